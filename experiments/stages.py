@@ -1,0 +1,319 @@
+"""The stages that experiments share: collect, train, evaluate; each goes on where it stopped, with a progress bar."""
+
+import dataclasses
+import itertools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+import sts_jax as sts
+from sts_jax import dataset, evaluation, mvae, training
+
+# The rows of the paper's Table 1, by the modalities a model has.
+MODELS: dict[str, tuple[str, ...]] = {
+    "mvae": ("visual", "tactile", "pose"),
+    "mvae-without-pose": ("visual", "tactile"),
+    "vae-visual": ("visual",),
+    "vae-tactile": ("tactile",),
+}
+TITLES = {
+    "mvae": "MVAE with pose",
+    "mvae-without-pose": "MVAE without pose",
+    "vae-visual": "VAE visual only",
+    "vae-tactile": "VAE tactile only",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One experiment: what is collected, how it is learnt, how it is judged."""
+
+    collection: dataset.Collection
+    training: training.TrainConfig
+    steps: tuple[int, ...] | None = None  # gradient steps of each of MODELS; None: training.epochs decide
+    targets: str = "all"  # a subset of modalities is asked for "all" targets, or for its "own" (paper)
+    mask_blank_touch: bool = True  # a touch without contact is no input; False: the blank image is fed (paper)
+    # Held out: whole "object"s (70/10/20), or a fifth of the shuffled "trajectory"s, which shows each object on both
+    # sides (paper). With several, each has its own models and table.
+    splits: tuple[str, ...] = ("object",)
+    num_shown: int = 8  # held-out trajectories in the figures
+
+
+def claim(config: Config, workdir: Path) -> None:
+    """Make a work directory this experiment's, or insist that it is."""
+    dataset.claim(workdir / "config.json", dataclasses.asdict(config))
+
+
+def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
+    """Make what is missing of the dataset and open it."""
+    with Bar() as bar:
+        resampled = dataset.collect(
+            config.collection,
+            sensor,
+            workdir / "dataset",
+            progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total),
+        )
+    if resampled:
+        say(f"collect: {resampled} drops went non-finite or sank and were drawn again")
+    return dataset.load(workdir / "dataset")
+
+
+def parts(data: dataset.Dataset, split: str) -> dict[str, np.ndarray]:
+    """Which trajectories train, validate and test."""
+    if split == "object":
+        return {name: data.members(name) for name in ("train", "validation", "test")}
+    if split != "trajectory":
+        raise ValueError(f"unknown split {split!r}: hold out by 'object' or by 'trajectory'.")
+    order = np.random.default_rng(data.collection["seed"]).permutation(len(data.trajectory["outcome"]))
+    cut = round(0.8 * len(order))
+    # The paper has no validation part; the outcome's threshold is then chosen on training trajectories.
+    return {"train": np.sort(order[:cut]), "validation": np.sort(order[:cut]), "test": np.sort(order[cut:])}
+
+
+def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
+    """Where a model lives: `models/NAME`, with the split behind it where it is not the experiment's first."""
+    return workdir / "models" / (name if split == config.splits[0] else f"{name}-by-{split}")
+
+
+def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
+    """Train the models of the paper's Table 1 on one split."""
+    pairs = data.pairs(parts(data, split)["train"], turns=True)
+    blank = empty_frame(sensor, config.collection)
+    for number, (name, modalities) in enumerate(MODELS.items()):
+        preprocessing = training.Preprocessing(
+            resolution=config.collection.resolution,
+            crop=config.collection.crop,
+            mask_blank_touch=config.mask_blank_touch,
+        )
+        arrays, preprocessing = learnable(pairs, modalities, preprocessing, blank.tactile)
+        schedule = config.training
+        if config.steps is not None:
+            schedule = dataclasses.replace(schedule, steps=config.steps[number])
+        folder = model_folder(workdir, name, config, split)
+        training.save_blank(folder, blank.visual, blank.tactile)
+        with Bar() as bar:
+            training.train(
+                schedule,
+                model_config(modalities, config.collection.resolution),
+                arrays,
+                workdir=folder,
+                absent=preprocessing.absent,
+                targets=config.targets,  # type: ignore[arg-type]
+                preprocessing=dataclasses.asdict(preprocessing),
+                progress=lambda done, total, record, bar=bar, name=folder.name: bar(
+                    f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else ""
+                ),
+            )
+
+
+def model_config(modalities: tuple[str, ...], resolution: tuple[int, int]) -> mvae.Config:
+    """The paper's networks for some modalities; lambda is 1 for images and 1000 for the pose."""
+    return mvae.Config(
+        tuple(
+            mvae.Modality("pose", "vector", (7,), 1000.0) if name == "pose" else mvae.Modality(name, "image", (*resolution, 3))
+            for name in modalities
+        )
+    )
+
+
+def learnable(
+    pairs: dataset.Pairs, modalities: tuple[str, ...], preprocessing: training.Preprocessing, blank: np.ndarray
+) -> tuple[training.Arrays, training.Preprocessing]:
+    """First moments as inputs, last ones as targets, and which inputs no trajectory has."""
+    code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
+    moments = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
+    touched = np.asarray(preprocessing.touched(jnp.asarray(pairs.tactile[:, 0] / 255, jnp.float32), jnp.asarray(blank / 255)))
+    absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
+    arrays = training.Arrays(
+        inputs={name: np.ascontiguousarray(moments[name][:, 0]) for name in modalities if name not in absent},
+        targets={name: np.ascontiguousarray(moments[name][:, 1]) for name in modalities},
+        present={"tactile": touched} if "tactile" in modalities and not absent else {},
+    )
+    return arrays, dataclasses.replace(preprocessing, absent=absent)
+
+
+def empty_frame(sensor: sts.Sensor, collection: dataset.Collection) -> dataset.Images:
+    """Both streams with nothing on the sensor, `uint8`."""
+    body = dataset.make_bodies(collection, np.array([0]))[0]
+    gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
+    images = dataset.render_uint8(
+        sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop
+    )
+    return dataset.Images(*(np.asarray(leaf)[0] for leaf in images))
+
+
+def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
+    """Score every model on held-out trajectories; write `metrics.json`, `table.md` and `figures/`."""
+    suffix = "" if split == config.splits[0] else f"-by-{split}"
+    done = workdir / f"table{suffix}.md"
+    if done.exists():
+        return
+    part = parts(data, split)
+    train_pairs, validation, test = data.pairs(part["train"], turns=True), data.pairs(part["validation"]), data.pairs(part["test"])
+    blank = training.load_blank(model_folder(workdir, "mvae", config, split))[0] / 255
+    rows = evaluation.baselines(train_pairs, test)
+    with Bar() as bar:
+        jobs = list(queries(config, workdir, split))
+        for number, (title, predictor, names) in enumerate(jobs):
+            bar("evaluate", number, len(jobs), title)
+            rows[title] = predict(predictor, names, validation, test, blank)
+        scores = {title: evaluation.score(row, test) for title, row in rows.items()}
+        summary = evaluation.summarise(scores, test)
+        bar("evaluate", len(jobs), len(jobs), "intervals done")
+
+    figures = workdir / f"figures{suffix}"
+    both, single = f"{TITLES['mvae']}, from all inputs", f"{TITLES['mvae']}, from visual"
+    shown = {"MVAE from vision": rows[single]}
+    if both in rows:
+        shown["MVAE from all"] = rows[both]
+    title = f"{workdir.name}: the first {config.num_shown} of the held-out list, by {split}"
+    evaluation.figures.predictions(figures / "predictions.png", test, shown, num=config.num_shown, title=title)
+    category = np.array([int(i) % len(sts.objects.CATEGORIES) for i in test.object])
+    best = rows[both] if both in rows else rows[single]
+    evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category)
+    logs = {
+        TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS
+    }
+    evaluation.figures.training_curves(figures / "training.png", logs)
+    if split == config.splits[0]:
+        draw_strip(config, data, figures / "fall.png", sensor)
+
+    steps = {name: log[-1]["step"] if log else 0 for name, log in logs.items()}
+    notes = [
+        "Gradient steps: " + ", ".join(f"{name} {count}" for name, count in steps.items()) + f"; batch {config.training.batch_size}.",
+    ]
+    content = (json.dumps({"split": split, **summary}, indent=2) + "\n").encode()
+    _write(workdir / f"metrics{suffix}.json", content)
+    title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
+    text = evaluation.table(summary, title=title, notes=notes)
+    _write(done, text.encode())
+    say(text)
+
+
+def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
+    """Every model with every subset of the inputs it can be given, the empty one where it can be given none."""
+    for name in MODELS:
+        predictor = sts.Predictor.load(model_folder(workdir, name, config, split))
+        usable = predictor.modalities
+        subsets = [s for n in range(1, len(usable) + 1) for s in itertools.combinations(usable, n)]
+        for subset in subsets or [()]:
+            if not subset:
+                given = "no input: the first touch is always blank"
+            elif len(usable) == 1:
+                given = f"from {subset[0]}"
+            else:
+                given = "from all inputs" if subset == usable else f"from {' and '.join(subset)}"
+            yield f"{TITLES[name]}, {given}", predictor, subset
+
+
+def predict(
+    predictor: sts.Predictor,
+    names: tuple[str, ...],
+    validation: dataset.Pairs,
+    test: dataset.Pairs,
+    blank: np.ndarray,
+) -> evaluation.Predicted:
+    """What a model says of the held-out trajectories; its outcome from the pose, or from whether its image is empty."""
+
+    def run(pairs: dataset.Pairs) -> sts.Prediction:
+        first = {"visual": pairs.visual[:, 0] / 255, "tactile": pairs.tactile[:, 0] / 255, "pose": pairs.pose[:, 0]}
+        if names:
+            out = predictor(**{name: first[name] for name in names})
+        else:
+            out = predictor.prior((len(pairs.object),))
+        return jax.tree.map(np.asarray, out)
+
+    out = run(test)
+    if out.pose is not None:
+        outcome = evaluation.outcome_of_pose(test.pose[:, 0], out.pose)
+    elif out.visual is not None:
+        score = evaluation.emptiness(run(validation).visual, blank)
+        threshold = evaluation.metrics.best_threshold(score, validation.outcome != int(sts.physics.Outcome.FELL_OFF))
+        outcome = evaluation.outcome_of_image(out.visual, blank, threshold)
+    else:
+        outcome = None
+    return evaluation.Predicted(out.visual, out.tactile, out.pose, outcome)
+
+
+def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Sensor) -> None:
+    """The first fully rendered trajectory that stays on the pad, from outside and through the sensor."""
+    full = data.full_trajectories()
+    if not len(full):
+        return
+    stays = full[data.trajectory["outcome"][full] == int(sts.physics.Outcome.RESTS)]
+    index = int(stays[0] if len(stays) else full[0])
+    images = data.strip(index)
+    body = dataset.make_bodies(config.collection, data.trajectory["body"][[index]])[0]
+    size = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
+    view = np.stack([np.asarray(evaluation.outside(body, pose, size)) for pose in data.trajectory["pose"][index]])
+    category = sts.objects.CATEGORIES[int(body.category)]
+    evaluation.figures.strip(
+        path,
+        data.trajectory["time"][index],
+        view,
+        images.visual / 255,
+        images.tactile / 255,
+        data.trajectory["wrench"][index],
+        title=f"trajectory {index}: a {category}",
+    )
+
+
+class Bar:
+    """A progress bar on a terminal, a plain line every ten seconds or so elsewhere."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm | None = None
+        self._stage = ""
+        self._said = 0.0
+
+    def __enter__(self) -> "Bar":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Show that `done` of `total` are done."""
+        if sys.stderr.isatty():
+            if stage != self._stage or self._bar is None:
+                if self._bar is not None:
+                    self._bar.close()
+                self._bar = tqdm(total=total, desc=stage, initial=done, dynamic_ncols=True)
+            self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(done - self._bar.n)
+        elif stage != self._stage or done == total or time.monotonic() - self._said > 10:
+            say(f"{stage}: {done}/{total} {note}".rstrip())
+            self._said = time.monotonic()
+        self._stage = stage
+
+
+def say(text: str) -> None:
+    """One line for the user, on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def _read_lines(path: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _write(path: Path, data: bytes) -> None:
+    dataset.write_whole(path, lambda temporary: _write_bytes(temporary, data))
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Seconds that a call takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start

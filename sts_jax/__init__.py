@@ -1,0 +1,22 @@
+"""The See-Through-your-Skin sensor in JAX: simulate it, see with it, learn to predict from it."""
+
+from sts_jax import dataset, evaluation, mvae, objects, optics, physics, tactile, training
+from sts_jax.frame import Frame, sense
+from sts_jax.predict import Prediction, Predictor
+from sts_jax.sensor import Sensor
+
+__all__ = [
+    "Frame",
+    "Prediction",
+    "Predictor",
+    "Sensor",
+    "dataset",
+    "evaluation",
+    "mvae",
+    "objects",
+    "optics",
+    "physics",
+    "sense",
+    "tactile",
+    "training",
+]

@@ -1,0 +1,170 @@
+"""Small mathematics that every room may use: gradient-safe vector operations and quaternions.
+
+Quaternions are `[w, x, y, z]`, unit; a pose is `(7,)`: position (m), then quaternion. Everything broadcasts
+over leading axes.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+def safe_divide(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """`a / b` with 0 (and zero gradient) where `b` is 0."""
+    ok = b != 0
+    return jnp.where(ok, a / jnp.where(ok, b, 1), 0)
+
+
+def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
+    """Euclidean norm over the last axis, with zero gradient at zero."""
+    square = jnp.sum(x * x, axis=-1)
+    ok = square > 0
+    return jnp.where(ok, jnp.sqrt(jnp.where(ok, square, 1)), 0)
+
+
+def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+    """`x` over its norm; zero, with zero gradient, where `x` is zero."""
+    length = norm(x)[..., None]
+    ok = length > 0
+    return jnp.where(ok, x / jnp.where(ok, length, 1), 0)
+
+
+def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    """Hamilton product: the rotation `b`, then the rotation `a`."""
+    aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
+    bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quat_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    """The inverse rotation of a unit quaternion."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
+
+
+def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    """The same rotation, unit, with `w >= 0`."""
+    q = normalize(q)
+    return jnp.where(q[..., :1] < 0, -q, q)
+
+
+def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
+    """Rotation matrix of a unit quaternion."""
+    w, x, y, z = jnp.moveaxis(q, -1, 0)
+    rows = [
+        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return jnp.stack(rows, -2)
+
+
+def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
+    """Quaternion of the rotation by `|v|` radians about `v`; differentiable at zero."""
+    half = 0.5 * norm(v)[..., None]
+    return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
+
+
+def quat_angle(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n"]:
+    """Geodesic angle between two rotations, radians in [0, pi]."""
+    d = quat_multiply(quat_conjugate(a), b)
+    return 2 * jnp.arctan2(norm(d[..., 1:]), jnp.abs(d[..., 0]))
+
+
+def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:
+    """A rotation drawn uniformly; `w >= 0`."""
+    return quat_canonical(jax.random.normal(key, (4,)))
+
+
+def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Points of the mesh frame in the sensor frame."""
+    return points @ quat_matrix(pose[3:]).T + jnp.broadcast_to(pose[:3], points.shape)
+
+
+@jax.custom_jvp
+def smallest_eigenvector(
+    xx: Float[Array, "*n"],
+    yy: Float[Array, "*n"],
+    zz: Float[Array, "*n"],
+    xy: Float[Array, "*n"],
+    xz: Float[Array, "*n"],
+    yz: Float[Array, "*n"],
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
+    """Unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices A, in closed form.
+
+    The eigenvalue is the smallest root of the cubic, `mean + spread b` with `b^3 - 3 b = 2 h` (a polynomial in
+    `sqrt(1 - h)` and one Newton step); the vector is the largest column of
+    `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. Its derivative needs the smallest eigenvalue
+    to be simple and no more: the other two may be equal, as they are for points that lie in a plane. Where it is not
+    simple, one of the eigenvectors is returned, with zero gradient.
+
+    Args:
+        xx: with the other five, the elements of A, each an array of its own (which is how a CPU is quick).
+        yy: see above.
+        zz: see above.
+        xy: see above.
+        xz: see above.
+        yz: see above.
+
+    Returns:
+        The vector's three components; its sign is arbitrary.
+    """
+    mean = (xx + yy + zz) / 3
+    a, b, c = xx - mean, yy - mean, zz - mean
+    spread = jnp.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
+    s = 1 / jnp.where(spread > 0, spread, 1)
+    half_det = (a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)) * (0.5 * s * s * s)
+    h = jnp.clip(half_det, -1, 1)
+    r = jnp.sqrt(1 - h)
+    root = -1 + r * (-0.81649658 + r * (0.10895821 + r * (-0.02969152 + r * 0.00519827)))
+    slope = 3 * root * root - 3
+    root = root - jnp.where(slope > 1e-3, (root * (root * root - 3) - 2 * h) / jnp.where(slope > 1e-3, slope, 1), 0)
+    shift = spread * root
+    a, b, c = a - shift, b - shift, c - shift
+    # the adjugate: diagonal p, q, t; off it u (01), v (02), w (12)
+    p, q, t = b * c - yz * yz, a * c - xz * xz, a * b - xy * xy
+    u, v, w = xz * yz - xy * c, xy * yz - xz * b, xy * xz - a * yz
+    third, second = (t >= p) & (t >= q), q >= p
+    x = jnp.where(third, v, jnp.where(second, u, p))
+    y = jnp.where(third, w, jnp.where(second, q, u))
+    z = jnp.where(third, t, jnp.where(second, w, v))
+    size = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
+    known = size > 0
+    scale = 1 / jnp.where(known, size, 1)
+    x, y, z = x * scale, y * scale, jnp.where(known, z * scale, 1)
+    length = 1 / jnp.sqrt(x * x + y * y + z * z)
+    return x * length, y * length, z * length
+
+
+@smallest_eigenvector.defjvp
+def _smallest_eigenvector_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[tuple, tuple]:
+    # dv = -(A - lambda I)^+ dA v: the inverse of a 2x2 matrix on the plane across v, which p and q span
+    # (Duff et al. 2017: a basis without a case where it vanishes).
+    v = smallest_eigenvector(*primals)
+    sign = jnp.where(v[2] < 0, -1.0, 1.0).astype(v[2].dtype)
+    k = -1 / (sign + v[2])
+    m = v[0] * v[1] * k
+    p = (1 + sign * v[0] * v[0] * k, sign * m, -sign * v[0])
+    q = (m, sign + v[1] * v[1] * k, -v[1])
+
+    def between(left: tuple, elements: tuple, right: tuple) -> Array:
+        xx, yy, zz, xy, xz, yz = elements
+        x, y, z = left
+        a, b, c = right
+        return xx * x * a + yy * y * b + zz * z * c + xy * (x * b + y * a) + xz * (x * c + z * a) + yz * (y * c + z * b)
+
+    value = between(v, primals, v)
+    pp, qq, pq = between(p, primals, p) - value, between(q, primals, q) - value, between(p, primals, q)
+    det = pp * qq - pq * pq
+    simple = det > 1e-6 * (pp + qq) ** 2
+    inverse = jnp.where(simple, 1 / jnp.where(simple, det, 1), 0)
+    tp, tq = between(p, tangents, v), between(q, tangents, v)
+    along_p, along_q = (qq * tp - pq * tq) * inverse, (pp * tq - pq * tp) * inverse
+    return v, tuple(-(along_p * p[i] + along_q * q[i]) for i in range(3))

@@ -1,0 +1,33 @@
+"""Collections on disk: made shard by shard, read as arrays."""
+
+from sts_jax.dataset.collect import Collection as Collection
+from sts_jax.dataset.collect import Progress as Progress
+from sts_jax.dataset.collect import claim as claim
+from sts_jax.dataset.collect import collect as collect
+from sts_jax.dataset.collect import make_bodies as make_bodies
+from sts_jax.dataset.collect import render_uint8 as render_uint8
+from sts_jax.dataset.collect import split_objects as split_objects
+from sts_jax.dataset.load import Dataset as Dataset
+from sts_jax.dataset.load import Pairs as Pairs
+from sts_jax.dataset.load import load as load
+from sts_jax.dataset.records import Images as Images
+from sts_jax.dataset.records import TornFileError as TornFileError
+from sts_jax.dataset.records import write_arrays as write_arrays
+from sts_jax.dataset.records import write_whole as write_whole
+
+__all__ = [
+    "Collection",
+    "Dataset",
+    "Images",
+    "Pairs",
+    "Progress",
+    "TornFileError",
+    "claim",
+    "collect",
+    "load",
+    "make_bodies",
+    "render_uint8",
+    "split_objects",
+    "write_arrays",
+    "write_whole",
+]

@@ -1,0 +1,275 @@
+"""From a description to a folder of shards: objects, physics and frames, one pure function a shard."""
+
+import concurrent.futures
+import dataclasses
+import functools
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from sts_jax import _math, objects, physics
+from sts_jax.dataset import records
+from sts_jax.frame import sense
+from sts_jax.sensor import Sensor
+
+# Frames rendered by one compiled call.
+RENDER_BATCH = 32
+SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
+
+
+@dataclasses.dataclass(frozen=True)
+class Collection:
+    """What a dataset is made of. Together with a `Sensor` it determines every byte."""
+
+    scenario: physics.Freefall = dataclasses.field(default_factory=physics.Freefall)
+    num_objects: int = 160  # procedural objects; the eight categories in turn
+    num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
+    num_full: int = 20  # trajectories with every frame rendered; of the others the first and the last
+    quarter_turns: bool = True  # see also each trajectory turned by 90, 180, 270 degrees: the pad is square
+    resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
+    crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
+    objects_per_shard: int = 40
+    seed: int = 0
+
+    @property
+    def num_trajectories(self) -> int:
+        """Trajectories in the whole dataset."""
+        return self.num_objects * self.num_per_object
+
+    @property
+    def num_shards(self) -> int:
+        """Units of work, each a whole file or none."""
+        return math.ceil(self.num_objects / self.objects_per_shard)
+
+
+class Progress(NamedTuple):
+    """What a collection reports while it runs."""
+
+    done: int  # trajectories (or frames) finished
+    total: int
+    stage: str  # "drops" or "frames"
+
+
+def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
+    """The objects of a collection, each from its own key: object i is the same whatever else is made."""
+    key = jax.random.key(collection.seed)
+    return [
+        objects.make(jax.random.fold_in(key, int(i)), objects.CATEGORIES[int(i) % len(objects.CATEGORIES)])
+        for i in indices
+    ]
+
+
+def split_objects(collection: Collection) -> dict[str, np.ndarray]:
+    """Which objects train, validate and test (70/10/20): shuffled by the seed, each category spread alike."""
+    rng = np.random.default_rng([collection.seed, 1])
+    # A block of one object of each category after the other, the objects of a category in random order.
+    count = len(objects.CATEGORIES)
+    members = [rng.permutation(np.arange(c, collection.num_objects, count)) for c in range(count)]
+    blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
+    cuts = np.round(np.cumsum(list(SPLITS.values()))[:-1] * collection.num_objects).astype(int)
+    parts = np.split(np.concatenate(blocks), cuts)
+    return {name: np.sort(part).astype(np.int64) for name, part in zip(SPLITS, parts, strict=True)}
+
+
+def turn(pose: Float[Array, "*n 7"], quarter: int) -> Float[Array, "*n 7"]:
+    """A pose turned about the sensor's z axis by `quarter` x 90 degrees."""
+    spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, quarter * math.pi / 2]))
+    position = _math.transform(jnp.concatenate([jnp.zeros(3), spin]), pose[..., :3])
+    spin = jnp.broadcast_to(spin, (*pose.shape[:-1], 4))
+    return jnp.concatenate([position, _math.quat_canonical(_math.quat_multiply(spin, pose[..., 3:]))], -1)
+
+
+def turn_wrench(wrench: Float[Array, "*n 6"], quarter: int) -> Float[Array, "*n 6"]:
+    """A wrench about the sensor's origin, turned like `turn`."""
+    spin = jnp.concatenate([jnp.zeros(3), _math.quat_from_rotvec(jnp.array([0.0, 0.0, quarter * math.pi / 2]))])
+    pair = wrench.reshape(*wrench.shape[:-1], 2, 3)
+    return _math.transform(spin, pair).reshape(wrench.shape)
+
+
+def collect(
+    collection: Collection,
+    sensor: Sensor,
+    folder: Path,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> int:
+    """Make every shard of a dataset that is not there yet.
+
+    Args:
+        collection: What to make.
+        sensor: The sensor that sees it.
+        folder: Where the shards go, with `collection.json`, `sensor.json` and `split.json` beside them.
+        progress: Called as the work goes on.
+
+    Returns:
+        How many trajectories were drawn again because they went non-finite or sank, in the shards made now.
+
+    Raises:
+        ValueError: The folder holds another collection; the message names the field.
+        OSError: The disk is full.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder / "collection.json", _as_json(collection))
+    claim(folder / "sensor.json", jax.tree.map(lambda x: np.asarray(x).tolist(), dataclasses.asdict(sensor)))
+    claim(
+        folder / "split.json",
+        {name: [int(i) for i in part] for name, part in split_objects(collection).items()},
+    )
+    resampled = 0
+    for index in range(collection.num_shards):
+        if not shard_path(folder, collection, index).with_suffix(".npz").exists():
+            resampled += _make_shard(collection, sensor, folder, index, progress)
+    return resampled
+
+
+def shard_path(folder: Path, collection: Collection, index: int) -> Path:
+    """The record file of a shard."""
+    return folder / f"shard-{index:05d}-of-{collection.num_shards:05d}.array_record"
+
+
+def claim(path: Path, content: dict) -> None:
+    """Write a JSON file once; afterwards insist that it says the same.
+
+    Raises:
+        ValueError: The file says something else; names the first field that differs, both values, and the remedy.
+    """
+    content = json.loads(json.dumps(content))
+    if not path.exists():
+        data = (json.dumps(content, indent=2) + "\n").encode()
+        records.write_whole(path, lambda temporary: _write_bytes(temporary, data))
+        return
+    try:
+        there = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise records.TornFileError(f"{path} is torn ({error}); give another --workdir or delete this one.") from error
+    for field in sorted({*content, *there}):
+        if content.get(field) != there.get(field):
+            raise ValueError(
+                f"{path} was made with {field} = {there.get(field)!r}, asked for now is {content.get(field)!r}: "
+                "give another --workdir, or delete this one to start anew."
+            )
+
+
+def _make_shard(
+    collection: Collection,
+    sensor: Sensor,
+    folder: Path,
+    index: int,
+    progress: Callable[[Progress], None] | None,
+) -> int:
+    first = index * collection.objects_per_shard
+    members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
+    bodies = make_bodies(collection, members)
+    before = first * collection.num_per_object
+    key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
+    trajectory = physics.simulate(
+        key,
+        bodies,
+        sensor,
+        collection.scenario,
+        collection.num_per_object,
+        progress=_report(progress, before, collection.num_trajectories, "drops"),
+    )
+    trajectory = jax.tree.map(np.asarray, trajectory)
+    frames = _frames_of(collection, first, trajectory)
+    path = shard_path(folder, collection, index)
+    report = _report(progress, 0, len(frames), "frames")
+    records.write_images(path, _render(collection, sensor, bodies, trajectory, frames, report))
+    arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
+    arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
+    arrays["trajectory/body"] = arrays["trajectory/body"] + first
+    arrays["frames"] = frames
+    records.write_arrays(path.with_suffix(".npz"), arrays)
+    return int(trajectory.resampled.sum())
+
+
+def _frames_of(collection: Collection, first_object: int, trajectory: physics.Trajectory) -> np.ndarray:
+    """Which frames are rendered: rows of (trajectory, frame, quarter turns), trajectory counted in the shard."""
+    num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
+    rows = []
+    for i in range(num):
+        # The full ones are spread over the objects: the first trajectory of each, then the second of each, ...
+        object_index, repeat = divmod(i, collection.num_per_object)
+        rank = repeat * collection.num_objects + first_object + object_index
+        full = rank < collection.num_full
+        rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
+        if collection.quarter_turns:
+            rows += [(i, t, quarter) for quarter in (1, 2, 3) for t in (0, last)]
+    return np.array(rows, np.int32)
+
+
+def _render(
+    collection: Collection,
+    sensor: Sensor,
+    bodies: list[objects.Body],
+    trajectory: physics.Trajectory,
+    frames: np.ndarray,
+    report: Callable[[int], None],
+) -> Iterator[records.Images]:
+    """Render `frames` in order, a fixed number a call; one thread a core, since a call keeps one core busy."""
+    turned = [(np.asarray(turn(trajectory.pose, q)), np.asarray(turn_wrench(trajectory.wrench, q))) for q in range(4)]
+
+    def batches() -> Iterator[tuple[objects.Body, np.ndarray, np.ndarray, int]]:
+        owner = trajectory.body[frames[:, 0]]
+        for body_index in np.unique(owner):
+            rows = frames[owner == body_index]
+            for start in range(0, len(rows), RENDER_BATCH):
+                part = rows[start : start + RENDER_BATCH]
+                padded = np.concatenate([part, np.repeat(part[-1:], RENDER_BATCH - len(part), 0)])
+                pose = np.stack([turned[q][0][i, t] for i, t, q in padded])
+                wrench = np.stack([turned[q][1][i, t] for i, t, q in padded])
+                yield bodies[body_index], pose, wrench, len(part)
+
+    def work(job: tuple[objects.Body, np.ndarray, np.ndarray, int]) -> records.Images:
+        body, pose, wrench, count = job
+        images = render_uint8(sensor, body, pose, wrench, resolution=collection.resolution, crop=collection.crop)
+        return records.Images(*(np.asarray(leaf)[:count] for leaf in images))
+
+    done = 0
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        for images in pool.map(work, batches()):
+            done += len(images.visual)
+            report(done)
+            yield images
+
+
+@functools.partial(jax.jit, static_argnames=("resolution", "crop"))
+def render_uint8(
+    sensor: Sensor,
+    body: objects.Body,
+    pose: Float[Array, "n 7"],
+    wrench: Float[Array, "n 6"],
+    *,
+    resolution: tuple[int, int],
+    crop: bool,
+) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
+    """Frames of one object as they are stored: visual and tactile in `uint8`, segmentation in bool."""
+    frame = jax.vmap(lambda p, w: sense(sensor, body, p, w, resolution=resolution, crop=crop))(pose, wrench)
+    to_uint8 = lambda image: jnp.round(image * 255).astype(jnp.uint8)  # noqa: E731
+    return to_uint8(frame.visual), to_uint8(frame.tactile), frame.segmentation
+
+
+def _report(progress: Callable[[Progress], None] | None, before: int, total: int, stage: str) -> Callable[[int], None]:
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(Progress(before + done, total, stage))
+
+    return report
+
+
+def _as_json(collection: Collection) -> dict:
+    content = dataclasses.asdict(collection)
+    content["scenario"] = {"name": type(collection.scenario).__name__, **content["scenario"]}
+    return content
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)

@@ -1,0 +1,147 @@
+"""A collected folder as arrays: trajectories, rendered frames, and the pairs that learning sees."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sts_jax.dataset import records
+from sts_jax.dataset.collect import turn
+
+
+class Pairs(NamedTuple):
+    """First and last moment of some trajectories, in memory; `n` is trajectories times quarter turns."""
+
+    visual: np.ndarray  # uint8 (n, 2, height, width, 3): first, last
+    tactile: np.ndarray  # uint8 (n, 2, height, width, 3)
+    segmentation: np.ndarray  # bool (n, 2, height, width)
+    pose: np.ndarray  # float32 (n, 2, 7)
+    contact: np.ndarray  # bool (n, 2): the pad carries the object
+    outcome: np.ndarray  # int32 (n,), physics.Outcome
+    object: np.ndarray  # int64 (n,), index of the object in the collection
+    trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """Everything small in memory, images read when asked for."""
+
+    folder: Path
+    collection: dict  # as collection.json has it
+    split: dict[str, np.ndarray]  # name -> object indices
+    trajectory: dict[str, np.ndarray]  # physics.Trajectory's leaves, all shards: (num, ...)
+    hidden: dict[str, np.ndarray]  # physics.Hidden's leaves, (num,)
+    frames: np.ndarray  # int (m, 3): trajectory, frame, quarter turns of every stored image, in order of the shards
+    shards: tuple[Path, ...]
+    shard_of: np.ndarray  # int (m,): which shard holds it
+    record_of: np.ndarray  # int (m,): where in it
+
+    def images(self, rows: np.ndarray) -> records.Images:
+        """Read the images of some rows of `frames`, in the order asked for."""
+        height, width = self.collection["resolution"]
+        out = records.Images(
+            np.empty((len(rows), height, width, 3), np.uint8),
+            np.empty((len(rows), height, width, 3), np.uint8),
+            np.empty((len(rows), height, width), bool),
+        )
+        for shard in np.unique(self.shard_of[rows]):
+            here = np.flatnonzero(self.shard_of[rows] == shard)
+            part = records.read_images(
+                self.shards[shard],
+                self.record_of[rows[here]],
+                resolution=(height, width),
+                total=int((self.shard_of == shard).sum()),
+            )
+            for whole, piece in zip(out, part, strict=True):
+                whole[here] = piece
+        return out
+
+    def full_trajectories(self) -> np.ndarray:
+        """Indices of the trajectories that have every frame rendered."""
+        plain = self.frames[self.frames[:, 2] == 0]
+        counts = np.bincount(plain[:, 0], minlength=len(self.trajectory["outcome"]))
+        return np.flatnonzero(counts == self.trajectory["pose"].shape[1])
+
+    def strip(self, trajectory: int) -> records.Images:
+        """Every frame of one fully rendered trajectory, in time order."""
+        rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
+        return self.images(rows[np.argsort(self.frames[rows, 1])])
+
+    def members(self, part: str) -> np.ndarray:
+        """Indices of the trajectories of `train`, `validation` or `test`."""
+        if part not in self.split:
+            raise ValueError(f"unknown part {part!r} of the dataset: one of {', '.join(self.split)}.")
+        return np.flatnonzero(np.isin(self.trajectory["body"], self.split[part]))
+
+    def pairs(self, trajectories: np.ndarray, *, turns: bool = False) -> Pairs:
+        """First and last frame of some trajectories.
+
+        Args:
+            trajectories: Their indices.
+            turns: Each also turned by 90, 180 and 270 degrees, where the collection rendered that.
+        """
+        last = self.trajectory["pose"].shape[1] - 1
+        quarters = range(4) if turns and self.collection["quarter_turns"] else range(1)
+        row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
+        wanted = [(int(t), quarter) for t in trajectories for quarter in quarters]
+        rows = np.array([[row_of[t, 0, q], row_of[t, last, q]] for t, q in wanted], np.int64).reshape(-1, 2)
+        images = self.images(rows.ravel())
+        index = np.array([t for t, _ in wanted], np.int64)
+        ends = self.trajectory["pose"][:, [0, last]]
+        turned = np.stack([np.asarray(turn(ends, quarter)) for quarter in quarters])
+        quarter_of = np.array([q for _, q in wanted], np.int64)
+        return Pairs(
+            *(leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in images),
+            pose=turned[quarter_of, index].astype(np.float32),
+            contact=self.trajectory["contact"][:, [0, last]][index],
+            outcome=self.trajectory["outcome"][index],
+            object=self.trajectory["body"][index],
+            trajectory=index,
+        )
+
+
+def load(folder: str | Path) -> Dataset:
+    """Open a folder that `collect` has finished.
+
+    Raises:
+        FileNotFoundError: The folder or one of its shards is missing; names it.
+        TornFileError: A file is not whole; names it.
+    """
+    folder = Path(folder)
+    collection = _read_json(folder / "collection.json")
+    split = {name: np.array(part, np.int64) for name, part in _read_json(folder / "split.json").items()}
+    count = -(-collection["num_objects"] // collection["objects_per_shard"])
+    shards = tuple(folder / f"shard-{i:05d}-of-{count:05d}.array_record" for i in range(count))
+    parts = []
+    for path in shards:
+        try:
+            parts.append(records.read_arrays(path.with_suffix(".npz")))
+        except FileNotFoundError:
+            raise FileNotFoundError(
+                f"{path.with_suffix('.npz')} is missing: the collection is not finished; run it again, it goes on."
+            ) from None
+    starts = np.cumsum([0] + [len(part["trajectory/outcome"]) for part in parts])
+    leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
+    sizes = [len(part["frames"]) for part in parts]
+    return Dataset(
+        folder=folder,
+        collection=collection,
+        split=split,
+        trajectory={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("trajectory/")},
+        hidden={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("hidden/")},
+        frames=np.concatenate([p["frames"] + np.array([s, 0, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
+        shards=shards,
+        shard_of=np.repeat(np.arange(count), sizes),
+        record_of=np.concatenate([np.arange(size) for size in sizes]),
+    )
+
+
+def _read_json(path: Path) -> dict:
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path} is missing: {path.parent} is not a collected dataset.") from None
+    except json.JSONDecodeError as error:
+        raise records.TornFileError(f"{path} is torn ({error}); delete {path.parent} and collect again.") from error

@@ -1,0 +1,30 @@
+"""How good a prediction is: metrics per item, tables with intervals, figures."""
+
+from sts_jax.evaluation import figures, metrics
+from sts_jax.evaluation.outside import outside
+from sts_jax.evaluation.report import (
+    Predicted,
+    Scores,
+    baselines,
+    emptiness,
+    outcome_of_image,
+    outcome_of_pose,
+    score,
+    summarise,
+    table,
+)
+
+__all__ = [
+    "Predicted",
+    "Scores",
+    "baselines",
+    "emptiness",
+    "figures",
+    "metrics",
+    "outcome_of_image",
+    "outcome_of_pose",
+    "outside",
+    "score",
+    "summarise",
+    "table",
+]

@@ -1,0 +1,175 @@
+"""Pictures of what was predicted, learnt and simulated, each written to one PNG file."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from sts_jax import physics
+from sts_jax.dataset import Pairs
+from sts_jax.evaluation.report import Predicted
+
+
+def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, num: int, title: str) -> None:
+    """Input, target and predictions of the first `num` held-out trajectories, one row each.
+
+    Args:
+        path: The PNG to write.
+        test: Held-out trajectories, in the dataset's order.
+        predicted: By name; each gives one column a stream it predicts.
+        num: How many rows.
+        title: Of the figure.
+    """
+    num = min(num, len(test.visual))
+    columns: list[tuple[str, np.ndarray]] = [
+        ("input\nvisual", test.visual[:, 0] / 255),
+        ("target\nvisual", test.visual[:, 1] / 255),
+        *((f"{name}\nvisual", p.visual) for name, p in predicted.items() if p.visual is not None),
+        ("target\ntactile", test.tactile[:, 1] / 255),
+        *((f"{name}\ntactile", p.tactile) for name, p in predicted.items() if p.tactile is not None),
+    ]
+    figure, axes = plt.subplots(num, len(columns), figsize=(1.45 * len(columns), 1.35 * num + 0.9), squeeze=False)
+    for row in range(num):
+        for axis, (head, images) in zip(axes[row], columns, strict=True):
+            _show(axis, images[row])
+            if row == 0:
+                axis.set_title(head, fontsize=7)
+        outcome = physics.Outcome(int(test.outcome[row])).name.lower().replace("_", " ")
+        axes[row, 0].set_ylabel(f"#{test.trajectory[row]}\n{outcome}", fontsize=7)
+    figure.suptitle(title, fontsize=9)
+    _save(figure, path)
+
+
+def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
+    """Loss, reconstruction and KL against the gradient step, one line a model.
+
+    Args:
+        path: The PNG to write.
+        logs: For each model its log: dictionaries with `step`, `loss`, `kl` and other numbers.
+    """
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.4))
+    for axis, key in zip(axes, ("loss", "reconstruction", "kl"), strict=True):
+        for name, log in logs.items():
+            points = [(entry["step"], entry[key]) for entry in log if key in entry]
+            if points:
+                axis.plot(*zip(*points, strict=True), label=name, linewidth=1)
+        axis.set_xlabel("gradient step")
+        axis.set_ylabel(f"{key} (nats an item)")
+        axis.grid(alpha=0.3)
+    axes[0].set_yscale("log")
+    axes[0].legend(fontsize=7)
+    _save(figure, path)
+
+
+def strip(
+    path: Path,
+    time: np.ndarray,
+    view: np.ndarray,
+    visual: np.ndarray,
+    tactile: np.ndarray,
+    wrench: np.ndarray,
+    *,
+    num: int = 10,
+    title: str = "",
+) -> None:
+    """One trajectory: a view from outside, both streams, and the force the pad exerts, over time.
+
+    Args:
+        path: The PNG to write.
+        time: Of every frame (s), `(frames,)`.
+        view: The scene from outside, `(frames, h, w, 3)`.
+        visual: `(frames, height, width, 3)` in [0, 1].
+        tactile: `(frames, height, width, 3)` in [0, 1].
+        wrench: `(frames, 6)`, N and N m.
+        num: How many frames are shown: from just before the first touch to the end, denser at the beginning.
+        title: Of the figure.
+    """
+    last = len(time) - 1
+    chosen = np.unique(np.round(last * np.linspace(0, 1, num) ** 1.8).astype(int))
+    figure, axes = plt.subplots(
+        4, len(chosen), figsize=(1.5 * len(chosen), 6.6), height_ratios=[1, 1, 1, 0.8], squeeze=False
+    )
+    for column, t in enumerate(chosen):
+        for row, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
+            _show(axes[row, column], images[t])
+            if column == 0:
+                axes[row, column].set_ylabel(name, fontsize=8)
+        axes[0, column].set_title(f"{time[t]:.2f} s", fontsize=8)
+        axes[3, column].remove()
+    force = figure.add_subplot(4, 1, 4)
+    for k, name in enumerate(("$F_x$", "$F_y$", "$F_z$")):
+        force.plot(time, wrench[:, k], label=name, linewidth=1)
+    force.set_xlabel("time (s)")
+    force.set_ylabel("force of the pad (N)")
+    force.legend(fontsize=7, ncols=3)
+    force.grid(alpha=0.3)
+    figure.suptitle(title, fontsize=9)
+    _save(figure, path)
+
+
+def line_up(
+    path: Path,
+    key_path: Path,
+    test: Pairs,
+    predicted: Predicted,
+    category: np.ndarray,
+    *,
+    num: int = 10,
+    seed: int = 0,
+) -> None:
+    """A test for fresh eyes: a prediction, and two last moments of which one is its own.
+
+    The first `num` held-out trajectories; the other candidate is the target of another held-out trajectory of the
+    same category. Which side is right is written to `key_path` only.
+
+    Args:
+        path: The PNG to write.
+        key_path: The JSON file with the answers, "A" or "B" for each row.
+        test: Held-out trajectories.
+        predicted: Predictions of the same.
+        category: The category of each, `(n,)`.
+        num: How many rows.
+        seed: Of sides and other candidates.
+    """
+    assert predicted.visual is not None and predicted.tactile is not None
+    rng = np.random.default_rng(seed)
+    num = min(num, len(test.visual))
+    figure, axes = plt.subplots(num, 6, figsize=(9.5, 1.5 * num + 0.6), squeeze=False)
+    answers = []
+    for row in range(num):
+        same = np.flatnonzero((category == category[row]) & (np.arange(len(category)) != row))
+        if len(same) == 0:
+            same = np.flatnonzero(np.arange(len(category)) != row)
+        sides = [row, int(rng.choice(same))]
+        right = int(rng.integers(2))
+        answers.append("AB"[right])
+        a, b = sides if right == 0 else sides[::-1]
+        images = [
+            predicted.visual[row],
+            predicted.tactile[row],
+            *(stream[i, 1] / 255 for i in (a, b) for stream in (test.visual, test.tactile)),
+        ]
+        heads = ["prediction", "(touch)", "A", "(touch)", "B", "(touch)"]
+        for axis, image, head in zip(axes[row], images, heads, strict=True):
+            _show(axis, image)
+            if row == 0:
+                axis.set_title(head, fontsize=9)
+        axes[row, 0].set_ylabel(str(row + 1), fontsize=9, rotation=0, labelpad=12)
+    _save(figure, path)
+    key_path.write_text(json.dumps(answers) + "\n")
+
+
+def _show(axis: Axes, image: np.ndarray) -> None:
+    axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def _save(figure: plt.Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

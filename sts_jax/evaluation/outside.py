@@ -1,0 +1,55 @@
+"""The object on its pad as a bystander sees it."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sts_jax import _math, optics
+from sts_jax.objects import Body
+
+_THICKNESS = 0.012  # m, how much of the sensor's housing is drawn
+_PAD = optics.to_linear(jnp.array([178.0, 178.0, 204.0]) / 255)
+_HOUSING = jnp.array([0.05, 0.05, 0.055])
+
+
+@functools.partial(jax.jit, static_argnames=("resolution",))
+def outside(
+    body: Body, pose: Float[Array, "7"], size: tuple[float, float], *, resolution: tuple[int, int] = (160, 160)
+) -> Float[Array, "h w 3"]:
+    """A picture of the object and the pad from outside, three-quarter view.
+
+    Args:
+        body: The object.
+        pose: Mesh frame in the sensor frame.
+        size: Of the pad along x and y (m).
+        resolution: (height, width), pixels.
+
+    Returns:
+        Image, sRGB in [0, 1].
+    """
+    half = jnp.array([size[0], size[1], _THICKNESS]) / 2
+    corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)], jnp.float32)
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    box = jnp.asarray(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), jnp.int32)
+    vertices = jnp.concatenate([_math.transform(pose, body.vertices), corners * half])
+    faces = jnp.concatenate([body.faces, box + len(body.vertices)])
+    flat = jnp.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], jnp.float32)
+    flat = jnp.broadcast_to(jnp.concatenate([flat, flat])[:, None], (12, 3, 3))
+    normals = jnp.concatenate([body.normals @ _math.quat_matrix(pose[3:]).T, flat])
+    top = flat[..., 2:] > 0
+    albedo = body.colors * optics.sample_texture(body.texture, body.uv)
+    albedo = jnp.concatenate([albedo, jnp.where(top, _PAD, _HOUSING)])
+    return optics.photograph(
+        vertices,
+        faces,
+        normals,
+        albedo,
+        eye=jnp.array([0.16, 0.34, 0.24]),
+        target=jnp.array([0.0, 0.0, 0.012]),
+        fov=0.46,
+        resolution=resolution,
+        two_sided=body.two_sided,
+    )

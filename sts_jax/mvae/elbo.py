@@ -1,0 +1,254 @@
+"""The time-lagged evidence lower bound over all subsets of the modalities, and prediction.
+
+`L(x_t, x_T) = sum_{X} [ sum_{m asked of X} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
+over the non-empty subsets `X` (paper, "Learning Intuitive Physics with MVAEs"), to be minimised. `E_m` is the
+binary cross-entropy with logits of an image, summed over pixels and channels, or the squared error of a vector,
+summed over components. The batch is averaged, subsets are summed, the expectation is one draw of `z`.
+"""
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from sts_jax.mvae.gaussian import Gaussian, kl_standard_normal, product_of_experts
+from sts_jax.mvae.networks import MVAE, Config, Modality
+
+
+class Terms(NamedTuple):
+    """Parts of a loss: means over the batch and over the subsets asked, before any weight."""
+
+    loss: Float[Array, ""]
+    kl: Float[Array, ""]  # nats
+    reconstruction: dict[str, Float[Array, ""]]  # nats per image, squared error per vector
+
+
+class _Group(NamedTuple):
+    """Subsets that are one once the absent modalities are taken out."""
+
+    members: int  # bit m: modality m is in
+    subsets: int
+    asked: tuple[int, ...]  # per modality, how many of the subsets are asked for it
+
+
+def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...]) -> list[_Group]:
+    count = len(config.modalities)
+    kept = sum(1 << i for i, name in enumerate(config.names) if name not in absent)
+    groups: dict[int, _Group] = {}
+    for subset in range(1, 1 << count):
+        old = groups.get(subset & kept, _Group(subset & kept, 0, (0,) * count))
+        more = [1 if asked == "all" else subset >> i & 1 for i in range(count)]
+        groups[old.members] = _Group(
+            old.members, old.subsets + 1, tuple(a + b for a, b in zip(old.asked, more, strict=True))
+        )
+    return list(groups.values())
+
+
+def loss(
+    graphdef: nnx.GraphDef[MVAE],
+    params: nnx.State,
+    stats: nnx.State,
+    key: PRNGKeyArray,
+    inputs: dict[str, Array],
+    targets: dict[str, Array],
+    *,
+    present: dict[str, Bool[Array, "batch"]] | None = None,
+    target_present: dict[str, Bool[Array, "batch"]] | None = None,
+    condition: Float[Array, "batch condition"] | None = None,
+    beta: float | Float[Array, ""] = 1.0,
+    asked: Literal["all", "own"] = "all",
+    absent: tuple[str, ...] = (),
+) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
+    """The negative bound of one batch (module docstring), in training mode.
+
+    Each modality is encoded once. Subsets that are equal without the `absent` modalities are computed once and
+    weighted by their number, the empty one (posterior = prior) with them, so `absent` changes the time and not
+    the loss. A subset falls back, sample by sample, to those of its modalities that are present. All subsets are
+    decoded in one stacked call: its batch statistics are shared, weighted like the subsets. The noise of a sample
+    belongs to the modalities that are left of a subset, so that equal subsets draw the same `z`.
+
+    Args:
+        graphdef: definition of the model.
+        params: its parameters.
+        stats: its running batch statistics.
+        key: consumed: the noise of `z`.
+        inputs: `x_t` by name, `(batch, *shape)`, images in [0, 1]; one not given is as if in `absent`.
+        targets: `x_T` by name, all of them.
+        present: which inputs count, by name; one not given counts always. The values of those that do not
+            count, NaN among them, have no influence.
+        target_present: the same of the targets; a missing one adds nothing to the sum, the mean stays over
+            the whole batch.
+        condition: `(batch, condition)`; needed where the model has one.
+        beta: weight of the divergence.
+        asked: `all`: every subset for every target; `own`: each subset for its own modalities (paper's code).
+        absent: names of modalities that are present in no sample.
+
+    Returns:
+        The loss, the new statistics (same structure) and its parts.
+    """
+    model = nnx.merge(graphdef, params, stats, copy=True)
+    config = model.config
+    _check(config, asked, absent, targets)
+    absent = tuple(name for name in config.names if name in absent or name not in inputs)
+    batch = len(next(iter(targets.values())))
+    experts, mask = _experts(model, inputs, present or {}, absent, batch, training=True)
+
+    groups = _groups(config, asked, absent)
+    members = jnp.array([[bool(g.members >> i & 1) for i in range(len(config.names))] for g in groups])
+    left = members[:, :, None] & mask[None]
+    posterior = jax.vmap(lambda p: product_of_experts(experts, p))(left)
+    divergence = kl_standard_normal(posterior)
+    subsets = jnp.array([g.subsets for g in groups], jnp.float32)
+    kl = jnp.sum(subsets[:, None] * divergence) / batch
+    z = posterior.mean + jnp.exp(0.5 * posterior.log_var) * _noise(key, groups, left, posterior.mean.shape)
+    z = _with_condition(config, z, condition)
+
+    total = beta * kl
+    reconstruction = {}
+    for i, modality in enumerate(config.modalities):
+        rows = [j for j, g in enumerate(groups) if g.asked[i]]
+        times = jnp.array([groups[j].asked[i] for j in rows], jnp.float32)
+        target = targets[modality.name]
+        known = (target_present or {}).get(modality.name, jnp.ones(batch, bool))
+        weights = (times[:, None] * known[None]).reshape(-1)
+        output = model.decode(modality.name, z[jnp.array(rows)].reshape(-1, z.shape[-1]), weights)
+        target = jnp.where(_over(known, target), target, 0)
+        error = _error(modality, output.reshape(len(rows), *target.shape), target[None])
+        summed = jnp.sum(weights * error.reshape(-1)) / batch
+        total = total + modality.weight * summed
+        reconstruction[modality.name] = summed * batch / jnp.maximum(jnp.sum(weights), 1)
+    return total, (nnx.state(model, nnx.BatchStat), Terms(total, kl / jnp.sum(subsets), reconstruction))
+
+
+def infer(
+    graphdef: nnx.GraphDef[MVAE],
+    state: nnx.State,
+    inputs: dict[str, Array],
+    *,
+    present: dict[str, Bool[Array, "batch"]] | None = None,
+) -> Gaussian:
+    """The fused posterior `q(z | X)` under the running batch statistics.
+
+    Args:
+        graphdef: definition of the model.
+        state: parameters and statistics, `nnx.merge_state(params, stats)`.
+        inputs: what is given, by name, `(batch, *shape)`, images in [0, 1]; at least one.
+        present: which samples of an input count; one not given counts always. Where none does, it is the prior.
+
+    Returns:
+        Mean and log variance, `(batch, latent)`.
+
+    Raises:
+        ValueError: nothing is given, or a name is unknown.
+    """
+    model = nnx.merge(graphdef, state)
+    unknown = sorted(set(inputs) - set(model.config.names))
+    if unknown or not inputs:
+        raise ValueError(f"inputs named {list(inputs)}; give at least one of {list(model.config.names)} and no other")
+    absent = tuple(name for name in model.config.names if name not in inputs)
+    batch = len(next(iter(inputs.values())))
+    return product_of_experts(*_experts(model, inputs, present or {}, absent, batch, training=False))
+
+
+def decode(
+    graphdef: nnx.GraphDef[MVAE],
+    state: nnx.State,
+    z: Float[Array, "*batch latent"],
+    *,
+    condition: Float[Array, "*batch condition"] | None = None,
+) -> dict[str, Array]:
+    """Every modality from a latent, under the running batch statistics.
+
+    Args:
+        graphdef: definition of the model.
+        state: parameters and statistics, `nnx.merge_state(params, stats)`.
+        z: any leading axes.
+        condition: the same leading axes; needed where the model has one.
+
+    Returns:
+        By name: logits of images (`jax.nn.sigmoid` gives the image) and values of vectors, `(*batch, *shape)`.
+    """
+    model = nnx.merge(graphdef, state)
+    z = _with_condition(model.config, z, condition)
+    flat = z.reshape(-1, z.shape[-1])
+    return {m.name: model.decode(m.name, flat, None).reshape(*z.shape[:-1], *m.shape) for m in model.config.modalities}
+
+
+def predict(
+    graphdef: nnx.GraphDef[MVAE],
+    state: nnx.State,
+    inputs: dict[str, Array],
+    *,
+    present: dict[str, Bool[Array, "batch"]] | None = None,
+    condition: Float[Array, "batch condition"] | None = None,
+) -> tuple[dict[str, Array], Gaussian]:
+    """What is expected from any subset of the inputs: `decode` of the mean of `infer`; arguments as there."""
+    posterior = infer(graphdef, state, inputs, present=present)
+    return decode(graphdef, state, posterior.mean, condition=condition), posterior
+
+
+def _check(config: Config, asked: str, absent: tuple[str, ...], targets: dict[str, Array]) -> None:
+    if asked not in ("all", "own"):
+        raise ValueError(f"asked={asked!r}; known are 'all' and 'own'")
+    if set(absent) - set(config.names):
+        raise ValueError(f"absent={absent}; the model has {config.names}")
+    if set(targets) != set(config.names):
+        raise ValueError(f"targets named {sorted(targets)}; the model needs {sorted(config.names)}")
+
+
+def _over(mask: Array, like: Array) -> Array:
+    """A mask over the batch with as many axes as `like`."""
+    return mask.reshape(-1, *(1,) * (like.ndim - 1))
+
+
+def _experts(
+    model: MVAE,
+    inputs: dict[str, Array],
+    present: dict[str, Array],
+    absent: tuple[str, ...],
+    batch: int,
+    *,
+    training: bool,
+) -> tuple[Gaussian, Array]:
+    """All experts, `(modality, batch, latent)`, and where they count, `(modality, batch)`."""
+    nothing = jnp.zeros((batch, model.config.latent), jnp.float32)
+    experts, masks = [], []
+    for name in model.config.names:
+        if name in absent:
+            experts.append(Gaussian(nothing, nothing))
+            masks.append(jnp.zeros(batch, bool))
+            continue
+        mask = present.get(name, jnp.ones(batch, bool)).astype(bool)
+        x = jnp.where(_over(mask, inputs[name]), inputs[name], 0)
+        experts.append(model.encode(name, x, mask.astype(jnp.float32) if training else None))
+        masks.append(mask)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *experts), jnp.stack(masks)
+
+
+def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[int, ...]) -> Array:
+    """Standard normal noise `(group, batch, latent)`, a function of the modalities left to each sample."""
+    possible = sorted({part for g in groups for part in range(g.members + 1) if part & g.members == part})
+    drawn = jnp.stack([jax.random.normal(jax.random.fold_in(key, p), shape[1:]) for p in possible])
+    place = jnp.zeros(possible[-1] + 1, jnp.int32).at[jnp.array(possible)].set(jnp.arange(len(possible)))
+    bits = jnp.array([1 << i for i in range(left.shape[1])], jnp.int32)
+    index = place[jnp.sum(jnp.where(left, bits[None, :, None], 0), axis=1)]
+    return drawn[index, jnp.arange(shape[1])[None]]
+
+
+def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
+    width = 0 if condition is None else condition.shape[-1]
+    if width != config.condition:
+        raise ValueError(f"condition of width {width}; the model has {config.condition}")
+    if condition is None:
+        return z
+    return jnp.concatenate([z, jnp.broadcast_to(condition, (*z.shape[:-1], width))], axis=-1)
+
+
+def _error(modality: Modality, output: Array, target: Array) -> Array:
+    """Reconstruction error per leading axes."""
+    if modality.kind == "image":
+        error = jax.nn.softplus(output) - output * target
+        return jnp.sum(error, axis=(-3, -2, -1))
+    return jnp.sum((output - target) ** 2, axis=-1)

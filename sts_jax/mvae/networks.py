@@ -1,0 +1,224 @@
+"""The paper's encoders and decoders as Flax NNX modules.
+
+Used functionally: `init` splits a model once into its definition, parameters and batch statistics;
+`flax.nnx.merge(graphdef, params, stats, copy=True)` puts it together again inside `jax.jit`.
+
+Images are `(batch, height, width, channel)` in [0, 1] at the input and logits at the output; vectors are
+`(batch, size)` at both.
+
+Source: the paper's supplement, "Network Architecture". Hidden widths are Wu and Goodman's (2018).
+"""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sts_jax.mvae.conv import conv, conv_transpose
+from sts_jax.mvae.gaussian import Gaussian
+
+_SIZE = 4  # side of every kernel
+_LAYERS = ((2, 1), (2, 1), (2, 1), (1, 0))  # stride and padding of the encoder; the decoder's backwards
+_EPSILON = 1e-5  # added to a variance
+_LOG_VAR_LIMIT = 8.0  # an encoder's variances lie within exp(-8) .. exp(8)
+
+
+@dataclass(frozen=True)
+class Modality:
+    """One thing that is measured and predicted."""
+
+    name: str
+    kind: Literal["image", "vector"]
+    shape: tuple[int, ...]  # (height, width, channel), sides multiples of 8 and at least 32; or (size,)
+    weight: float = 1.0  # lambda of its reconstruction; the paper: 1 for images, 1000 for the pose
+
+    def __post_init__(self) -> None:
+        if self.kind == "vector" and len(self.shape) == 1 and self.shape[0] > 0:
+            return
+        if self.kind == "image" and len(self.shape) == 3:
+            if all(side >= 32 and side % 8 == 0 for side in self.shape[:2]):
+                return
+            raise ValueError(f"{self.name}: image of {self.shape[:2]}; sides must be multiples of 8, at least 32")
+        raise ValueError(f"{self.name}: a {self.kind!r} of shape {self.shape}; known are image (h, w, c), vector (n,)")
+
+
+@dataclass(frozen=True)
+class Config:
+    """What a model is made of; plain values, so `asdict` of it is JSON."""
+
+    modalities: tuple[Modality, ...]
+    latent: int = 256  # paper
+    hidden: int = 512  # width between two fully connected layers; not in the paper
+    widths: tuple[int, ...] = (32, 64, 128, 256)  # paper
+    condition: int = 0  # width of the condition, concatenated to the latent; 0: none
+    momentum: float = 0.9  # of the running batch statistics, per step
+
+    def __post_init__(self) -> None:
+        names = [m.name for m in self.modalities]
+        if not names or len(set(names)) != len(names):
+            raise ValueError(f"modalities named {names}: give at least one, each name once")
+        if len(self.widths) != len(_LAYERS):
+            raise ValueError(f"widths={self.widths}: give {len(_LAYERS)}, one per convolution")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the modalities, in order."""
+        return tuple(m.name for m in self.modalities)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain dictionaries and lists."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Config":
+        """The inverse of `to_json`, also after a trip through a JSON file."""
+        modalities = tuple(Modality(**{**m, "shape": tuple(m["shape"])}) for m in values["modalities"])
+        return cls(**{**values, "modalities": modalities, "widths": tuple(values["widths"])})
+
+
+class BatchNorm(nnx.Module):
+    """Batch normalisation with a weight per sample.
+
+    Training: `mean = sum_n w_n mean_hw(x_n) / sum_n w_n`, the variance likewise, and the running statistics
+    become `momentum old + (1 - momentum) new`. Where no sample has weight, they stay and are used.
+    Evaluation (`weights=None`): the running statistics.
+    """
+
+    def __init__(self, channels: int, *, momentum: float) -> None:
+        self.scale = nnx.Param(jnp.ones(channels, jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(channels, jnp.float32))
+        self.mean = nnx.BatchStat(jnp.zeros(channels, jnp.float32))
+        self.var = nnx.BatchStat(jnp.ones(channels, jnp.float32))
+        self.momentum = momentum
+
+    def __call__(
+        self, x: Float[Array, "batch h w channel"], weights: Float[Array, "batch"] | None
+    ) -> Float[Array, "batch h w channel"]:
+        """Normalise; with `weights`, by the statistics of this batch, which also enter the running ones."""
+        mean, var = self.mean[...], self.var[...]
+        if weights is not None:
+            total = jnp.sum(weights)
+            share = weights / jnp.where(total > 0, total, 1)
+            new_mean = jnp.sum(share[:, None] * jnp.mean(x, axis=(1, 2)), axis=0)
+            new_var = jnp.sum(share[:, None] * jnp.mean((x - new_mean[None, None, None]) ** 2, axis=(1, 2)), axis=0)
+            old_mean, old_var = mean, var
+            mean, var = jnp.where(total > 0, new_mean, old_mean), jnp.where(total > 0, new_var, old_var)
+            self.mean[...] = jax.lax.stop_gradient(self.momentum * old_mean + (1 - self.momentum) * mean)
+            self.var[...] = jax.lax.stop_gradient(self.momentum * old_var + (1 - self.momentum) * var)
+        slope = self.scale[...] / jnp.sqrt(var + _EPSILON)
+        offset = self.bias[...] - slope * mean
+        return x * slope[None, None, None] + offset[None, None, None]
+
+
+class ImageEncoder(nnx.Module):
+    """Four convolutions (with batch normalisation and Swish), then two fully connected layers."""
+
+    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
+        channels = (modality.shape[2], *config.widths)
+        self.kernels = nnx.List(
+            [
+                nnx.Param(_kernel(rngs.params(), a, b, _SIZE**2 * a))
+                for a, b in zip(channels, config.widths, strict=False)
+            ]
+        )
+        self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in config.widths])
+        self.first = nnx.Linear(math.prod(_core(modality)) * config.widths[-1], config.hidden, rngs=rngs)
+        self.second = nnx.Linear(config.hidden, 2 * config.latent, rngs=rngs)
+
+    def __call__(self, x: Array, weights: Array | None) -> Gaussian:
+        for kernel, norm, (stride, padding) in zip(self.kernels, self.norms, _LAYERS, strict=True):
+            x = jax.nn.swish(norm(conv(x, kernel[...], stride, padding), weights))
+        return _gaussian(self.second(jax.nn.swish(self.first(x.reshape(len(x), -1)))))
+
+
+class ImageDecoder(nnx.Module):
+    """A fully connected layer, then four transposed convolutions; the last one is linear and gives logits."""
+
+    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
+        channels = (*config.widths[::-1], modality.shape[2])
+        self.core = (*_core(modality), channels[0])
+        self.first = nnx.Linear(config.latent + config.condition, math.prod(self.core), rngs=rngs)
+        self.kernels = nnx.List(
+            [
+                nnx.Param(_kernel(rngs.params(), a, b, (_SIZE // stride) ** 2 * a))
+                for a, b, (stride, _) in zip(channels, channels[1:], _LAYERS[::-1], strict=False)
+            ]
+        )
+        self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in channels[1:-1]])
+        self.bias = nnx.Param(jnp.zeros(channels[-1], jnp.float32))
+
+    def __call__(self, z: Array, weights: Array | None) -> Array:
+        x = jax.nn.swish(self.first(z)).reshape(len(z), *self.core)
+        for i, (stride, padding) in enumerate(_LAYERS[::-1]):
+            x = conv_transpose(x, self.kernels[i][...], stride, padding)
+            if i < len(self.norms):
+                x = jax.nn.swish(self.norms[i](x, weights))
+        return x + self.bias[...][None, None, None]
+
+
+class VectorEncoder(nnx.Module):
+    """Two fully connected layers."""
+
+    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
+        self.first = nnx.Linear(modality.shape[0], config.hidden, rngs=rngs)
+        self.second = nnx.Linear(config.hidden, 2 * config.latent, rngs=rngs)
+
+    def __call__(self, x: Array, weights: Array | None) -> Gaussian:
+        del weights
+        return _gaussian(self.second(jax.nn.swish(self.first(x))))
+
+
+class VectorDecoder(nnx.Module):
+    """Two fully connected layers."""
+
+    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
+        self.first = nnx.Linear(config.latent + config.condition, config.hidden, rngs=rngs)
+        self.second = nnx.Linear(config.hidden, modality.shape[0], rngs=rngs)
+
+    def __call__(self, z: Array, weights: Array | None) -> Array:
+        del weights
+        return self.second(jax.nn.swish(self.first(z)))
+
+
+class MVAE(nnx.Module):
+    """One encoder and one decoder per modality.
+
+    `encode` and `decode` take a weight per sample for the batch statistics; `None` means evaluation.
+    """
+
+    def __init__(self, config: Config, *, rngs: nnx.Rngs) -> None:
+        self.config = config
+        encoders = {"image": ImageEncoder, "vector": VectorEncoder}
+        decoders = {"image": ImageDecoder, "vector": VectorDecoder}
+        self.encoders = nnx.Dict({m.name: encoders[m.kind](m, config, rngs=rngs) for m in config.modalities})
+        self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config, rngs=rngs) for m in config.modalities})
+
+    def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
+        """The expert of one modality, `(batch, latent)`."""
+        return self.encoders[name](x, weights)
+
+    def decode(self, name: str, z: Array, weights: Array | None) -> Array:
+        """Logits of an image, or a vector, from the latent with the condition behind it."""
+        return self.decoders[name](z, weights)
+
+
+def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
+    """A new model as `(graphdef, params, stats)`; consumes `key`."""
+    return nnx.split(MVAE(config, rngs=nnx.Rngs(key)), nnx.Param, nnx.BatchStat)
+
+
+def _core(modality: Modality) -> tuple[int, int]:
+    return modality.shape[0] // 8 - 3, modality.shape[1] // 8 - 3
+
+
+def _kernel(key: Array, a: int, b: int, fan_in: int) -> Array:
+    return jax.random.normal(key, (_SIZE, _SIZE, a, b), jnp.float32) / math.sqrt(fan_in)
+
+
+def _gaussian(x: Array) -> Gaussian:
+    mean, log_var = jnp.split(x, 2, axis=-1)
+    return Gaussian(mean, _LOG_VAR_LIMIT * jnp.tanh(log_var / _LOG_VAR_LIMIT))

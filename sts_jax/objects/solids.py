@@ -1,0 +1,345 @@
+"""Geometry of solids on the host, NumPy in float64: moments, fill levels, convex hulls, corner normals, assembly.
+
+Triangles are counter-clockwise seen from outside. A row of moments is `[1, x, y, z, xx, yy, zz, xy, xz, yz]`
+integrated over a solid or a surface.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull, QhullError
+
+from .body import FACE_CLASSES, HULL_CLASSES, NUM_FILLS, Body
+
+WALL = 1.2  # kg/m^2, plastic about 1.2 mm thick: the shell of everything that holds something
+CONTENTS = 1000.0  # kg/m^3, water
+CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are made
+HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less
+
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+def linear(srgb: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def solid_moments(
+    triangles: Float[np.ndarray, "f 3 3"], *, reference: Float[np.ndarray, "3"] | None = None
+) -> Float[np.ndarray, "f 10"]:
+    """Moments of the signed tetrahedra between a reference point and each triangle; summed, those of the solid.
+
+    For a tetrahedron with corners `0, a, b, c` relative to the reference, v = a . (b x c) / 6, int r = v s / 4 and
+    int r r^T = v (s s^T + a a^T + b b^T + c c^T) / 20 with s = a + b + c.
+
+    Args:
+        triangles: corners, m.
+        reference: any point; for a clipped solid one on the cutting plane, so that the cut's own face adds nothing.
+
+    Returns:
+        One row per triangle: m^3, m^4, m^5.
+    """
+    origin = np.zeros(3) if reference is None else reference
+    r = triangles - origin
+    volume = np.einsum("fi,fi->f", r[:, 0], np.cross(r[:, 1], r[:, 2])) / 6
+    total = r.sum(axis=1)
+    second = (np.einsum("fi,fj->fij", total, total) + np.einsum("fki,fkj->fij", r, r)) / 20
+    return _shifted(volume, total / 4, second, origin)
+
+
+def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
+    """Moments of triangles as thin sheets: area A, int r = A s / 3, int r r^T = A (s s^T + sum r_i r_i^T) / 12."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(cross, axis=1) / 2
+    total = triangles.sum(axis=1)
+    second = (np.einsum("fi,fj->fij", total, total) + np.einsum("fki,fkj->fij", triangles, triangles)) / 12
+    return _shifted(area, total / 3, second, np.zeros(3))
+
+
+def _shifted(measure: np.ndarray, mean: np.ndarray, second: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    second = (
+        second + np.einsum("fi,j->fij", mean, origin) + np.einsum("i,fj->fij", origin, mean) + np.outer(origin, origin)
+    )
+    columns = [np.ones_like(measure), *(mean + origin).T, *(second[:, i, j] for i, j in _PAIRS)]
+    return measure[:, None] * np.stack(columns, axis=1)
+
+
+def _below(triangles: np.ndarray, height: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles and weights (+1, -1) whose sum is what lies below the level.
+
+    Of a triangle that crosses it, either the corner alone below is added, or the whole less the corner alone above.
+    """
+    under = height < level
+    count = under.sum(axis=1)
+    crossing = (count == 1) | (count == 2)
+    lone = np.argmax(under == (count == 1)[:, None], axis=1)[crossing]
+    order = (lone[:, None] + np.arange(3)) % 3
+    corner = np.take_along_axis(triangles[crossing], order[:, :, None], axis=1)
+    h = np.take_along_axis(height[crossing], order, axis=1)
+    share = ((level - h[:, :1]) / (h[:, 1:] - h[:, :1]))[:, :, None]
+    corner[:, 1:] = corner[:, :1] + share * (corner[:, 1:] - corner[:, :1])
+    whole = count >= 2
+    weight = np.concatenate([np.ones(whole.sum()), np.where(count[crossing] == 1, 1.0, -1.0)])
+    return np.concatenate([triangles[whole], corner]), weight
+
+
+def fill_moments(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *,
+    direction: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    num: int = NUM_FILLS,
+) -> Float[np.ndarray, "k 10"]:
+    """Moments of what fills a closed mesh from its lowest point along a direction, by share of its volume.
+
+    Exact for the mesh: with a point of the liquid's surface as reference, the signed tetrahedra of the triangles
+    clipped to the half-space sum to the clipped solid's moments. The level for each volume is found by bisection.
+
+    Args:
+        vertices: m.
+        faces: closed, counter-clockwise from outside.
+        direction: up, any length; contents frozen in another attitude take another direction.
+        num: number of levels K.
+
+    Returns:
+        Row k: the moments of the lowest k / (K - 1) of the volume; row 0 is zero.
+
+    Raises:
+        ValueError: the mesh encloses no volume, or the direction is zero.
+    """
+    up = np.asarray(direction, float)
+    if not np.linalg.norm(up) > 0:
+        raise ValueError(f"direction must not be zero, got {direction}")
+    up = up / np.linalg.norm(up)
+    triangles = np.asarray(vertices, float)[faces]
+    middle = triangles.mean(axis=(0, 1))
+    full = solid_moments(triangles, reference=middle).sum(axis=0)
+    if not full[0] > 0:
+        raise ValueError(f"the mesh encloses no volume ({full[0]:.3g} m^3): close it, or turn its faces outwards")
+    height = triangles @ up
+
+    def clipped(level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        part, weight = _below(triangles, height, level)
+        return part, weight, middle + (level - middle @ up) * up
+
+    def volume(level: float) -> float:
+        part, weight, reference = clipped(level)
+        r = part - reference
+        return float(weight @ np.einsum("fi,fi->f", r[:, 0], np.cross(r[:, 1], r[:, 2]))) / 6
+
+    table = np.zeros((num, 10))
+    table[-1] = full
+    bottom, top = float(height.min()), float(height.max())
+    low, low_volume = bottom, 0.0
+    for k in range(1, num - 1):
+        target = full[0] * k / (num - 1)
+        level = _root(volume, target, low, low_volume, top, full[0])
+        part, weight, reference = clipped(level)
+        table[k] = weight @ solid_moments(part, reference=reference)
+        low, low_volume = level, target
+    return table
+
+
+def _root(
+    function: Callable[[float], float], target: float, low: float, at_low: float, high: float, at_high: float
+) -> float:
+    """Root of an increasing function by secants inside a bracket, halved wherever a secant gains too little."""
+    tolerance = 1e-12 * abs(at_high)
+    for step in range(100):
+        width = high - low
+        share = 0.5 if step % 3 == 2 else np.clip((target - at_low) / (at_high - at_low), 0.01, 0.99)
+        middle = low + share * width
+        value = function(middle)
+        if abs(value - target) <= tolerance or width < 1e-15:
+            break
+        if value < target:
+            low, at_low = middle, value
+        else:
+            high, at_high = middle, value
+    return float(middle)
+
+
+def convex_hull(
+    points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
+) -> Float[np.ndarray, "h 3"]:
+    """Vertices of the convex hull: all that matter to within the tolerance, at most as many as the limit.
+
+    Starting from a simplex, the point furthest outside is added until none is outside by more than the tolerance.
+
+    Args:
+        points: m.
+        limit: most vertices.
+        tolerance: m.
+
+    Returns:
+        A subset of the points.
+
+    Raises:
+        ValueError: the points lie in a plane.
+    """
+    try:
+        candidates = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError) as error:
+        raise ValueError("the points lie in a plane: their convex hull has no volume") from error
+    chosen = [int(np.argmax(candidates[:, 0]))]
+    relative = candidates - candidates[chosen[0]]
+    chosen.append(int(np.argmax(np.linalg.norm(relative, axis=1))))
+    chosen.append(int(np.argmax(np.linalg.norm(np.cross(relative, relative[chosen[1]]), axis=1))))
+    normal = np.cross(relative[chosen[1]], relative[chosen[2]])
+    chosen.append(int(np.argmax(np.abs(relative @ normal))))
+    while len(chosen) < limit:
+        planes = ConvexHull(candidates[chosen]).equations
+        outside = (candidates @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+        furthest = int(np.argmax(outside))
+        if outside[furthest] <= tolerance:
+            break
+        chosen.append(furthest)
+    corners = candidates[chosen]
+    return corners[np.sort(ConvexHull(corners).vertices)]
+
+
+def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
+    """Distance (m) of each point from a convex hull; 0 inside."""
+    shape = ConvexHull(hull)
+    outside = (points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1)
+    distance = np.zeros(len(points))
+    triangles = hull[shape.simplices]
+    for index in np.nonzero(outside > 1e-9)[0]:
+        nearest = trimesh.triangles.closest_point(triangles, np.repeat(points[index][None], len(triangles), axis=0))
+        distance[index] = np.linalg.norm(nearest - points[index], axis=1).min()
+    return distance
+
+
+def hull_gap(body: Body) -> float:
+    """Largest distance (m) by which the visible surface of one body sticks out of its collision hull."""
+    hull = np.unique(np.asarray(body.hull, float), axis=0)
+    return float(outside_hull(np.unique(np.asarray(body.vertices, float), axis=0), hull).max())
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
+) -> Float[np.ndarray, "f 3 3"]:
+    """Unit normal of each corner: the mean, weighted by angle, of the faces at its vertex within the crease angle.
+
+    Args:
+        vertices: m.
+        faces: indices; vertices at one place are one vertex where the surface is to be smooth.
+        crease: rad.
+
+    Returns:
+        Normals; a face without area gets (0, 0, 1).
+    """
+    triangles = vertices[faces]
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    flat = np.where(length > 0, cross / np.where(length > 0, length, 1), np.array([0.0, 0.0, 1.0]))
+    angle = trimesh.triangles.angles(triangles) * (length > 0)
+
+    corner_vertex = faces.ravel()
+    order = np.argsort(corner_vertex, kind="stable")
+    count = np.bincount(corner_vertex, minlength=len(vertices))
+    start = np.cumsum(count) - count
+    # Every corner with every corner at its vertex.
+    repeats = count[corner_vertex]
+    first = np.repeat(np.arange(len(corner_vertex)), repeats)
+    within = np.arange(len(first)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    second = order[start[corner_vertex[first]] + within]
+    near = np.einsum("pi,pi->p", flat[first // 3], flat[second // 3]) > np.cos(crease)
+    weight = near * angle.ravel()[second]
+    normals = np.stack(
+        [np.bincount(first, weight * flat[second // 3, axis], len(corner_vertex)) for axis in range(3)], axis=1
+    )
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(size > 1e-9, normals / np.where(size > 1e-9, size, 1), np.repeat(flat, 3, axis=0))
+    return normals.reshape(-1, 3, 3)
+
+
+def _class(count: int, classes: tuple[int, ...]) -> int:
+    return next(size for size in classes if count <= size)
+
+
+def _pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
+    padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
+    return np.concatenate([array, padding])
+
+
+def assemble(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    colors: Float[np.ndarray, "f 3 3"],
+    *,
+    density: Float[np.ndarray, "f"],
+    interior: tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]] | None,
+    contents_density: float = 0.0,
+    mass: float | None = None,
+    uv: Float[np.ndarray, "f 3 2"] | None = None,
+    texture: Float[np.ndarray, "t t 3"] | None = None,
+    two_sided: Bool[np.ndarray, ""] | bool = False,
+    category: int = -1,
+) -> Body:
+    """A surface with its material as a padded `Body`, moved so that its hull's centroid is the origin.
+
+    Args:
+        vertices: m, +z up.
+        faces: counter-clockwise from outside; at most FACE_CLASSES[-1].
+        colors: [0, 1], linear light, of each corner.
+        density: kg/m^2 of each face.
+        interior: a closed mesh in the same frame that bounds the contents, or None for a solid thing.
+        contents_density: kg/m^3.
+        mass: kg, of the shell; None takes area times density.
+        uv: texture coordinates of each corner, v = 0 at the texture's top row.
+        texture: [0, 1], linear light, of one of TEXTURE_CLASSES.
+        two_sided: whether the surface is seen from behind too.
+        category: index into CATEGORIES, or -1.
+
+    Returns:
+        The body.
+
+    Raises:
+        ValueError: the convex hull has no volume.
+    """
+    hull = convex_hull(vertices)
+    shape = ConvexHull(hull)
+    middle = hull.mean(axis=0)
+    outward = hull[shape.simplices] - middle
+    sign = np.sign(np.einsum("fi,fi->f", outward[:, 0], np.cross(outward[:, 1], outward[:, 2])))
+    moments = sign @ solid_moments(outward)
+    origin = middle + moments[1:4] / moments[0]
+    vertices, hull = vertices - origin, hull - origin
+
+    shell = density @ surface_moments(vertices[faces])
+    if mass is not None:
+        shell *= mass / shell[0]
+    com = shell[1:4] / shell[0]
+    second = np.zeros((3, 3))
+    for (i, j), value in zip(_PAIRS, shell[4:], strict=True):
+        second[i, j] = second[j, i] = value
+    second -= shell[0] * np.outer(com, com)
+
+    contents = np.zeros((NUM_FILLS, 10))
+    if interior is not None:
+        contents = fill_moments(interior[0] - origin, interior[1])
+
+    size = max(_class(len(faces), FACE_CLASSES), _class(len(vertices), FACE_CLASSES))
+    single = np.float32
+    uv = np.zeros((len(faces), 3, 2)) if uv is None else uv
+    texture = np.ones((1, 1, 3)) if texture is None else texture
+    return Body(
+        vertices=jnp.asarray(_pad(vertices, size, vertices[-1]), single),
+        faces=jnp.asarray(_pad(faces, size, 0.0), np.int32),
+        normals=jnp.asarray(_pad(corner_normals(vertices, faces), size, np.array([0.0, 0.0, 1.0])), single),
+        colors=jnp.asarray(_pad(colors, size, 0.0), single),
+        uv=jnp.asarray(_pad(uv, size, 0.0), single),
+        texture=jnp.asarray(texture, single),
+        two_sided=jnp.asarray(two_sided, bool),
+        hull=jnp.asarray(_pad(hull, _class(len(hull), HULL_CLASSES), hull[-1]), single),
+        shell_mass=jnp.asarray(shell[0], single),
+        shell_com=jnp.asarray(com, single),
+        shell_inertia=jnp.asarray(np.trace(second) * np.eye(3) - second, single),
+        contents=jnp.asarray(contents, single),
+        contents_density=jnp.asarray(contents_density, single),
+        category=jnp.asarray(category, np.int32),
+    )

@@ -1,0 +1,23 @@
+"""Sight: the camera, the rasteriser (plain arrays in), the light above the skin."""
+
+from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
+from sts_jax.optics.photograph import photograph
+from sts_jax.optics.rasterise import barycentrics, rasterise
+from sts_jax.optics.shading import Room, empty_view, sample_texture, shade, to_linear, to_srgb
+
+__all__ = [
+    "Camera",
+    "Room",
+    "barycentrics",
+    "empty_view",
+    "full_window",
+    "object_window",
+    "photograph",
+    "rasterise",
+    "rays",
+    "sample_texture",
+    "shade",
+    "to_linear",
+    "to_pixels",
+    "to_srgb",
+]

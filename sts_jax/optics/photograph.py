@@ -1,0 +1,75 @@
+"""The scene from outside, for people to look at: any triangles, any viewpoint, the same rasteriser."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sts_jax import _math
+from sts_jax.optics.camera import Camera, full_window, rays, to_pixels
+from sts_jax.optics.rasterise import barycentrics, rasterise
+from sts_jax.optics.shading import to_srgb
+
+_SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # light from above and from below, linear
+_LAMP = (0.45, 0.43, 0.40)  # of a lamp over the photographer's left shoulder, linear
+_SAMPLES = 3  # a pixel's samples along each side
+
+
+def photograph(
+    vertices: Float[Array, "v 3"],
+    faces: Int[Array, "f 3"],
+    normals: Float[Array, "f 3 3"],
+    albedo: Float[Array, "f 3 3"],
+    *,
+    eye: Float[Array, "3"],
+    target: Float[Array, "3"],
+    fov: float = 0.5,
+    resolution: tuple[int, int] = (200, 200),
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    two_sided: Bool[Array, ""] | bool = False,
+) -> Float[Array, "h w 3"]:
+    """A picture of triangles from a free viewpoint, z up, by daylight and a lamp.
+
+    Args:
+        vertices: World frame (m).
+        faces: Corner indices, counter-clockwise seen from outside.
+        normals: Unit, of each corner of each face.
+        albedo: Linear, of each corner of each face.
+        eye: Where the pinhole is (m); not straight above or below the target.
+        target: What is in the middle of the picture (m).
+        fov: Vertical field of view (rad).
+        resolution: (height, width), pixels.
+        background: sRGB where there is nothing.
+        two_sided: Whether faces are seen from behind too.
+
+    Returns:
+        Image, sRGB in [0, 1].
+    """
+    eye = jnp.asarray(eye, jnp.float32)
+    forward = _math.normalize(jnp.asarray(target, jnp.float32) - eye)
+    right = _math.normalize(jnp.cross(forward, jnp.array([0.0, 0.0, 1.0])))
+    turn = jnp.stack([right, jnp.cross(forward, right), forward])
+    shape = (resolution[0] * _SAMPLES, resolution[1] * _SAMPLES)
+    # The pinhole of `camera` sits at z = -distance; the point it looks at, one metre ahead, is the origin.
+    camera = Camera(distance=1.0, fov=fov, aspect=resolution[1] / resolution[0], near=0.01)
+    window = full_window(camera, shape)
+    points = (vertices - eye) @ turn.T - jnp.array([0.0, 0.0, 1.0])
+    pixels, depth = to_pixels(camera, window, shape, points)
+    inverse = 1 / jnp.maximum(depth, 0.01)
+    keep = jnp.all(depth[faces] > 0.01, axis=1)
+    winner = rasterise(pixels, -inverse, faces, keep, jnp.asarray(two_sided), shape)
+    nearest = jnp.maximum(winner, 0)
+    shares = [w * inverse[faces[:, k]][nearest] for k, w in enumerate(barycentrics(pixels, faces, winner))]
+    total = sum(shares)
+    corners = jnp.concatenate([normals, albedo], -1)[nearest]
+    values = sum((w / total)[..., None] * corners[..., k, :] for k, w in enumerate(shares))
+
+    slopes = rays(camera, window, shape)
+    ray = jnp.concatenate([slopes, jnp.ones_like(slopes[..., :1])], -1) @ turn
+    normal = _math.normalize(values[..., :3])
+    normal = jnp.where(jnp.sum(normal * ray, -1, keepdims=True) > 0, -normal, normal)
+    lamp = _math.normalize(-forward - 0.6 * right + jnp.array([0.0, 0.0, 0.8]))
+    up = 0.5 + 0.5 * normal[..., 2:]
+    light = up * jnp.array(_SKY) + (1 - up) * jnp.array(_GROUND)
+    light += jnp.maximum(normal @ lamp, 0)[..., None] * jnp.array(_LAMP)
+    image = jnp.where((winner >= 0)[..., None], to_srgb(values[..., 3:] * light), jnp.array(background))
+    image = image.reshape(resolution[0], _SAMPLES, resolution[1], _SAMPLES, 3).mean((1, 3))
+    return jnp.clip(image, 0, 1)

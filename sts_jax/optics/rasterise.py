@@ -1,0 +1,167 @@
+"""Which face each pixel sees: a z-buffer in plain JAX, for triangles of any size on screen.
+
+Every face is cut into the pixel centres it can cover, row by row: as many columns as its widest row is wide. The list
+of these (face, pixel) candidates is walked in chunks, so the work follows what is covered and not the number of faces
+times pixels. Each chunk is one scatter-min of a 32-bit key, depth in its high bits and the face's index in its low
+ones. All of this decides and has no gradient; what is interpolated from the winning face has.
+
+Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. `order` is smaller for
+what is nearer and affine across a face on the screen: -1/depth in a pinhole's view, depth itself in a parallel one.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+_SLACK = 1e-4  # pixels by which faces are grown, so that no pixel centre on a shared edge falls between two
+_NOTHING = np.uint32(0xFFFFFFFF)
+
+
+def rasterise(
+    points: Float[Array, "v 2"],
+    order: Float[Array, "v"],
+    faces: Int[Array, "f 3"],
+    keep: Bool[Array, "f"],
+    two_sided: Bool[Array, ""],
+    shape: tuple[int, int],
+    *,
+    chunk: int = 2048,
+) -> Int[Array, "h w"]:
+    """Index of the nearest face at every pixel centre.
+
+    Args:
+        points: vertices on the screen, (column, row) in pixels.
+        order: of each vertex; smaller is nearer.
+        faces: corner indices, counter-clockwise seen from outside the object by a right-handed eye.
+        keep: faces to draw at all.
+        two_sided: whether faces are seen from behind too.
+        shape: (height, width) of the image, pixels.
+        chunk: candidates tested at a time.
+
+    Returns:
+        Face indices, -1 where no face is seen. No gradient.
+    """
+    height, width = shape
+    num_faces = faces.shape[0]
+    points, order = jax.lax.stop_gradient((points, order))
+
+    x, y, o = points[faces, 0], points[faces, 1], order[faces]
+    a, b, c = ((x[:, k], y[:, k], o[:, k]) for k in range(3))
+    area = _cross(a, b, c)
+    # Seen along +z with x right and y down, a face that looks at us runs counter-clockwise: negative area.
+    drawn = keep & jnp.where(two_sided, area != 0, area < 0)
+
+    a, b = _by_row(a, b)
+    b, c = _by_row(b, c)
+    a, b = _by_row(a, b)
+    (x0, y0, o0), (x1, y1, o1), (x2, y2, o2) = a, b, c
+    area = _cross(a, b, c)
+    safe_area = jnp.where(area == 0, 1, area)
+    slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
+    slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
+
+    first_row = jnp.clip(jnp.ceil(y0 - _SLACK), 0, height)
+    last_row = jnp.clip(jnp.floor(y2 + _SLACK), -1, height - 1)
+    tall = y2 - y0
+    widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
+    left, right = _lowest(x0, x1, x2), _highest(x0, x1, x2)
+    # Rows that are nearly flat on screen are as wide as the face is.
+    widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
+    outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
+    empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
+    columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
+    rows = jnp.maximum(last_row - first_row + 1, 0)
+    number = jnp.where(drawn & ~outside & ~empty, rows * columns, 0).astype(jnp.int32)
+    end = jnp.cumsum(number)
+
+    face_bits = max((num_faces - 1).bit_length(), 1)
+    levels = 2.0 ** min(32 - face_bits, 23) - 2
+    used = number > 0
+    lowest, highest = _lowest(o0, o1, o2), _highest(o0, o1, o2)
+    nearest = jnp.min(jnp.where(used, lowest, jnp.inf))
+    farthest = jnp.max(jnp.where(used, highest, -jnp.inf))
+    scale = levels / jnp.where(farthest > nearest, farthest - nearest, 1)
+    table = jnp.stack([x0, x1, x2, y0, y1, y2, o0, slope_x, slope_y, lowest, highest, first_row, columns], axis=1)
+
+    def body(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        base, image = state
+        candidate = base + jnp.arange(chunk, dtype=jnp.int32)
+        face = jnp.searchsorted(end, candidate, side="right", method="scan_unrolled").astype(jnp.int32)
+        live = face < num_faces
+        face = jnp.minimum(face, num_faces - 1)
+        x0, x1, x2, y0, y1, y2, o0, sx, sy, low, high, row0, cols = jnp.moveaxis(table[face], 1, 0)
+        local = candidate - (end[face] - number[face])
+        cols = jnp.maximum(cols.astype(jnp.int32), 1)
+        down = local // cols
+        row = row0 + down
+        long = x0 + (x2 - x0) * _fraction(row, y0, y2)
+        short = jnp.where(
+            row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2)
+        )
+        # A face that lies within one row's slack covers that row from end to end.
+        flat = y2 - y0 <= 1e-3
+        start = jnp.where(flat, _lowest(x0, x1, x2), jnp.minimum(long, short))
+        stop = jnp.where(flat, _highest(x0, x1, x2), jnp.maximum(long, short))
+        column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + (local - down * cols)
+        live &= (column <= stop + _SLACK) & (column < width)
+        value = jnp.clip(o0 + sx * (column - x0) + sy * (row - y0), low, high)
+        level = jnp.clip((value - nearest) * scale, 0, levels).astype(jnp.uint32)
+        key = (level << face_bits) | face.astype(jnp.uint32)
+        pixel = jnp.where(live, row.astype(jnp.int32) * width + column.astype(jnp.int32), height * width)
+        return base + chunk, image.at[pixel].min(key, mode="drop")
+
+    blank = jnp.full(height * width, _NOTHING)
+    _, image = jax.lax.while_loop(lambda state: state[0] < end[-1], body, (jnp.int32(0), blank))
+    winner = (image & jnp.uint32(2**face_bits - 1)).astype(jnp.int32)
+    return jnp.where(image == _NOTHING, -1, winner).reshape(shape)
+
+
+def barycentrics(
+    points: Float[Array, "v 2"], faces: Int[Array, "f 3"], winner: Int[Array, "h w"]
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]:
+    """Weights of the winning face's corners at every pixel centre, affine on the screen.
+
+    Args:
+        points: vertices on the screen, (column, row) in pixels.
+        faces: corner indices.
+        winner: from `rasterise`.
+
+    Returns:
+        Non-negative weights that sum to 1, one image per corner; arbitrary but finite where nothing is seen.
+    """
+    height, width = winner.shape
+    corners = points[faces].reshape(-1, 6)[jnp.maximum(winner, 0)]
+    column = jnp.broadcast_to(jnp.arange(width, dtype=jnp.float32)[None, :], winner.shape)
+    row = jnp.broadcast_to(jnp.arange(height, dtype=jnp.float32)[:, None], winner.shape)
+    a, b, c = ((corners[..., 2 * k] - column, corners[..., 2 * k + 1] - row) for k in range(3))
+    area = _cross(a, b, c)
+    ok = area != 0
+    area = jnp.where(ok, area, 1)
+    first = jnp.clip((b[0] * c[1] - c[0] * b[1]) / area, 0, 1)
+    second = jnp.clip((c[0] * a[1] - a[0] * c[1]) / area, 0, 1 - first)
+    return jnp.where(ok, first, 1), jnp.where(ok, second, 0), jnp.where(ok, 1 - first - second, 0)
+
+
+def _cross(a: tuple[Array, ...], b: tuple[Array, ...], c: tuple[Array, ...]) -> Array:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+
+
+def _by_row(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    swap = a[1] > b[1]
+    return tuple(jnp.where(swap, q, p) for p, q in zip(a, b, strict=True)), tuple(
+        jnp.where(swap, p, q) for p, q in zip(a, b, strict=True)
+    )
+
+
+def _lowest(a: Array, b: Array, c: Array) -> Array:
+    return jnp.minimum(jnp.minimum(a, b), c)
+
+
+def _highest(a: Array, b: Array, c: Array) -> Array:
+    return jnp.maximum(jnp.maximum(a, b), c)
+
+
+def _fraction(value: Array, low: Array, high: Array) -> Array:
+    span = high - low
+    return jnp.clip((value - low) / jnp.where(span > 0, span, 1), 0, 1)

@@ -1,0 +1,146 @@
+"""Where a convex hull touches the pad: exact candidates, and up to four contact points chosen among them.
+
+MJX's own test of a mesh against a box was tried and left: beside a face it counts every pair of edges, so a small
+object lying on a pad much larger than itself is pushed by contacts between its edges and the pad's distant rims (it
+never comes to rest, and some are thrown off), and it keeps each mesh in its compiled structure. The pad is a box
+whose sides face along the axes, so its contacts with a convex hull are three kinds only:
+
+- a vertex of the hull inside the pad: the nearest of the top and the four sides pushes it out;
+- an edge of the hull across a rim of the top: pushed along the common normal of the two lines;
+- a corner of the top inside the hull: pushed along the normal of the nearest of the hull's lower faces.
+
+Each holds the true distance along its own normal. C MuJoCo with a mesh is the truth it is tested against.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import ConvexHull, QhullError
+
+from sts_jax import _math
+
+NUM_CONTACTS = 4  # what MJX reserves for two boxes
+SKIN = 0.001  # m; points this much higher than the deepest one may still belong to the support
+
+
+class Hull(NamedTuple):
+    """A convex hull in the mesh frame, padded to its class by repetition."""
+
+    vertices: Float[Array, "*n h 3"]  # m
+    edges: Float[Array, "*n e 2 3"]  # m, both ends; diagonals of flat faces are among them and do no harm
+    planes: Float[Array, "*n f 4"]  # outward unit normal, offset (m): inside is normal . x < offset
+
+
+class Contacts(NamedTuple):
+    """Contact points in the sensor frame, in MuJoCo's convention."""
+
+    dist: Float[Array, "4"]  # m, negative is penetration, 1 where there is no contact
+    pos: Float[Array, "4 3"]  # m, halfway between the two surfaces
+    frame: Float[Array, "4 3 3"]  # rows: normal from pad to object, two tangents
+
+
+def hull(vertices: np.ndarray) -> Hull:
+    """Edges and faces of the convex hull of points; counts depend on the number of points alone.
+
+    Args:
+        vertices: (n, 3) m; repetitions are ignored.
+
+    Raises:
+        ValueError: the points span no volume.
+    """
+    points = np.asarray(vertices, np.float64)
+    try:
+        found = ConvexHull(points)
+    except QhullError as error:
+        raise ValueError("the collision hull spans no volume; give at least four points that do") from error
+    sides = np.sort(found.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges = points[np.unique(sides, axis=0)]
+    planes = found.equations * [1, 1, 1, -1]
+
+    def pad(x: np.ndarray, count: int) -> np.ndarray:
+        return np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)]).astype(np.float32)
+
+    n = len(points)
+    return Hull(pad(points, n), pad(edges, 3 * n - 6), pad(planes, 2 * n - 4))
+
+
+def _vertices(points: Float[Array, "h 3"], half: Float[Array, "2"]) -> tuple[Array, Array, Array]:
+    across = half - jnp.abs(points[:, :2])
+    depths = jnp.concatenate([-points[:, 2:], across], axis=1)
+    nearest = jnp.argmin(depths, axis=1)
+    outward = jnp.where(points[:, :2] < 0, -1.0, 1.0)
+    axis = jax.nn.one_hot(nearest, 3)
+    normal = jnp.concatenate([axis[:, 1:] * outward, axis[:, :1]], axis=1)
+    return jnp.min(depths, axis=1), points, normal
+
+
+def _rim(ends: Float[Array, "e 2 3"], half: Float[Array, "2"], axis: int, sign: float) -> tuple[Array, Array, Array]:
+    out = sign * ends[..., axis] - half[axis]
+    inner = jnp.where((out[:, 0] < out[:, 1])[:, None], ends[:, 0], ends[:, 1])
+    share = out[:, 0] / jnp.where(out[:, 0] == out[:, 1], 1.0, out[:, 0] - out[:, 1])
+    crosses = out[:, 0] * out[:, 1] < 0
+    point = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
+    # The edge ends above the pad, or inside it nearer to the top than to a side: it came through the top.
+    through_top = -inner[:, 2] <= jnp.maximum(0, jnp.min(half - jnp.abs(inner[:, :2]), axis=1))
+    rim = jnp.zeros(3).at[1 - axis].set(1.0)
+    normal = _math.normalize(jnp.cross(ends[:, 1] - ends[:, 0], rim))
+    normal = jnp.where(normal[:, 2:] < 0, -normal, normal)
+    # A lower inner end is itself the contact; the rim then only supports from below.
+    normal = jnp.where(sign * normal[:, axis : axis + 1] < 0, jnp.array([0.0, 0.0, 1.0]), normal)
+    on_rim = jnp.abs(point[:, 1 - axis]) < half[1 - axis]
+    depth = -point[:, 2] * normal[:, 2]
+    return jnp.where(crosses & through_top & on_rim, depth, -1.0), point, normal
+
+
+def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Array, Array, Array]:
+    corners = jnp.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) * jnp.append(half, 0.0)
+    inside = planes[:, 3] - corners @ planes[:, :3].T
+    below = jnp.where(planes[:, 2] < 0, inside, 1.0)
+    nearest = jnp.argmin(below, axis=1)
+    depth = jnp.where(jnp.all(inside > 0, axis=1), jnp.min(below, axis=1), -1.0)
+    normal = -planes[nearest, :3]
+    return depth, corners - depth[:, None] * normal, normal
+
+
+def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"], normal: Float[Array, "c 3"]) -> Float[Array, "4"]:
+    candidate = jnp.where(depth > jnp.maximum(0, jnp.max(depth) - SKIN), 0.0, -1e3)
+    a = jnp.argmax(depth)
+    b = jnp.argmax(jnp.sum((points - points[a]) ** 2, axis=1) + candidate)
+    side = (points - points[a]) @ jnp.cross(normal[a], points[b] - points[a])
+    c = jnp.argmax(side + candidate)
+    d = jnp.argmax(-side + candidate)
+    return jnp.stack([a, b, c, d])
+
+
+def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    other = jnp.where(jnp.abs(normal[1]) < 0.5, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
+    tangent = _math.normalize(other - normal * (normal @ other))
+    return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
+
+
+def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"]) -> Contacts:
+    """The contacts of a hull with the pad.
+
+    The deepest point is always among them; the others, within SKIN of its depth, span the largest area with it.
+
+    Args:
+        body: the hull.
+        pose: (7,) mesh frame in the sensor frame.
+        half: (2,) m, half the pad's size; its top is z = 0.
+    """
+    rotation = _math.quat_matrix(pose[3:])
+    points = body.vertices @ rotation.T + pose[:3]
+    ends = body.edges @ rotation.T + pose[:3]
+    normals = body.planes[:, :3] @ rotation.T
+    planes = jnp.concatenate([normals, (body.planes[:, 3] + normals @ pose[:3])[:, None]], axis=1)
+    rims = [_rim(ends, half, axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)]
+    kinds = [_vertices(points, half), *rims, _corners(planes, half)]
+    depth, points, normal = (jnp.concatenate(x) for x in zip(*kinds, strict=True))
+    chosen = _spread(depth, points, normal)
+    new = jnp.sum(jnp.tril(chosen == chosen[:, None]), axis=1) == 1
+    depth, points, normal = depth[chosen], points[chosen], normal[chosen]
+    dist = jnp.where(new & (depth > 0), -depth, 1.0)
+    return Contacts(dist, points + 0.5 * depth[:, None] * normal, jax.vmap(_frame)(normal))

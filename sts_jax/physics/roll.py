@@ -1,0 +1,145 @@
+"""One trajectory as a pure function: step, what is measured at every step, and one record per frame."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sts_jax import _math
+from sts_jax.physics import scene
+from sts_jax.physics.contact import Hull, collide
+from sts_jax.physics.scene import mjx
+
+SLOW_SPEED = 0.005  # m/s; slower than this ...
+SLOW_TURN = 0.1  # rad/s; ... and this ...
+SLOW_TIME = 0.2  # s; ... for this long is settled
+PARTED_TIME = 0.005  # s; two touches are two when they are this far apart
+GONE_DEPTH = 0.01  # m; the whole object this far below the gel's face has left the pad
+
+
+class State(NamedTuple):
+    """What one step hands to the next."""
+
+    qpos: Float[Array, "7"]  # m, quaternion: the pose
+    qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
+    warmstart: Float[Array, "6"]  # acceleration from which the solver starts
+    gone: Bool[Array, ""]  # has left the pad: everything is frozen
+    slow: Int[Array, ""]  # consecutive slow steps
+    apart: Int[Array, ""]  # consecutive steps without contact
+    touches: Int[Array, ""]  # contacts begun after PARTED_TIME without
+    sunk: Float[Array, ""]  # m, deepest any hull vertex has been inside the pad
+    finite: Bool[Array, ""]  # no state so far was non-finite
+    impulse: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
+    loaded: Int[Array, ""]  # number of those steps
+
+
+class Record(NamedTuple):
+    """What is kept of one frame."""
+
+    pose: Float[Array, "7"]
+    velocity: Float[Array, "6"]
+    wrench: Float[Array, "6"]
+    contact: Bool[Array, ""]
+
+
+def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"]) -> State:
+    """The state of an object released with a pose and a velocity (m/s, rad/s, sensor frame)."""
+    turn = velocity[3:] @ _math.quat_matrix(pose[3:])
+    zero = jnp.zeros((), jnp.int32)
+    return State(
+        qpos=pose,
+        qvel=jnp.concatenate([velocity[:3], turn]),
+        warmstart=jnp.zeros(6),
+        gone=jnp.zeros((), bool),
+        slow=zero,
+        apart=jnp.full((), 2**20, jnp.int32),
+        touches=zero,
+        sunk=jnp.zeros(()),
+        finite=jnp.ones((), bool),
+        impulse=jnp.zeros(6),
+        loaded=zero,
+    )
+
+
+def _depth(points: Float[Array, "n 3"], half: Float[Array, "3"]) -> Float[Array, ""]:
+    across = jnp.min(half[:2] - jnp.abs(points[:, :2]), axis=1)
+    return jnp.max(jnp.minimum(-points[:, 2], across), initial=0.0)
+
+
+def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
+    """One time step under a gravity (m/s^2, sensor frame) that holds for this step.
+
+    Everything that constrains the object is the pad, so the pad's wrench is MuJoCo's `qfrc_constraint`: force in the
+    sensor frame, moment about the object's origin in the mesh frame; here it becomes the moment about the sensor's
+    origin.
+    """
+    old = state
+    model = model.tree_replace({"opt.gravity": gravity})
+    data = data.replace(qpos=old.qpos, qvel=old.qvel, qacc_warmstart=old.warmstart)
+    half = model.geom_size[0]
+    new = scene.step(model, data, collide(hull, old.qpos, half[:2]))
+
+    push = new.qfrc_constraint
+    rotation = _math.quat_matrix(old.qpos[3:])
+    moment = rotation @ push[3:] + jnp.cross(old.qpos[:3], push[:3])
+    wrench = jnp.concatenate([push[:3], moment])
+    contact = jnp.any(push != 0)
+
+    points = hull.vertices @ _math.quat_matrix(new.qpos[3:]).T + new.qpos[:3]
+    timestep = model.opt.timestep
+    slow = (_math.norm(new.qvel[:3]) < SLOW_SPEED) & (_math.norm(new.qvel[3:]) < SLOW_TURN)
+    begun = contact & (old.apart * timestep >= PARTED_TIME)
+    now = State(
+        qpos=new.qpos,
+        qvel=new.qvel,
+        warmstart=new.qacc_warmstart,
+        gone=jnp.max(points[:, 2]) < -GONE_DEPTH,
+        slow=jnp.where(slow, old.slow + 1, 0),
+        apart=jnp.where(contact, 0, old.apart + 1),
+        touches=old.touches + begun,
+        sunk=jnp.maximum(old.sunk, _depth(points, half)),
+        finite=old.finite & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)),
+        impulse=jnp.where(contact, old.impulse + wrench, 0),
+        loaded=jnp.where(contact, old.loaded + 1, 0),
+    )
+    frozen = old._replace(qvel=jnp.zeros(6), impulse=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32))
+    return jax.tree.map(lambda a, b: jnp.where(old.gone, a, b), frozen, now)
+
+
+def _record(state: State) -> Record:
+    turn = _math.quat_matrix(state.qpos[3:]) @ state.qvel[3:]
+    contact = state.loaded > 0
+    return Record(
+        pose=jnp.concatenate([state.qpos[:3], _math.quat_canonical(state.qpos[3:])]),
+        velocity=jnp.concatenate([state.qvel[:3], turn]),
+        wrench=jnp.where(contact, state.impulse / jnp.maximum(state.loaded, 1), 0),
+        contact=contact,
+    )
+
+
+def roll(
+    model: mjx.Model,
+    data: mjx.Data,
+    hull: Hull,
+    state: State,
+    gravity: Float[Array, "frames steps 3"],
+) -> tuple[State, Record]:
+    """One trajectory: for each frame the steps of the interval that ends with it.
+
+    Args:
+        model, data: one scene.
+        hull: of the object.
+        state: at the beginning of the first frame's interval.
+        gravity: (frames, steps, 3) m/s^2 in the sensor frame, for every step of every interval.
+
+    Returns:
+        The last state, and one record per frame.
+    """
+
+    def interval(state: State, gravity: Float[Array, "steps 3"]) -> tuple[State, Record]:
+        state = state._replace(impulse=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32))
+        state, _ = jax.lax.scan(lambda s, g: (step(model, data, hull, s, g), None), state, gravity)
+        return state, _record(state)
+
+    return jax.lax.scan(interval, state, gravity)

@@ -1,0 +1,160 @@
+"""The one scene of all scenarios, as MuJoCo and as MJX models: a fixed pad and one free object above it.
+
+The pad is a box whose top face lies in z = 0 of the sensor frame. The object's body frame is its mesh frame
+(its inertia is given about an explicit centre of mass), so `qpos` is the pose of `design`: position and quaternion.
+
+MJX steps one template model for all objects (`step`, `template`): what differs between two is a few arrays and the
+contacts. `compile_scene` is the same scene with the object's mesh, for C MuJoCo.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import io
+
+import mujoco
+import numpy as np
+
+from sts_jax.physics.contact import Contacts
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, another engine, is not installed
+    from mujoco import mjx
+
+PAD_DEPTH = 0.2  # m; what leaves the pad slides down its side and never gets beneath it
+FACE_VERTICES = 20  # MJX's largest polygon
+
+_SCENE = """
+<mujoco>
+  <option timestep="{timestep}" cone="elliptic" impratio="{impratio}" iterations="{iterations}"
+          ls_iterations="{ls_iterations}">
+    <flag eulerdamp="disable"/>
+  </option>
+  <default>
+    <geom condim="6" solref="{time_constant} {damping_ratio}" solimp="{soft} {hard} {width}"/>
+  </default>
+  {asset}
+  <worldbody>
+    <geom name="pad" type="box" pos="0 0 {pad_z}" size="{pad_x} {pad_y} {pad_half}" friction="0 0 0"/>
+    <body name="object">
+      <freejoint/>
+      <inertial pos="0 0 0.001" mass="1" fullinertia="2e-4 2e-4 3e-4 0 0 1e-5"/>
+      <geom name="object" {shape} friction="0.5 {torsional} {rolling}"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Contact:
+    """The contact and solver constants of every scenario (MuJoCo's names and meanings)."""
+
+    timestep: float = 0.001  # s
+    time_constant: float = 0.004  # s, solref; stiff: about 0.1 mm at rest, 1-2 mm at impact
+    damping_ratio: float = 0.5  # solref; below 1 the object bounces
+    soft: float = 0.5  # solimp at first touch; a low one rests deeper than g dt^2 and does not chatter there
+    hard: float = 0.99  # solimp at `width`
+    width: float = 0.001  # m, solimp
+    torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
+    rolling: float = 0.0005  # m, rolling friction: lathed objects come to rest
+    impratio: float = 10.0  # stiffness of friction against the normal force: what holds does not creep
+    iterations: int = 10  # Newton iterations of one step
+    ls_iterations: int = 20  # line-search iterations of one Newton iteration
+
+
+def _xml(pad: tuple[float, float], contact: Contact, shape: str, asset: str = "") -> str:
+    return _SCENE.format(
+        shape=shape,
+        asset=asset,
+        pad_x=pad[0] / 2,
+        pad_y=pad[1] / 2,
+        pad_half=PAD_DEPTH / 2,
+        pad_z=-PAD_DEPTH / 2,
+        **dataclasses.asdict(contact),
+    )
+
+
+def compile_scene(vertices: np.ndarray, pad: tuple[float, float], contact: Contact) -> mujoco.MjModel:
+    """The scene for C MuJoCo, which finds the contacts itself; mass properties are placeholders (`set_rigid`).
+
+    Args:
+        vertices: (n, 3) m, points whose convex hull collides, in the mesh frame.
+        pad: (x, y) m, size of the pad.
+        contact: constants.
+    """
+    points = " ".join(f"{x:.9g}" for x in np.unique(vertices, axis=0).ravel())
+    asset = f'<asset><mesh name="hull" inertia="convex" vertex="{points}"/></asset>'
+    return mujoco.MjModel.from_xml_string(_xml(pad, contact, 'type="mesh" mesh="hull"', asset))
+
+
+def set_rigid(
+    model: mujoco.MjModel, data: mujoco.MjData, mass: float, com: np.ndarray, inertia: np.ndarray, friction: float
+) -> None:
+    """Writes an object's mass (kg), centre of mass (m), inertia about it (kg m^2) and friction into a model.
+
+    All constants derived from them follow (`mj_setConst`); without them the contact's stiffness would change.
+
+    Raises:
+        ValueError: a mass, inertia or friction that is not positive or not finite.
+    """
+    if not (np.isfinite(mass) and mass > 0):
+        raise ValueError(f"mass is {mass} kg; it must be positive and finite")
+    if not (np.isfinite(friction) and friction > 0):
+        raise ValueError(f"friction is {friction}; it must be positive and finite")
+    if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
+        raise ValueError("centre of mass or inertia is not finite")
+    principal, axes = (x[..., ::-1].copy() for x in np.linalg.eigh(inertia))  # largest first, as MuJoCo does
+    if principal[2] <= 0:
+        raise ValueError(f"principal moments of inertia are {principal} kg m^2; they must be positive")
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    body, geom = model.body("object"), model.geom("object")
+    body.mass = mass
+    body.ipos = com
+    body.inertia = principal
+    mujoco.mju_mat2Quat(model.body_iquat[body.id], axes.ravel())
+    geom.friction[0] = friction
+    mujoco.mj_setConst(model, data)
+    model.stat.meaninertia = model.dof_M0.mean()  # scales the solver's tolerance; the compiler alone sets it
+
+
+# The fields of mjx.Model that `set_rigid` changes; a test compares all fields with a freshly compiled model's.
+DRAWN = (
+    "body_mass",
+    "body_subtreemass",
+    "body_ipos",
+    "body_iquat",
+    "body_inertia",
+    "body_invweight0",
+    "dof_invweight0",
+    "dof_M0",
+    "geom_friction",
+)
+
+
+@functools.cache
+def template(pad: tuple[float, float], contact: Contact) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
+    """The scene that MJX steps, for every object: a box stands for the hull, whose contacts `collide` finds."""
+    model = mujoco.MjModel.from_xml_string(_xml(pad, contact, 'type="box" size=".01 .01 .01"'))
+    return model, mjx.put_model(model), mjx.make_data(model)
+
+
+def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
+    """What `set_rigid` changed, under the names of `mjx.Model`'s fields."""
+    fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
+    return fields | {"stat.meaninertia": np.float32(model.stat.meaninertia)}
+
+
+def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
+    """The position stage of `mjx.forward`, with given contacts in place of those of the stand-in box."""
+    data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
+    data = mjx.collision(model, data)
+    # MJX has no public way to hand in contacts. Should this path move, `tree_replace` fails at the first step.
+    data = data.tree_replace({f"_impl.contact.{name}": value for name, value in contacts._asdict().items()})
+    return mjx.make_constraint(model, data)
+
+
+def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
+    """`mjx.step` (semi-implicit Euler) with given contacts."""
+    data = mjx.fwd_velocity(model, position(model, data, contacts))
+    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    return mjx.euler(model, mjx.solve(model, data))

@@ -1,0 +1,250 @@
+"""`simulate`: bodies, draws and chunks on the host, MJX underneath."""
+
+import concurrent.futures
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from sts_jax import objects
+from sts_jax.objects import Body
+from sts_jax.physics import contact, scene
+from sts_jax.physics.contact import Hull
+from sts_jax.physics.roll import SLOW_TIME, Record, State, initial, roll
+from sts_jax.physics.scenarios import Freefall, Hidden, Start, outcome
+from sts_jax.physics.scene import Contact, mjx
+from sts_jax.sensor import Sensor
+
+SUNK_LIMIT = 0.003  # m; a trajectory in which the object went deeper into the pad is drawn again
+ATTEMPTS = 5  # draws of one trajectory before giving up
+CHUNK = 64  # trajectories of one call: a fixed number, so that their count compiles nothing
+WORKERS = 1
+
+
+class Trajectory(NamedTuple):
+    """Trajectories of one or more bodies, body-major; n of them, f frames each."""
+
+    time: Float[Array, "n f"]  # s, 0 at frame 0
+    pose: Float[Array, "n f 7"]  # mesh frame in the sensor frame, w >= 0
+    velocity: Float[Array, "n f 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
+    wrench: Float[Array, "n f 6"]  # N, N m about the sensor's origin: what the pad exerts, mean of (t - dt, t]
+    contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
+    gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
+    settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
+    outcome: Int[Array, "n"]  # Outcome
+    touches: Int[Array, "n"]  # contacts parted by at least 5 ms
+    sunk: Float[Array, "n"]  # m, deepest the hull went into the pad
+    condition: Float[Array, "n c"]  # the scenario's input
+    hidden: Hidden  # (n,) each
+    body: Int[Array, "n"]  # index into the sequence of bodies
+    resampled: Int[Array, "n"]  # draws thrown away because non-finite or sunken
+
+
+class _Worlds(NamedTuple):
+    """What one call of MJX steps, a leading axis of trajectories everywhere."""
+
+    fields: dict[str, Array]  # of the model, see scene.drawn
+    hull: Hull
+    start: Start
+    gravity: Float[Array, "n f s 3"]
+
+
+@functools.partial(jax.jit, static_argnames="scenario")
+def _draw(
+    key: PRNGKeyArray,
+    body: Int[Array, "n"],
+    draw: Int[Array, "n"],
+    attempt: Int[Array, "n"],
+    hulls: Float[Array, "b h 3"],
+    scenario: Freefall,
+) -> tuple[Start, Hidden]:
+    def one(body: Int[Array, ""], draw: Int[Array, ""], attempt: Int[Array, ""]) -> tuple[Start, Hidden]:
+        own = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), draw), attempt)
+        start, hidden = jax.random.split(own)
+        return scenario.start(start, hulls[body]), scenario.hidden(hidden)
+
+    return jax.vmap(one)(body, draw, attempt)
+
+
+@functools.partial(jax.jit, static_argnames="scenario")
+def _gravity(condition: Float[Array, "n c"], scenario: Freefall) -> Float[Array, "n f s 3"]:
+    steps = _steps(scenario)
+    time = (jnp.arange(scenario.frames) - 1)[:, None] / scenario.rate + jnp.arange(steps) * scenario.contact.timestep
+    return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
+
+
+@jax.jit
+def _roll(worlds: _Worlds, model: mjx.Model, data: mjx.Data) -> tuple[State, Record]:
+    def one(world: _Worlds) -> tuple[State, Record]:
+        own = model.tree_replace(world.fields)
+        return roll(own, data, world.hull, initial(world.start.pose, world.start.velocity), world.gravity)
+
+    return jax.vmap(one)(worlds)
+
+
+_rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))
+
+
+def _steps(scenario: Freefall) -> int:
+    steps = 1 / (scenario.rate * scenario.contact.timestep)
+    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
+        raise ValueError(
+            f"rate {scenario.rate}/s times timestep {scenario.contact.timestep} s must divide 1: "
+            f"{steps:.3f} steps per frame; choose another rate"
+        )
+    return round(steps)
+
+
+def _check(bodies: Sequence[Body], scenario: Freefall, num: int) -> None:
+    if num < 1:
+        raise ValueError(f"num is {num}; at least one trajectory of each body is needed")
+    if not bodies:
+        raise ValueError("no body was given; pass one Body or a sequence of them")
+    _steps(scenario)
+    for name in ("fill", "shell_scale", "friction"):
+        low, high = getattr(scenario, name)
+        if not (np.isfinite([low, high]).all() and low <= high and low >= 0 and (name == "fill" or low > 0)):
+            raise ValueError(f"scenario.{name} is {(low, high)}; it must be (low, high), positive and finite")
+    if scenario.fill[1] > 1:
+        raise ValueError(f"scenario.fill is {scenario.fill}; a share is at most 1")
+    if scenario.frames < 1:
+        raise ValueError(f"scenario.frames is {scenario.frames}; at least one is needed")
+    for i, body in enumerate(bodies):
+        if body.hull.ndim != 2 or body.hull.shape[0] not in objects.HULL_CLASSES:
+            raise ValueError(
+                f"body {i}: hull has shape {body.hull.shape}; expected (n, 3), n in {objects.HULL_CLASSES}"
+            )
+        if not np.isfinite(body.hull).all():
+            raise ValueError(f"body {i}: hull has a non-finite vertex")
+
+
+def _check_hidden(hidden: Hidden, count: int) -> Hidden:
+    for name, values in hidden._asdict().items():
+        values = np.asarray(values)
+        if values.shape != (count,):
+            raise ValueError(f"hidden.{name} has shape {values.shape}; expected ({count},): bodies times num")
+        low, high = (0, 1) if name == "fill" else (np.finfo(np.float32).tiny, np.finfo(np.float32).max)
+        if not ((values >= low) & (values <= high)).all():
+            raise ValueError(f"hidden.{name} has values outside [{low}, {high}]")
+    return Hidden(*(jnp.asarray(x, jnp.float32) for x in hidden))
+
+
+def _draws(
+    bodies: Sequence[Body], which: np.ndarray, hidden: Hidden, pad: tuple[float, float], constants: Contact
+) -> dict[str, np.ndarray]:
+    """The model's fields of each draw: MuJoCo derives them from mass, centre of mass, inertia and friction."""
+    model, like, _ = scene.template(pad, constants)
+    data = mujoco.MjData(model)
+    fields = []
+    for index, body in enumerate(bodies):
+        own = jax.tree.map(lambda x, mine=which == index: x[mine], hidden)
+        rigid = [np.asarray(x, np.float64) for x in (*_rigid(body, own.fill, own.shell_scale), own.friction)]
+        for mass, com, inertia, friction in zip(*rigid, strict=True):
+            try:
+                scene.set_rigid(model, data, mass, com, inertia, friction)
+            except ValueError as error:
+                raise ValueError(f"body {index}: {error}") from error
+            fields.append(scene.drawn(model, like))
+    return {name: np.stack([f[name] for f in fields]) for name in fields[0]}
+
+
+def simulate(
+    key: PRNGKeyArray,
+    body: Body | Sequence[Body],
+    sensor: Sensor,
+    scenario: Freefall,
+    num: int = 1,
+    *,
+    hidden: Hidden | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> Trajectory:
+    """Simulates `num` trajectories of each body: random start, hidden values, contact with the pad.
+
+    Trajectory j of body i depends on `key`, i, j and the body, not on how many others there are. Non-finite ones and
+    those sunken into the pad deeper than SUNK_LIMIT are drawn again with a fresh key and counted in `resampled`.
+
+    Args:
+        key: of the whole set.
+        body: one, or a sequence of different ones.
+        sensor: `sensor.gel.size` is the pad.
+        scenario: `Freefall()`.
+        num: trajectories of each body.
+        hidden: (bodies * num,) each, body-major: rolls the starts of `key` with these instead of drawn ones.
+        progress: called with the number of trajectories done so far, after each chunk.
+
+    Returns:
+        bodies * num trajectories, body-major.
+
+    Raises:
+        ValueError: an argument out of range, named; or a trajectory that fails in every attempt.
+    """
+    bodies = [body] if isinstance(body, Body) else list(body)
+    _check(bodies, scenario, num)
+    count = len(bodies) * num
+    given = None if hidden is None else _check_hidden(hidden, count)
+    pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
+    hulls = [contact.hull(np.asarray(b.hull)) for b in bodies]
+    sizes = np.array([len(b.hull) for b in bodies])
+    vertices = np.stack([np.pad(b.hull, ((0, sizes.max() - len(b.hull)), (0, 0)), "edge") for b in bodies])
+    which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
+    _, model, data = scene.template(pad, scenario.contact)
+
+    def chunk(indices: np.ndarray, starts: Start, fields: dict[str, np.ndarray]) -> tuple[State, Record]:
+        padded = np.pad(indices, (0, CHUNK - len(indices)), "edge")
+        start = jax.tree.map(lambda x: x[padded], starts)
+        worlds = _Worlds(
+            fields={name: x[padded] for name, x in fields.items()},
+            hull=jax.tree.map(lambda *x: np.stack(x), *(hulls[which[i]] for i in padded)),
+            start=start,
+            gravity=_gravity(start.condition, scenario=scenario),
+        )
+        return jax.tree.map(lambda x: np.asarray(x)[: len(indices)], _roll(worlds, model, data))
+
+    attempt = np.zeros(count, np.int32)
+    pending = np.arange(count)
+    rows: list[tuple[State, Record] | None] = [None] * count
+    while len(pending):
+        starts, drawn = _draw(key, which, nth, attempt, vertices, scenario=scenario)
+        drawn = drawn if given is None else given
+        fields = _draws(bodies, which, drawn, pad, scenario.contact)
+        by_size = [pending[sizes[which[pending]] == size] for size in np.unique(sizes)]
+        chunks = [c for part in by_size for c in np.split(part, range(CHUNK, len(part), CHUNK)) if len(c)]
+        with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
+            for indices, result in zip(chunks, pool.map(lambda c: chunk(c, starts, fields), chunks), strict=True):
+                for row, i in enumerate(indices):
+                    rows[i] = jax.tree.map(lambda x, row=row: x[row], result)
+                if progress is not None:
+                    progress(sum(row is not None for row in rows))
+        ok = np.array([bool(row[0].finite and row[0].sunk <= SUNK_LIMIT) for row in rows])
+        pending = np.flatnonzero(~ok)
+        attempt[pending] += 1
+        if attempt.max() >= ATTEMPTS:
+            worst = int(attempt.argmax())
+            raise ValueError(
+                f"body {which[worst]}, trajectory {nth[worst]}: non-finite or sunken deeper than {SUNK_LIMIT} m in "
+                f"{ATTEMPTS} draws; is its hull too thin or its mass out of scale?"
+            )
+
+    last, records = jax.tree.map(lambda *x: jnp.stack(x), *rows)
+    frozen_or_slow = last.gone | (last.slow * scenario.contact.timestep >= SLOW_TIME)
+    return Trajectory(
+        time=jnp.tile(jnp.arange(scenario.frames) / scenario.rate, (count, 1)),
+        pose=records.pose,
+        velocity=records.velocity,
+        wrench=records.wrench,
+        contact=records.contact,
+        gravity=_gravity(starts.condition, scenario=scenario)[:, :, -1],
+        settled=frozen_or_slow,
+        outcome=jax.vmap(outcome)(records.pose[:, 0], records.pose[:, -1]),
+        touches=last.touches,
+        sunk=last.sunk,
+        condition=starts.condition,
+        hidden=drawn,
+        body=jnp.asarray(which, jnp.int32),
+        resampled=jnp.asarray(attempt),
+    )

@@ -1,0 +1,184 @@
+"""The gel as a bed of springs, in equilibrium with the wrench that the pad exerts on the object.
+
+Heights are those of the object's underside over the gel's face (m, positive outwards), on a grid of the gel's own;
+row 0 is the cell row of lowest y, column 0 that of lowest x, as in an image.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+from jaxtyping import ScalarLike as Scalar
+
+_NEWTON_STEPS = 14
+_STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
+_LEVER = 0.02  # m, by which tilts are scaled
+_FAR = 1.0  # m, stands for the height where there is no object
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Gel:
+    """A square pad of soft gel, its outer face in the plane z = 0."""
+
+    size: tuple[Scalar, Scalar] = (0.15, 0.15)  # m, along x and y (paper, "Real-World Dataset")
+    thickness: Scalar = 0.005  # m (paper, supplement "Simulator Details")
+    stiffness: Scalar = 2e6  # N/m^3, per area; about 10 kPa over 5 mm: a bottle sinks 0.2-0.3 mm. Ours.
+    max_depth: Scalar = 0.003  # m, deepest imprint that an equilibrium may ask for. Ours.
+    max_tilt: Scalar = math.radians(5)  # rad, about x and about y each, from the given pose. Ours.
+    tolerance: Scalar = 0.005  # of Fz, and of Fz times 1 cm for the moments: what counts as balanced. Ours.
+    cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata={"static": True})  # rows, columns: 1 mm
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Equilibrium:
+    """How a rigid object lies in the gel."""
+
+    sink: Float[Array, ""]  # m, how far it moves along -z, after the turn
+    turn: Float[Array, "2"]  # rad, rotation vector about the sensor's x and y axes
+    pressure: Float[Array, "r c"]  # Pa, on the gel's grid
+    balanced: Bool[Array, ""]  # whether the pressure balances Fz, Mx and My
+
+
+def cell_centres(gel: Gel) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
+    """x and y of the grid's cells (m)."""
+    rows, columns = gel.cells
+    x = ((jnp.arange(columns) + 0.5) / columns - 0.5) * gel.size[0]
+    y = ((jnp.arange(rows) + 0.5) / rows - 0.5) * gel.size[1]
+    x, y = jnp.meshgrid(x, y)
+    return x, y
+
+
+def cell_area(gel: Gel) -> Float[Array, ""]:
+    """Area of one cell (m^2)."""
+    return jnp.asarray(gel.size[0] * gel.size[1] / (gel.cells[0] * gel.cells[1]), jnp.float32)
+
+
+def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
+    """The imprint that a pose asks for by itself: the object stays where it is, `p = k max(0, -h)`.
+
+    Args:
+        gel: its constants.
+        heights: of the object's underside over the gel's face (m), `inf` where there is none.
+
+    Returns:
+        Equilibrium without motion; balanced, as there is no wrench to balance.
+    """
+    pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
+    return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))
+
+
+def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
+    """Depth and two tilts at which the springs balance Fz, Mx and My.
+
+    With the object moved by `h' = h - d + a y - b x`, the pressure is `p = k max(0, -h')`, and
+
+        Fz = sum p A,   Mx = sum y p A,   My = -sum x p A
+
+    are the stationarity of `E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b`, which is convex and piecewise
+    quadratic: projected Newton steps with a line search, from an imprint as deep as the limit allows below first
+    touch. Derivatives are those of the equilibrium (implicit function theorem: one more Newton step, undamped).
+
+    Args:
+        gel: its constants.
+        heights: of the object's underside over the gel's face (m), `inf` where there is none.
+        wrench: force (N) and moment about the sensor's origin (N m) of the pad on the object; Fx, Fy and Mz are
+            friction and play no part.
+
+    Returns:
+        Equilibrium. With `Fz <= 0` nothing moves and nothing is pressed. Where no equilibrium exists (first touch
+        farther off than `max_depth`, centre of pressure outside what the footprint can carry, a limit reached) it is
+        what the limits allow, and `balanced` is False.
+    """
+    force = wrench[2]
+    pressed = force > 0
+    safe_force = jnp.where(pressed, force, 1)
+    load = jnp.where(pressed, force, 0) / (gel.stiffness * cell_area(gel))  # sum of the springs' lengths (m)
+    # Tilts are taken about the centre of pressure, and measured by the height they make a lever's length from it.
+    half_x, half_y = gel.size[0] / 2, gel.size[1] / 2
+    wanted_x, wanted_y = -wrench[4] / safe_force, wrench[3] / safe_force
+    on_pad = (jnp.abs(wanted_x) <= half_x) & (jnp.abs(wanted_y) <= half_y)
+    centre_x, centre_y = jnp.clip(wanted_x, -half_x, half_x), jnp.clip(wanted_y, -half_y, half_y)
+    x, y = cell_centres(gel)
+    x, y = (x[0] - centre_x) / _LEVER, (y[:, 0] - centre_y) / _LEVER
+    target = load * jnp.array([1.0, 0.0, 0.0])
+
+    height = jnp.where(jnp.isfinite(heights), heights, _FAR)
+    touch = jnp.min(height)
+    reach = touch <= gel.max_depth
+    tilt = jnp.tan(gel.max_tilt) * _LEVER
+    bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
+
+    def newton(_: int, u: Float[Array, "3"]) -> Float[Array, "3"]:
+        length = _plane(u, fixed_x, fixed_y) - fixed_height
+        gradient = _moments(jnp.maximum(length, 0), fixed_x, fixed_y) - fixed_target
+        held = ((u >= bound) & (gradient < 0)) | ((u <= -bound) & (gradient > 0))
+        step = -_solve(_curvature(length, fixed_x, fixed_y), gradient, held)
+        step = jnp.clip(u + step, -bound, bound) - u
+        along = _plane(step, fixed_x, fixed_y)
+        slopes = [
+            jnp.sum(step * (_moments(jnp.maximum(length + t * along, 0), fixed_x, fixed_y) - fixed_target))
+            for t in _STEP_LENGTHS
+        ]
+        best = jnp.argmin(jnp.abs(jnp.stack(slopes)))
+        return u + jnp.array(_STEP_LENGTHS)[best] * step
+
+    fixed_x, fixed_y, fixed_height, fixed_target = jax.lax.stop_gradient((x, y, height, target))
+    start = jnp.stack([jax.lax.stop_gradient(touch + gel.max_depth), jnp.float32(0), jnp.float32(0)])
+    u = jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON_STEPS, newton, start))
+
+    length = _plane(u, x, y) - height
+    gradient = _moments(jnp.maximum(length, 0), x, y) - target
+    curvature = jax.lax.stop_gradient(_curvature(length, x, y))
+    u = jnp.clip(u - _solve(curvature, gradient, jnp.abs(u) >= bound), -bound, bound)
+
+    deepest = jnp.max(_plane(u, x, y) - height)
+    u = u - jnp.maximum(deepest - gel.max_depth, 0) * jnp.array([1.0, 0.0, 0.0])
+    u = jnp.where(pressed & reach, u, 0)
+    length = jnp.where(pressed & reach, jnp.maximum(_plane(u, x, y) - height, 0), 0)
+
+    # the moments' errors over a lever of 1 cm
+    residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
+    balanced = ~pressed | (reach & on_pad & jnp.all(residual <= gel.tolerance * load))
+    return Equilibrium(
+        sink=u[0] - (u[1] * centre_y + u[2] * centre_x) / _LEVER,
+        turn=jnp.stack([-u[1], u[2]]) / _LEVER,
+        pressure=gel.stiffness * length,
+        balanced=balanced,
+    )
+
+
+def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "r c"]:
+    return (u[0] + u[1] * y)[:, None] + (u[2] * x)[None, :]
+
+
+def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3 3"]:
+    """`sum value y^i x^j`, as two matrix products."""
+    powers_x = jnp.stack([jnp.ones_like(x), x, x * x], axis=1)
+    powers_y = jnp.stack([jnp.ones_like(y), y, y * y], axis=0)
+    return powers_y @ (value @ powers_x)
+
+
+def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3"]:
+    sums = _sums(value, x, y)
+    return jnp.stack([sums[0, 0], sums[1, 0], sums[0, 1]])
+
+
+def _curvature(length: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3 3"]:
+    s = _sums((length > 0).astype(length.dtype), x, y)
+    rows = [[s[0, 0], s[1, 0], s[0, 1]], [s[1, 0], s[2, 0], s[1, 1]], [s[0, 1], s[1, 1], s[0, 2]]]
+    return jnp.stack([jnp.stack(row) for row in rows]) + (1e-6 + 1e-5 * s[0, 0]) * jnp.eye(3)
+
+
+def _solve(matrix: Float[Array, "3 3"], vector: Float[Array, "3"], held: Bool[Array, "3"]) -> Float[Array, "3"]:
+    """Solve among the unknowns that are not held; 0 for those that are."""
+    matrix = jnp.where(held[:, None] | held[None, :], jnp.eye(3), matrix)
+    vector = jnp.where(held, 0, vector)
+    a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
+    det = jnp.sum(a * jnp.cross(b, c))
+    det = jnp.where(det == 0, 1, det)
+    parts = [vector * jnp.cross(b, c), a * jnp.cross(vector, c), a * jnp.cross(b, vector)]
+    return jnp.stack([jnp.sum(p) for p in parts]) / det

@@ -1,0 +1,24 @@
+"""Training of `sts_jax.mvae` models: loop, schedules, checkpoints."""
+
+from sts_jax.training.checkpoint import TrainState, restore, save
+from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
+from sts_jax.training.train import Arrays, Model, TrainConfig, initial, load, optimiser, order, step, train
+
+__all__ = [
+    "Arrays",
+    "Model",
+    "Preprocessing",
+    "TrainConfig",
+    "TrainState",
+    "initial",
+    "load",
+    "load_blank",
+    "optimiser",
+    "order",
+    "preprocessing_from_json",
+    "restore",
+    "save",
+    "save_blank",
+    "step",
+    "train",
+]

@@ -1,0 +1,59 @@
+"""What happens to a measurement before a network sees it: stored with every checkpoint."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from sts_jax import _math
+
+
+@dataclasses.dataclass(frozen=True)
+class Preprocessing:
+    """The view a model was trained on, its units of pose, and when a touch counts as one."""
+
+    resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
+    crop: bool = False  # the square around the object instead of the whole pad
+    position_scale: float = 0.05  # m; positions are divided by it, so that they are of the size of a quaternion
+    mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is fed, as the paper)
+    touch_threshold: float = 3 / 255  # a touch is one where a pixel differs from the blank gel by more than this
+    absent: tuple[str, ...] = ()  # modalities that no training input ever had
+
+    def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
+        """A pose (m, quaternion) as the networks see it."""
+        return jnp.concatenate([pose[..., :3] / self.position_scale, _math.quat_canonical(pose[..., 3:])], axis=-1)
+
+    def decode_pose(self, code: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
+        """What a network says as a pose: metres and a unit quaternion with `w >= 0` (identity if it says 0)."""
+        quat = _math.quat_canonical(code[..., 3:])
+        quat = jnp.where(jnp.any(quat != 0, -1, keepdims=True), quat, jnp.array([1.0, 0, 0, 0]))
+        return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
+
+    def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:
+        """Whether a tactile image shows a contact: differs somewhere from the blank gel."""
+        if not self.mask_blank_touch:
+            return jnp.ones(tactile.shape[:-3], bool)
+        return jnp.max(jnp.abs(tactile - blank), axis=(-3, -2, -1)) > self.touch_threshold
+
+
+def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
+    """Store what the sensor shows with nothing on it, `uint8 (height, width, 3)` each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(folder / "blank.npz", visual=visual, tactile=tactile)
+
+
+def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The visual and the tactile image of the empty sensor, `uint8 (height, width, 3)` each."""
+    with np.load(folder / "blank.npz", allow_pickle=False) as arrays:
+        return arrays["visual"], arrays["tactile"]
+
+
+def preprocessing_from_json(content: dict) -> Preprocessing:
+    """The inverse of `dataclasses.asdict`, through JSON."""
+    content = json.loads(json.dumps(content))
+    content["resolution"] = tuple(content["resolution"])
+    content["absent"] = tuple(content["absent"])
+    return Preprocessing(**content)

@@ -1,0 +1,333 @@
+"""The training loop: a Python loop over one compiled step (a convolution inside `lax.scan` is slow on a CPU)."""
+
+import json
+import os
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jaxtyping import Array, PRNGKeyArray
+
+from sts_jax import mvae
+from sts_jax.training.checkpoint import TrainState, read_settings, restore, save, write_text
+
+Batch = dict[str, Any]  # `inputs`, `targets`, `present`, `target_present`: dicts by name; `condition`: array or None
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a model is trained."""
+
+    steps: int | None = None  # gradient steps; None: `epochs` decide
+    epochs: int = 200  # paper
+    batch_size: int = 64  # paper
+    learning_rate: float = 1e-3  # not in the paper
+    schedule: Literal["constant", "cosine"] = "constant"  # cosine ends at 0
+    b1: float = 0.9  # Adam
+    b2: float = 0.999
+    epsilon: float = 1e-8
+    clip: float | None = None  # largest global norm of the gradient
+    beta_warmup: float = 0.25  # share of the steps over which beta goes from 0 to 1 (paper: 50 of 200 epochs)
+    seed: int = 0
+    log_every: int = 10  # steps; a record is the mean over them
+    checkpoint_every: int = 200  # steps, a multiple of log_every
+
+    def __post_init__(self) -> None:
+        if self.checkpoint_every % self.log_every:
+            raise ValueError(f"checkpoint_every={self.checkpoint_every}: give a multiple of log_every={self.log_every}")
+        if self.schedule not in ("constant", "cosine"):
+            raise ValueError(f"schedule={self.schedule!r}; known are 'constant' and 'cosine'")
+
+    def total(self, samples: int) -> int:
+        """Gradient steps over a data set of so many samples."""
+        return self.steps if self.steps is not None else self.epochs * -(-samples // self.batch_size)
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """A data set in memory, by modality, `(samples, *shape)`; images uint8, or float32 in [0, 1]."""
+
+    inputs: dict[str, np.ndarray]
+    targets: dict[str, np.ndarray]
+    present: dict[str, np.ndarray] = field(default_factory=dict)  # (samples,) bool; one not given counts always
+    target_present: dict[str, np.ndarray] = field(default_factory=dict)
+    condition: np.ndarray | None = None  # (samples, condition)
+
+    def __post_init__(self) -> None:
+        sizes = {len(x) for x in jax.tree.leaves(self._tree())}
+        if len(sizes) != 1 or 0 in sizes:
+            raise ValueError(f"arrays of {sorted(sizes)} samples; all must have the same number, at least one")
+
+    def __len__(self) -> int:
+        return len(next(iter(self.targets.values())))
+
+    def take(self, index: np.ndarray) -> Batch:
+        """These samples."""
+        return jax.tree.map(lambda x: x[index], self._tree())
+
+    def checksum(self) -> int:
+        """Changes when the data do."""
+        value = 0
+        for path, x in jax.tree_util.tree_leaves_with_path(self._tree()):
+            value = zlib.crc32(f"{path}{x.shape}{x.dtype}".encode(), value)
+            value = zlib.crc32(np.ascontiguousarray(x).data, value)
+        return value
+
+    def _tree(self) -> Batch:
+        return {name: getattr(self, name) for name in ("inputs", "targets", "present", "target_present", "condition")}
+
+
+class Model(NamedTuple):
+    """A trained model, ready for `mvae.predict(model.graphdef, model.state, ...)`."""
+
+    config: mvae.Config
+    graphdef: nnx.GraphDef[mvae.MVAE]
+    state: nnx.State  # parameters and running batch statistics
+    step: int  # gradient steps done
+    settings: dict[str, Any]  # config.json: `model`, `training`, `preprocessing`, ...
+
+
+def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
+    """Adam as configured."""
+    rate: float | optax.Schedule = config.learning_rate
+    if config.schedule == "cosine":
+        rate = optax.cosine_decay_schedule(config.learning_rate, total)
+    adam = optax.adam(rate, b1=config.b1, b2=config.b2, eps=config.epsilon)
+    return adam if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adam)
+
+
+def initial(config: TrainConfig, model: mvae.Config, total: int) -> tuple[nnx.GraphDef[mvae.MVAE], TrainState]:
+    """A new model and its state, a function of `config.seed`."""
+    graphdef, params, stats = mvae.init(jax.random.key(config.seed), model)
+    return graphdef, TrainState(params, stats, optimiser(config, total).init(params), jnp.zeros((), jnp.int32))
+
+
+def step(
+    graphdef: nnx.GraphDef[mvae.MVAE],
+    config: TrainConfig,
+    total: int,
+    state: TrainState,
+    batch: Batch,
+    *,
+    targets: Literal["all", "own"] = "all",
+    absent: tuple[str, ...] = (),
+    augment: Callable[[PRNGKeyArray, Batch], Batch] | None = None,
+) -> tuple[TrainState, mvae.Terms]:
+    """One gradient step; the state keeps its structure and dtypes.
+
+    Args:
+        graphdef: definition of the model.
+        config: how it is trained.
+        total: steps of the whole run; beta and the learning rate follow from it.
+        state: the state before.
+        batch: `Arrays.take`; uint8 becomes float32 in [0, 1] here.
+        targets: `mvae.loss`, `asked`.
+        absent: `mvae.loss`.
+        augment: changes a batch of floats; its key is its own.
+
+    Returns:
+        The state after, and the parts of the loss before.
+    """
+    batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
+    noise, augmentation = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
+    if augment is not None:
+        batch = augment(augmentation, batch)
+    warmup = max(config.beta_warmup * total, 1)
+    beta = jnp.minimum(state.step.astype(jnp.float32) / warmup, 1)
+
+    def objective(params: nnx.State) -> tuple[Array, tuple[nnx.State, mvae.Terms]]:
+        return mvae.loss(graphdef, params, state.stats, noise, **batch, beta=beta, asked=targets, absent=absent)
+
+    gradient, (stats, terms) = jax.grad(objective, has_aux=True)(state.params)
+    update, rest = optimiser(config, total).update(gradient, state.optimiser, state.params)
+    return TrainState(optax.apply_updates(state.params, update), stats, rest, state.step + 1), terms
+
+
+def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
+    """Indices of the batches `start .. stop`, a function of the seed and the step alone.
+
+    Permutations of the samples follow one another, one per epoch, and a batch may straddle two: every sample is
+    seen once per epoch and none is dropped.
+    """
+    permutations: dict[int, np.ndarray] = {}
+    for number in range(start, stop):
+        epoch, place = np.divmod(np.arange(number * batch_size, (number + 1) * batch_size), samples)
+        permutations = {
+            e: permutations.get(e, np.random.default_rng([seed, e]).permutation(samples)) for e in np.unique(epoch)
+        }
+        yield np.array([permutations[e][p] for e, p in zip(epoch, place, strict=True)])
+
+
+def train(
+    config: TrainConfig,
+    model: mvae.Config,
+    arrays: Arrays,
+    *,
+    workdir: str | os.PathLike[str],
+    absent: tuple[str, ...] = (),
+    targets: Literal["all", "own"] = "all",
+    augment: Callable[[PRNGKeyArray, Batch], Batch] | None = None,
+    preprocessing: dict[str, Any] | None = None,
+    validate: Callable[[nnx.GraphDef[mvae.MVAE], nnx.State], dict[str, float]] | None = None,
+    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+) -> Model:
+    """Train a model in `workdir`, or go on where an earlier call on it stopped.
+
+    A run that was killed gives the parameters, to the last bit, of one that was not, on one machine. Where the
+    last step is done, nothing is written. Other entries in `workdir` are left alone.
+
+    Args:
+        config: how.
+        model: what.
+        arrays: the training set; what `augment` does is not part of what is compared on resuming.
+        workdir: the model's folder: `config.json`, `metrics.jsonl`, `checkpoints/`.
+        absent: modalities present in no sample; they may be missing from `arrays.inputs`.
+        targets: `all` or `own`, see `mvae.loss`.
+        augment: pure and traceable, `(key, batch) -> batch` on floats.
+        preprocessing: plain values for `config.json`: how images and vectors were made.
+        validate: called at every checkpoint with the definition and the state; its numbers join the record.
+        progress: called after every step with the steps done, their total, and the latest record of
+            `metrics.jsonl` (empty before the first).
+
+    Returns:
+        The trained model.
+
+    Raises:
+        ValueError: `workdir` was made with other settings or data, or a checkpoint in it is torn; the arrays
+            contradict `absent` or lack a modality.
+        FloatingPointError: the loss is no longer finite.
+    """
+    workdir = Path(workdir)
+    total = config.total(len(arrays))
+    _check(model, arrays, absent)
+    settings = {
+        "model": model.to_json(),
+        "training": asdict(config),
+        "targets": targets,
+        "absent": list(absent),
+        "data": {"samples": len(arrays), "checksum": arrays.checksum()},
+        "preprocessing": preprocessing or {},
+    }
+    settings = _settle(workdir, settings)
+    graphdef, state = initial(config, model, total)
+    state = restore(workdir, state) or state
+    start = int(state.step)
+    if start < total:
+        log = workdir / "metrics.jsonl"
+        record = _truncate(log, start)
+        compiled = jax.jit(
+            lambda state, batch: step(
+                graphdef, config, total, state, batch, targets=targets, absent=absent, augment=augment
+            ),
+            donate_argnums=0,
+        )
+        recent: list[mvae.Terms] = []
+        for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
+            state, terms = compiled(state, arrays.take(index))
+            recent.append(jax.block_until_ready(terms))
+            at_checkpoint = done % config.checkpoint_every == 0 or done == total
+            if done % config.log_every == 0 or done == total:
+                record = _record(done, recent)
+                recent = []
+                if at_checkpoint and validate is not None:
+                    record |= validate(graphdef, nnx.merge_state(state.params, state.stats))
+                with log.open("a") as file:
+                    file.write(json.dumps(record) + "\n")
+                if not np.isfinite(record["loss"]):
+                    raise FloatingPointError(
+                        f"{workdir}: the loss is {record['loss']} at step {done}; lower learning_rate="
+                        f"{config.learning_rate} or set clip"
+                    )
+            if at_checkpoint:
+                save(workdir, state)
+            if progress is not None:
+                progress(done, total, record)
+    return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
+
+
+def load(workdir: str | os.PathLike[str]) -> Model:
+    """The model in a folder, from this folder alone.
+
+    Args:
+        workdir: what was `workdir` to `train`.
+
+    Returns:
+        The model at its newest checkpoint.
+
+    Raises:
+        FileNotFoundError: the folder has no `config.json` or no checkpoint.
+        ValueError: one of them is torn.
+    """
+    workdir = Path(workdir)
+    settings = read_settings(workdir)
+    if settings is None:
+        raise FileNotFoundError(
+            f"{workdir}: has no config.json; give the folder of a trained model, or train one there"
+        )
+    model, config = mvae.Config.from_json(settings["model"]), TrainConfig(**settings["training"])
+    total = config.total(settings["data"]["samples"])
+    graphdef, _, _ = mvae.init(jax.random.key(0), model)
+    state = restore(workdir, jax.eval_shape(lambda: initial(config, model, total)[1]))
+    if state is None:
+        raise FileNotFoundError(f"{workdir}: has no checkpoint; run its training to the first one")
+    return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
+
+
+def _settle(workdir: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Write `config.json`, or compare with the one that is there."""
+    settings = json.loads(json.dumps(settings))
+    old = read_settings(workdir)
+    if old is None:
+        workdir.mkdir(parents=True, exist_ok=True)
+        write_text(workdir / "config.json", json.dumps(settings, indent=1) + "\n")
+    elif old != settings:
+        differ = sorted(key for key in old.keys() | settings.keys() if old.get(key) != settings.get(key))
+        raise ValueError(
+            f"{workdir / 'config.json'}: made with another {', '.join(differ)}; give another workdir, or delete this one"
+        )
+    return settings
+
+
+def _truncate(log: Path, start: int) -> dict[str, float]:
+    """Drop records after step `start`; the last one that stays."""
+    records = []
+    for line in log.read_text().splitlines() if log.exists() else []:
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:  # torn by a kill
+            break
+        if record["step"] <= start:
+            records.append(record)
+    write_text(log, "".join(json.dumps(r) + "\n" for r in records))
+    return records[-1] if records else {}
+
+
+def _record(done: int, recent: list[mvae.Terms]) -> dict[str, float]:
+    mean = jax.tree.map(lambda *x: float(np.mean(x)), *recent)
+    return {"step": done, "loss": mean.loss, "kl": mean.kl, **mean.reconstruction}
+
+
+def _check(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
+    for name in absent:
+        if np.any(arrays.present.get(name, False)):
+            raise ValueError(f"{name} is declared absent, and {int(np.sum(arrays.present[name]))} samples have it")
+    for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
+        needed = set(model.names) - (set(absent) if kind == "inputs" else set())
+        if not needed <= set(values) <= set(model.names):
+            raise ValueError(f"{kind} named {sorted(values)}; the model {sorted(model.names)} needs {sorted(needed)}")
+    for modality in model.modalities:
+        for values in (arrays.inputs, arrays.targets):
+            if modality.name in values and values[modality.name].shape[1:] != modality.shape:
+                raise ValueError(
+                    f"{modality.name}: arrays of {values[modality.name].shape[1:]}, the model takes {modality.shape}"
+                )
+    width = 0 if arrays.condition is None else arrays.condition.shape[1]
+    if width != model.condition:
+        raise ValueError(f"condition of width {width}; the model takes {model.condition}")

@@ -1,0 +1,107 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+
+from sts_jax import objects
+
+
+def brute(
+    body: objects.Body, solid: trimesh.Trimesh, fill: float, scale: float
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre and inertia of samples: the shell's on the surface, the contents' lowest share of the volume."""
+    rng = np.random.default_rng(0)
+    shell = trimesh.sample.sample_surface(solid, 100_000, seed=2)[0]
+    low, high = solid.bounds
+    inside = rng.uniform(low, high, (300_000, 3))
+    inside = inside[solid.contains(inside)]
+    inside = inside[np.argsort(inside[:, 2])][: int(len(inside) * fill)]
+    shell_mass = float(body.shell_mass) * scale
+    contents_mass = float(body.contents_density) * solid.volume * fill
+    weights = np.concatenate(
+        [np.full(len(shell), shell_mass / len(shell)), np.full(len(inside), contents_mass / max(len(inside), 1))]
+    )
+    points = np.concatenate([shell, inside])
+    mass = weights.sum()
+    com = weights @ points / mass
+    offset = points - com
+    square = np.einsum("p,pi,pj->ij", weights, offset, offset)
+    return mass, com, np.trace(square) * np.eye(3) - square
+
+
+@pytest.fixture(scope="module")
+def jar(tmp_path_factory) -> tuple[objects.Body, trimesh.Trimesh]:
+    """A closed, lopsided solid whose surface is both shell and interior."""
+    mesh = trimesh.creation.torus(0.025, 0.012, major_sections=20, minor_sections=12)
+    mesh.vertices[:, 2] *= 1 + 8 * mesh.vertices[:, 0]
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5, [1, 1, 0]))
+    path = tmp_path_factory.mktemp("jar") / "jar.stl"
+    mesh.export(path)
+    body = objects.load(path)
+    faces = np.asarray(body.faces)
+    faces = faces[faces.any(1)]
+    return body, trimesh.Trimesh(np.asarray(body.vertices, float), faces, process=True)
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+@pytest.mark.parametrize("fill", [0.0, 0.13, 0.5, 0.87, 1.0])
+def test_rigid_against_samples(jar, fill, scale):
+    body, solid = jar
+    mass, com, inertia = jax.jit(objects.rigid)(body, fill, scale)
+    true_mass, true_com, true_inertia = brute(body, solid, fill, scale)
+    np.testing.assert_allclose(mass, true_mass, rtol=1e-4)
+    np.testing.assert_allclose(com, true_com, atol=2e-4)
+    np.testing.assert_allclose(inertia, true_inertia, atol=0.015 * np.trace(true_inertia))
+
+
+def test_full_box_by_hand(tmp_path):
+    a, b, c = 0.06, 0.04, 0.1
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((a, b, c)).export(path)
+    mass, com, inertia = objects.rigid(objects.load(path), 1.0, 0.0)
+    np.testing.assert_allclose(mass, 1000 * a * b * c, rtol=1e-5)
+    np.testing.assert_allclose(com, 0, atol=1e-7)
+    truth = float(mass) / 12 * np.diag([b * b + c * c, a * a + c * c, a * a + b * b])
+    np.testing.assert_allclose(inertia, truth, atol=1e-5 * truth.max())
+
+
+def test_mass_and_inertia_grow_with_the_fill():
+    body = objects.make(jax.random.key(2), "bottle")
+    fills = jnp.linspace(0, 1, 101)
+    mass, com, inertia = jax.vmap(lambda fill: objects.rigid(body, fill, 1.0))(fills)
+    np.testing.assert_allclose(np.diff(mass), np.diff(mass)[0], rtol=1e-3)
+    assert float(com[5, 2]) < float(com[0, 2])  # a little water lowers the balance, much raises it again
+    assert float(com[100, 2]) > float(com[20, 2])
+    moments = np.linalg.eigvalsh(np.asarray(inertia))
+    assert (moments > 0).all()
+    assert (moments[:, 0] + moments[:, 1] > moments[:, 2] * (1 - 1e-5)).all()
+
+
+def test_solid_things_weigh_the_same_at_any_fill():
+    body = objects.make(jax.random.key(2), "fork")
+    empty, full = objects.rigid(body, 0.0, 1.0), objects.rigid(body, 1.0, 1.0)
+    for a, b in zip(empty, full, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_rigid_has_a_gradient_everywhere():
+    body = objects.make(jax.random.key(2), "camera")
+    grad = jax.jit(jax.grad(lambda fill: sum(jnp.sum(x) for x in objects.rigid(body, fill, 1.0))))
+    assert all(np.isfinite(grad(fill)) for fill in (0.0, 0.3, 1.0))
+
+
+def test_stack_is_for_vmap_and_knows_classes():
+    bodies = [objects.make(jax.random.key(k), c) for k, c in enumerate(("bottle", "fork", "watch"))]
+    several = objects.stack(bodies)
+    mass, _, _ = jax.vmap(lambda body: objects.rigid(body, 0.5, 1.0))(several)
+    np.testing.assert_allclose(mass, [float(objects.rigid(b, 0.5, 1.0)[0]) for b in bodies], rtol=1e-6)
+    with pytest.raises(ValueError, match="at least one"):
+        objects.stack([])
+
+
+def test_stack_refuses_two_classes(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((0.06, 0.04, 0.1)).export(path)
+    with pytest.raises(ValueError, match="body 1 is of another class"):
+        objects.stack([objects.make(jax.random.key(0), "bottle"), objects.load(path)])

@@ -1,0 +1,307 @@
+import importlib.util
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from sts_jax import objects
+from sts_jax.objects import meshes
+from sts_jax.objects.solids import linear
+
+
+def real_faces(body: objects.Body) -> np.ndarray:
+    faces = np.asarray(body.faces)
+    return faces[faces.any(axis=1)]
+
+
+def looked_up(body: objects.Body) -> np.ndarray:
+    """Albedo at each corner of each face, nearest texel."""
+    number = len(real_faces(body))
+    texture = np.asarray(body.texture)
+    place = np.asarray(body.uv)[:number] * len(texture)
+    column, row = np.moveaxis(np.clip(place.astype(int), 0, len(texture) - 1), -1, 0)
+    return texture[row, column] * np.asarray(body.colors)[:number]
+
+
+def corners(body: objects.Body) -> np.ndarray:
+    return np.asarray(body.vertices)[real_faces(body)]
+
+
+@pytest.fixture
+def box(tmp_path) -> Path:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((0.1, 0.06, 0.04)).export(path)
+    return path
+
+
+def flag(folder: Path, *, material: bool = True, image: bool = True) -> Path:
+    """A box as an OBJ whose front (y low) wears an image, red above blue, and whose Kd is dark."""
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    lines = ["mtllib flag.mtl", "usemtl cloth"]
+    lines += [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
+    lines += [f"vt {0.1 + 0.8 * (x > 0)} {0.1 + 0.8 * (z > 0)}" for x, _, z in mesh.vertices]
+    lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in mesh.faces]
+    (folder / "flag.obj").write_text("\n".join(lines) + "\n")
+    if material:
+        (folder / "flag.mtl").write_text("newmtl cloth\nKd 0.1 0.1 0.1\nmap_Kd flag.png\n")
+    if image:
+        pixels = np.zeros((40, 60, 3), np.uint8)
+        pixels[:20], pixels[20:] = (200, 0, 0), (0, 0, 200)
+        Image.fromarray(pixels).save(folder / "flag.png")
+    return folder / "flag.obj"
+
+
+def test_closed_box(box):
+    body = objects.load(box)
+    area = 2 * (0.1 * 0.06 + 0.1 * 0.04 + 0.06 * 0.04)
+    np.testing.assert_allclose(body.shell_mass, 1.2 * area, rtol=1e-5)
+    np.testing.assert_allclose(body.contents[-1, 0], 0.1 * 0.06 * 0.04, rtol=1e-5)
+    assert body.contents_density == 1000
+    assert not body.two_sided
+    assert int(body.category) == -1
+    assert body.hull.shape == (32, 3)
+    assert len(np.unique(np.asarray(body.hull), axis=0)) == 8
+    np.testing.assert_allclose(corners(body).max((0, 1)), [0.05, 0.03, 0.02], rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(body.colors)[:12], linear(np.array(0.7)), rtol=1e-5)
+
+
+def test_given_mass_has_no_contents(box):
+    body = objects.load(box, mass=0.3)
+    for fill in (0.0, 1.0):
+        np.testing.assert_allclose(objects.rigid(body, fill, 1.0)[0], 0.3, rtol=1e-6)
+    assert body.contents_density == 0
+
+
+def test_longest_side_and_up(box):
+    body = objects.load(box, longest_side=0.05, up="x")
+    np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.03, 0.02, 0.05], rtol=1e-5)
+    body = objects.load(box, up="y")
+    np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.1, 0.04, 0.06], rtol=1e-5)
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_up_is_a_rotation(tmp_path, up):
+    mesh = trimesh.creation.box((0.02, 0.03, 0.04))
+    tip = {"x": [0.06, 0, 0], "y": [0, 0.06, 0], "z": [0, 0, 0.06]}[up]
+    mesh = trimesh.convex.convex_hull(np.vstack([mesh.vertices, [tip]]))
+    mesh.export(tmp_path / "tip.stl")
+    body = objects.load(tmp_path / "tip.stl", up=up)
+    vertices = np.asarray(body.vertices)
+    high, low = vertices[np.argmax(vertices[:, 2])], vertices[np.argmin(vertices[:, 2])]
+    assert abs(high[0]) < 1e-6
+    assert abs(high[1]) < 1e-6
+    assert high[2] > -low[2]
+    assert float(body.contents[-1, 0]) > 0  # not turned inside out
+
+
+def test_obj_texture_the_right_way_up(tmp_path):
+    body = objects.load(flag(tmp_path))
+    assert body.texture.shape == (256, 256, 3)
+    color = looked_up(body)
+    high = corners(body)[..., 2] > 0
+    level = linear(np.array(200 / 255))
+    np.testing.assert_allclose(color[high], np.broadcast_to([level, 0, 0], color[high].shape), atol=1e-3)
+    np.testing.assert_allclose(color[~high], np.broadcast_to([0, 0, level], color[~high].shape), atol=1e-3)
+
+
+def test_missing_material_is_named_once_and_texture_mends_it(tmp_path):
+    path = flag(tmp_path, material=False)
+    with pytest.warns(UserWarning, match=r"flag\.mtl.*texture=") as caught:
+        objects.load(path)
+    assert len(caught) == 1
+    with pytest.raises(FileNotFoundError, match=r"flag\.mtl"):
+        objects.load(path, strict=True)
+    body = objects.load(path, texture=tmp_path / "flag.png")
+    assert body.texture.shape == (256, 256, 3)
+    assert looked_up(body)[corners(body)[..., 2] > 0][:, 0].min() > 0.5
+
+
+def test_missing_and_torn_images(tmp_path):
+    path = flag(tmp_path, image=False)
+    with pytest.warns(UserWarning, match=r"flag\.png"):
+        objects.load(path)
+    (tmp_path / "flag.png").write_bytes(b"\x89PNG\r\n\x1a\n torn")
+    with pytest.raises(ValueError, match=r"flag\.png: cannot be read as an image"):
+        objects.load(path)
+    with pytest.raises(FileNotFoundError, match=r"none\.png"):
+        objects.load(path, texture=tmp_path / "none.png")
+
+
+def test_texture_needs_coordinates(box, tmp_path):
+    flag(tmp_path)
+    with pytest.raises(ValueError, match="no texture coordinates"):
+        objects.load(box, texture=tmp_path / "flag.png")
+
+
+def test_vertex_and_face_colours(tmp_path):
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    paint = np.where(mesh.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 100, 0, 255]]).astype(np.uint8)
+    mesh.visual.vertex_colors = paint
+    mesh.export(tmp_path / "vertex.ply")
+    body = objects.load(tmp_path / "vertex.ply")
+    color, high = looked_up(body), corners(body)[..., 2] > 0
+    np.testing.assert_allclose(color[high], np.broadcast_to([1.0, 0, 0], color[high].shape), atol=1e-6)
+    green = [0, float(linear(np.array(100 / 255))), 0]
+    np.testing.assert_allclose(color[~high], np.broadcast_to(green, color[~high].shape), atol=1e-6)
+
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    mesh.visual.face_colors = np.tile(np.uint8([0, 0, 255, 255]), (12, 1))
+    mesh.export(tmp_path / "face.ply")
+    np.testing.assert_allclose(looked_up(objects.load(tmp_path / "face.ply"))[..., 2], 1, atol=1e-6)
+
+
+def test_gltf_factor_is_linear_and_scenes_are_merged(tmp_path):
+    scene = trimesh.Scene()
+    for index, factor in enumerate(([128, 0, 0, 255], [0, 64, 0, 255])):
+        part = trimesh.creation.box((0.02, 0.02, 0.02))
+        part.visual = trimesh.visual.TextureVisuals(
+            material=trimesh.visual.material.PBRMaterial(baseColorFactor=np.array(factor, np.uint8))
+        )
+        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, 0.05 * index]))
+    scene.export(tmp_path / "two.glb")
+    body = objects.load(tmp_path / "two.glb")
+    assert len(real_faces(body)) == 24
+    color, high = looked_up(body), corners(body)[..., 2] > 0
+    np.testing.assert_allclose(color[high][:, :2], np.broadcast_to([0, 64 / 255], (36, 2)), atol=1e-3)
+    np.testing.assert_allclose(color[~high][:, :2], np.broadcast_to([128 / 255, 0], (36, 2)), atol=1e-3)
+    np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.02, 0.02, 0.07], rtol=1e-5)
+    np.testing.assert_allclose(body.contents[-1, 0], 2 * 0.02**3, rtol=1e-4)
+
+
+def test_several_textures_become_one(tmp_path):
+    scene = trimesh.Scene()
+    for index, paint in enumerate([(255, 0, 0), (0, 255, 0), None]):
+        part = trimesh.creation.box((0.02, 0.02, 0.02))
+        image = None if paint is None else Image.new("RGB", (300, 20), paint)
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+        part.visual = trimesh.visual.TextureVisuals(uv=part.vertices[:, :2] * 40 + 0.5, material=material)
+        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, 0.04 * index]))
+    scene.export(tmp_path / "three.glb")
+    body = objects.load(tmp_path / "three.glb")
+    assert body.texture.shape == (1024, 1024, 3)
+    color, z = looked_up(body), corners(body)[..., 2]
+    for rows, truth in ((z < -0.02, [1, 0, 0]), (abs(z) < 0.02, [0, 1, 0]), (z > 0.02, [1, 1, 1])):
+        np.testing.assert_allclose(color[rows], np.broadcast_to(truth, color[rows].shape), atol=2e-2)
+
+
+def test_bowl_takes_its_hull_with_one_warning(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.04)
+    keep = ball.triangles_center[:, 2] < 0
+    bowl = trimesh.Trimesh(ball.vertices, ball.faces[keep])
+    path = tmp_path / "bowl.stl"
+    bowl.export(path)
+    with pytest.warns(UserWarning, match=r"bowl\.stl.*not closed.*convex hull") as caught:
+        body = objects.load(path)
+    assert len(caught) == 1
+    np.testing.assert_allclose(body.contents[-1, 0], bowl.convex_hull.volume, rtol=1e-4)
+    assert body.two_sided
+    with pytest.raises(ValueError, match="not closed"):
+        objects.load(path, strict=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert objects.load(path, mass=0.1).two_sided  # needs no volume
+
+
+def test_flat_mesh_fails(tmp_path):
+    sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 3]])
+    sheet.export(tmp_path / "sheet.stl")
+    with pytest.raises(ValueError, match=r"sheet\.stl.*flat"):
+        objects.load(tmp_path / "sheet.stl")
+
+
+def test_inside_out_mesh_is_turned(tmp_path):
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    mesh.invert()
+    mesh.export(tmp_path / "inverted.stl")
+    body = objects.load(tmp_path / "inverted.stl")
+    np.testing.assert_allclose(body.contents[-1, 0], 0.1 * 0.06 * 0.04, rtol=1e-5)
+    outward = np.einsum("fki,fki->fk", np.asarray(body.normals)[:12], corners(body))
+    assert (outward > 0).all()
+
+
+def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
+    trimesh.creation.icosphere(subdivisions=3, radius=0.04).export(tmp_path / "ball.stl")
+    body = objects.load(tmp_path / "ball.stl")
+    assert body.hull.shape == (64, 3)
+    assert 1e-3 < objects.hull_gap(body) < 3e-3
+    np.testing.assert_allclose(np.asarray(body.normals)[:1280], corners(body) / 0.04, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mass": -0.1}, "mass must be a positive"),
+        ({"mass": 0.0}, "mass must be a positive"),
+        ({"mass": float("nan")}, "mass must be a positive"),
+        ({"longest_side": 0.0}, "longest_side must be a positive"),
+        ({"longest_side": -0.1}, "longest_side must be a positive"),
+        ({"longest_side": 0.2}, "the pad is 0.15 m"),
+    ],
+)
+def test_bad_arguments(box, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        objects.load(box, **arguments)
+
+
+def test_larger_than_the_pad(tmp_path):
+    trimesh.creation.box((100, 60, 40)).export(tmp_path / "millimetres.stl")
+    with pytest.raises(ValueError, match=r"millimetres\.stl.*longest side is 100 m.*longest_side"):
+        objects.load(tmp_path / "millimetres.stl")
+    body = objects.load(tmp_path / "millimetres.stl", longest_side=0.1)
+    np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), 0.1, rtol=1e-5)
+
+
+def test_missing_torn_and_empty_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nothing\.obj"):
+        objects.load(tmp_path / "nothing.obj")
+    trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(tmp_path / "whole.glb")
+    torn = tmp_path / "torn.glb"
+    torn.write_bytes((tmp_path / "whole.glb").read_bytes()[:3000])
+    with pytest.raises(ValueError, match=r"torn\.glb"):
+        objects.load(torn)
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 0 0 1\nv 0 1 0\n")
+    with pytest.raises(ValueError, match=r"points\.obj"):
+        objects.load(tmp_path / "points.obj")
+    (tmp_path / "empty.stl").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"empty\.stl"):
+        objects.load(tmp_path / "empty.stl")
+    (tmp_path / "text.xyzzy").write_text("no mesh")
+    with pytest.raises(ValueError, match=r"text\.xyzzy"):
+        objects.load(tmp_path / "text.xyzzy")
+
+
+def test_nan_vertices(tmp_path):
+    mesh = trimesh.creation.box((0.1, 0.06, 0.04))
+    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
+    lines[3] = "v nan 0 0"
+    lines += ["f " + " ".join(str(i + 1) for i in face) for face in mesh.faces]
+    (tmp_path / "nan.obj").write_text("\n".join(lines) + "\n")
+    with pytest.raises(ValueError, match=r"nan\.obj.*NaN"):
+        objects.load(tmp_path / "nan.obj")
+
+
+def test_too_many_faces(tmp_path, monkeypatch):
+    monkeypatch.setattr(meshes, "FACE_CLASSES", (2048, 4096))
+    trimesh.creation.icosphere(subdivisions=4, radius=0.04).export(tmp_path / "fine.stl")
+    with pytest.raises(ValueError, match=r"fine\.stl: 5,120 faces, at most 4,096.*decimate"):
+        objects.load(tmp_path / "fine.stl")
+
+
+def test_public_textured_mesh():
+    # miniworld's potion bottle (Farama Foundation): made by nobody here, and its OBJ names a material nobody has.
+    found = importlib.util.find_spec("miniworld")
+    assert found is not None, "the test extra is not installed: pip install -e .[test]"
+    folder = Path(found.origin).parent / "meshes"
+    body = objects.load(folder / "potion.obj", longest_side=0.08, up="y", texture=folder / "potion.png", strict=True)
+    assert body.texture.shape == (256, 256, 3)
+    assert np.asarray(body.texture).std() > 0.05
+    assert objects.hull_gap(body) < 2e-4
+    assert len(np.unique(np.round(looked_up(body).reshape(-1, 3), 2), axis=0)) > 5
+    assert 10e-6 < float(body.contents[-1, 0]) < 100e-6
+    vertices = np.asarray(body.vertices)
+    extent = np.ptp(vertices, axis=0)
+    np.testing.assert_allclose(extent.max(), 0.08, rtol=1e-5)
+    assert np.argmax(extent) == 2  # it stands

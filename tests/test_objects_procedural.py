@@ -1,0 +1,133 @@
+import jax
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from sts_jax import objects
+
+KEYS = [3, 17, 400]
+SOLID = ("scissors", "fork", "spoon")
+
+
+def real_faces(body: objects.Body) -> np.ndarray:
+    faces = np.asarray(body.faces)
+    return faces[faces.any(axis=1)]
+
+
+@pytest.fixture(scope="module")
+def bodies() -> dict[str, list[objects.Body]]:
+    return {c: [objects.make(jax.random.key(k), c) for k in KEYS] for c in objects.CATEGORIES}
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_fits_its_classes_and_the_pad(bodies, category):
+    for body in bodies[category]:
+        assert body.vertices.shape == (objects.FACE_CLASSES[0], 3)
+        assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
+        assert body.hull.shape[0] in objects.HULL_CLASSES
+        assert body.texture.shape == (1, 1, 3)
+        longest = np.ptp(np.asarray(body.vertices), axis=0).max()
+        assert 0.050 - 1e-6 <= longest <= 0.130 + 1e-6
+        assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(body))
+        assert objects.CATEGORIES[int(body.category)] == category
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_what_collides_is_what_is_seen(bodies, category):
+    for body in bodies[category]:
+        assert objects.hull_gap(body) < 1e-4  # m: stated 0.1 mm, aim 0.2 mm
+        seen = {tuple(p) for p in np.asarray(body.vertices)}
+        assert {tuple(p) for p in np.asarray(body.hull)} <= seen
+        assert {int(i) for i in np.unique(real_faces(body))} >= {
+            int(np.nonzero((np.asarray(body.vertices) == p).all(1))[0][0]) for p in np.asarray(body.hull)
+        }
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_hull_suits_the_collider(bodies, category):
+    for body in bodies[category]:
+        shape = ConvexHull(np.unique(np.asarray(body.hull, float), axis=0))
+        assert (shape.equations[:, 3] < -1e-3).all()  # the origin is inside, by a millimetre and more
+        _, face = np.unique(np.round(shape.equations, 4), axis=0, return_inverse=True)
+        corners = [len(np.unique(shape.simplices[face.ravel() == i])) for i in range(face.max() + 1)]
+        assert max(corners) <= 20  # MJX thins out faces of more
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_normals_and_colours(bodies, category):
+    for body in bodies[category]:
+        faces = real_faces(body)
+        vertices = np.asarray(body.vertices, float)
+        normals = np.asarray(body.normals, float)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
+        a, b, c = np.moveaxis(vertices[faces], 1, 0)
+        flat = np.cross(b - a, c - a)
+        assert (np.einsum("fki,fi->fk", normals[: len(faces)], flat) > 0).all()
+        colors = np.asarray(body.colors)
+        assert colors.min() >= 0
+        assert colors.max() <= 1
+        different = len(np.unique(colors[: len(faces)].reshape(-1, 3), axis=0))
+        assert different >= (1 if category == "fork" else 2)  # a fork may be all steel
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_mass_is_that_of_the_surface(bodies, category):
+    for body in bodies[category]:
+        triangles = np.asarray(body.vertices, float)[real_faces(body)]
+        area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+        lightest, heaviest = (0.8, 1.2 + 1e-6) if category not in (*SOLID, "watch") else (0.8, 5.9 + 1e-6)
+        assert lightest < float(body.shell_mass) / (area.sum() / 2) < heaviest
+        moments = np.linalg.eigvalsh(np.asarray(body.shell_inertia, float))
+        assert moments[0] > 0
+        assert moments[0] + moments[1] > moments[2] * (1 - 1e-5)
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_contents(bodies, category):
+    for body in bodies[category]:
+        contents = np.asarray(body.contents, float)
+        if category in SOLID:
+            assert not contents.any()
+            assert body.contents_density == 0
+            continue
+        assert body.contents_density == 1000
+        volume = contents[-1, 0]
+        hull = ConvexHull(np.unique(np.asarray(body.hull, float), axis=0)).volume
+        assert 0.2 * hull < volume < hull
+        np.testing.assert_allclose(contents[:, 0], volume * np.linspace(0, 1, objects.NUM_FILLS), rtol=1e-5)
+        height = contents[1:, 3] / contents[1:, 0]
+        assert (np.diff(height) > 0).all()
+        assert np.asarray(body.vertices)[:, 2].min() < height[0]
+
+
+def test_same_key_same_object_other_key_another():
+    for category in objects.CATEGORIES:
+        one = objects.make(jax.random.key(5), category)
+        again = objects.make(jax.random.key(5), category)
+        other = objects.make(jax.random.key(6), category)
+        assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True))
+        assert not np.array_equal(one.vertices, other.vertices)
+
+
+def test_bottles_are_those_of_the_shaken_scenario():
+    bottles = [objects.make(jax.random.key(k), "bottle") for k in range(40)]
+    height = np.array([np.ptp(np.asarray(b.vertices)[:, 2]) for b in bottles])
+    foot = []
+    shoulder = []
+    for body in bottles:
+        vertices = np.asarray(body.vertices, float)
+        radius = np.linalg.norm(vertices[:, :2], axis=1)
+        low = vertices[:, 2] < vertices[:, 2].min() + 1e-4
+        foot.append(radius[low].max())
+        shoulder.append(radius[~low].max() / radius[low].max())
+    assert 0.080 <= height.min() < 0.086 < 0.114 < height.max() <= 0.120
+    assert 0.011 <= min(foot) < 0.0125 < 0.0185 < max(foot) <= 0.020 + 1e-6
+    assert min(shoulder) > 0.9
+    assert 1.1 < max(shoulder) < 1.31
+    axes = np.array([np.asarray(b.vertices)[:, :2].max(0) + np.asarray(b.vertices)[:, :2].min(0) for b in bottles])
+    np.testing.assert_allclose(axes, 0, atol=1e-5)  # the axis is z
+
+
+def test_unknown_category():
+    with pytest.raises(ValueError, match=r"teapot.*bottle.*watch"):
+        objects.make(jax.random.key(0), "teapot")

@@ -1,0 +1,165 @@
+import numpy as np
+import pytest
+import trimesh
+
+from sts_jax.objects import NUM_FILLS, fill_moments
+from sts_jax.objects.solids import convex_hull, corner_normals, outside_hull, solid_moments, surface_moments
+
+FILLS = np.arange(NUM_FILLS) / (NUM_FILLS - 1)
+
+
+def box(a: float, b: float, c: float, centre: tuple[float, float, float]) -> np.ndarray:
+    """Moments of a solid box, by hand."""
+    x, y, z = centre
+    squares = [a * a / 12 + x * x, b * b / 12 + y * y, c * c / 12 + z * z]
+    return a * b * c * np.array([1, x, y, z, *squares, x * y, x * z, y * z])
+
+
+def twisted() -> trimesh.Trimesh:
+    """Closed, not convex, in no special attitude and away from the origin."""
+    mesh = trimesh.creation.torus(0.03, 0.012, major_sections=24, minor_sections=10)
+    turn = trimesh.transformations.rotation_matrix(0.7, [1.0, 0.4, 0.2])
+    mesh.apply_transform(turn)
+    mesh.apply_translation([0.02, -0.05, 0.04])
+    return mesh
+
+
+def test_box_fills():
+    mesh = trimesh.creation.box((0.06, 0.04, 0.1))
+    mesh.apply_translation([0.01, 0.02, 0.03])
+    table = fill_moments(mesh.vertices, mesh.faces)
+    truth = [box(0.06, 0.04, 0.1 * s, (0.01, 0.02, -0.02 + 0.05 * s)) for s in FILLS]
+    np.testing.assert_allclose(table, truth, rtol=1e-9, atol=1e-16)
+
+
+def test_prism_lying_on_its_side_is_the_clipped_polygon():
+    # A cylinder of 64 sides along y: the filled part is the segment of the polygon, cut here by trapezoids.
+    mesh = trimesh.creation.cylinder(radius=0.02, height=0.08, sections=64)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    table = fill_moments(mesh.vertices, mesh.faces)
+    angle = np.linspace(0, 2 * np.pi, 65)
+    outline = trimesh.creation.cylinder(radius=0.02, height=0.08, sections=64).vertices
+    assert np.isclose(np.linalg.norm(outline[:, :2], axis=1).max(), 0.02)
+    z = np.linspace(-0.02, 0.02, 400_001)
+    corners = 0.02 * np.stack([np.cos(angle), np.sin(angle)], 1)
+    right = corners[corners[:, 0] >= -1e-12]
+    right = right[np.argsort(right[:, 1])]
+    width = 2 * np.interp(z, right[:, 1], right[:, 0]) * 0.08
+    step = z[1] - z[0]
+
+    def running(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2 * step)])
+
+    volume = running(width)
+    for column, values in ((0, width), (3, width * z), (6, width * z * z), (4, width**3 / (12 * 0.08**2))):
+        truth = np.interp(FILLS * volume[-1], volume, running(values))
+        np.testing.assert_allclose(table[:, column], truth, atol=1e-6 * np.abs(truth).max())
+
+
+def test_sphere_caps():
+    radius = 0.03
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    table = fill_moments(mesh.vertices, mesh.faces)
+    for k in (4, 16, 25):
+        roots = np.roots([-np.pi / 3, np.pi * radius, 0, -k / 32 * 4 / 3 * np.pi * radius**3])
+        height = float(next(r.real for r in roots if abs(r.imag) < 1e-9 and 0 < r.real < 2 * radius))
+        centre = -3 * (2 * radius - height) ** 2 / (4 * (3 * radius - height))
+        np.testing.assert_allclose(table[k, 3] / table[k, 0], centre, atol=2e-3 * radius)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.0, 0.0, -2.0), (0.3, -0.8, 0.5)])
+def test_fills_of_a_ring_against_samples(direction):
+    mesh = twisted()
+    up = np.array(direction) / np.linalg.norm(direction)
+    table = fill_moments(mesh.vertices, mesh.faces, direction=direction)
+    rng = np.random.default_rng(0)
+    low, high = mesh.bounds
+    points = rng.uniform(low, high, (200_000, 3))
+    points = points[mesh.contains(points)]
+    points = points[np.argsort(points @ up)]
+    for k in (1, 8, 20, 32):
+        part = points[: len(points) * k // 32]
+        np.testing.assert_allclose(table[k, 0], mesh.volume * k / 32, rtol=1e-9)
+        noise = 5 / np.sqrt(len(part))
+        centre = table[k, 1:4] / table[k, 0]
+        assert (abs(centre - part.mean(0)) < noise * part.std(0)).all()
+        i, j = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+        square = part[:, i] * part[:, j]
+        assert (abs(table[k, 4:] / table[k, 0] - square.mean(0)) < noise * square.std(0)).all()
+
+
+def test_opposite_directions_share_the_whole():
+    mesh = twisted()
+    up = fill_moments(mesh.vertices, mesh.faces, direction=(0.2, 0.3, 0.9))
+    down = fill_moments(mesh.vertices, mesh.faces, direction=(-0.2, -0.3, -0.9))
+    np.testing.assert_allclose(up + down[::-1], np.broadcast_to(up[-1], up.shape), rtol=1e-7, atol=1e-15)
+
+
+def test_whole_solid_agrees_with_trimesh():
+    mesh = twisted()
+    total = solid_moments(mesh.triangles).sum(0)
+    elsewhere = solid_moments(mesh.triangles, reference=np.array([0.3, -0.2, 0.1])).sum(0)
+    np.testing.assert_allclose(total, elsewhere, rtol=1e-9)
+    np.testing.assert_allclose(total[0], mesh.volume)
+    np.testing.assert_allclose(total[1:4] / total[0], mesh.center_mass)
+    central = total[4:7] - total[0] * (total[1:4] / total[0]) ** 2
+    np.testing.assert_allclose(central.sum() - central, np.diag(mesh.moment_inertia), rtol=1e-6)
+
+
+def test_surface_moments_against_samples():
+    mesh = twisted()
+    total = surface_moments(mesh.triangles).sum(0)
+    points = trimesh.sample.sample_surface(mesh, 200_000, seed=1)[0]
+    np.testing.assert_allclose(total[0], mesh.area)
+    np.testing.assert_allclose(total[1:4] / total[0], points.mean(0), atol=3e-4)
+    np.testing.assert_allclose(total[4:7] / total[0], (points**2).mean(0), atol=3e-5)
+
+
+def test_fill_errors():
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1))
+    with pytest.raises(ValueError, match="direction"):
+        fill_moments(mesh.vertices, mesh.faces, direction=(0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="no volume"):
+        fill_moments(mesh.vertices, mesh.faces[:, ::-1])
+
+
+def test_hull_is_exact_while_it_may_be():
+    points = trimesh.creation.box((0.1, 0.05, 0.02)).subdivide().subdivide().vertices
+    hull = convex_hull(points)
+    assert len(hull) == 8
+    assert outside_hull(points, hull).max() < 1e-12
+
+
+def test_hull_keeps_what_matters_and_the_rest_is_stated():
+    points = trimesh.creation.icosphere(subdivisions=4, radius=0.05).vertices
+    hull = convex_hull(points)
+    assert len(hull) == 64
+    gap = outside_hull(points, hull).max()
+    assert 1e-3 < gap < 4e-3  # a sphere is the worst there is
+    assert {tuple(p) for p in hull} <= {tuple(p) for p in points}
+
+
+def test_outside_hull_is_the_distance():
+    hull = trimesh.creation.box((2.0, 2.0, 2.0)).vertices
+    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.5, 0, 0], [1.3, 1.4, 0], [2.0, 2, 2]])
+    np.testing.assert_allclose(outside_hull(points, hull), [0, 0, 0.5, 0.5, np.sqrt(3)], atol=1e-9)
+
+
+def test_flat_points_have_no_hull():
+    with pytest.raises(ValueError, match="plane"):
+        convex_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]))
+
+
+def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_box():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    normals = corner_normals(ball.vertices, ball.faces)
+    np.testing.assert_allclose(normals, ball.vertices[ball.faces], atol=2e-2)
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    normals = corner_normals(cube.vertices, cube.faces)
+    np.testing.assert_allclose(normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
+
+
+def test_corner_normals_of_faces_without_area_are_finite():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]])
+    normals = corner_normals(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
