@@ -103,7 +103,7 @@ def smallest_eigenvector(
     `sqrt(1 - h)` and one Newton step); the vector is the largest column of
     `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. Its derivative needs the smallest eigenvalue
     to be simple and no more: the other two may be equal, as they are for points that lie in a plane. Where it is not
-    simple, one of the eigenvectors is returned, with zero gradient.
+    simple, some unit vector is returned, with zero gradient.
 
     Args:
         xx: with the other five, the elements of A, each an array of its own (which is how a CPU is quick).

@@ -88,9 +88,7 @@ def sense(
         # Every other sample is a pixel's centre; the others lie half way between.
         shape = (2 * resolution[0] + 1, 2 * resolution[1] + 1)
         pitch = window[2:] / jnp.array([resolution[1], resolution[0]], jnp.float32) / 2
-        seen = jnp.concatenate(
-            [window[:2] - pitch / 2, pitch * jnp.array([shape[1], shape[0]], jnp.float32)]
-        )
+        seen = jnp.concatenate([window[:2] - pitch / 2, pitch * jnp.array([shape[1], shape[0]], jnp.float32)])
     else:
         shape, seen = resolution, window
 
@@ -161,6 +159,8 @@ def _draw(
     weights = [w * corners[..., k] for k, w in enumerate(optics.barycentrics(pixels, body.faces, winner))]
     depth = 1 / sum(weights)
     weights = [w * depth for w in weights]
+    # Kept as they are: XLA would work them out again for each of the neighbours that a normal needs.
+    depth, weights, nearest = jax.lax.optimization_barrier((depth, weights, nearest))
     slopes = optics.rays(camera, window, shape)
 
     # seen through the skin
@@ -180,10 +180,12 @@ def _draw(
     visual = jnp.where(hit[..., None], shaded, empty)
 
     # the skin itself
-    skin = jnp.where(hit & on_pad & pressing, jnp.clip(depth, camera.distance - gel.thickness, camera.distance), camera.distance)
-    surface = jnp.concatenate([slopes * skin[..., None], (skin - camera.distance)[..., None]], axis=-1)
-    light = tactile.phong(sensor.phong, sensor.lights, tactile.surface_normals(surface))
-    dark = tactile.darken(sensor.phong, camera.distance - skin) * jnp.where(on_pad, 1, sensor.room.rim)
+    face = jnp.asarray(camera.distance)
+    skin = jnp.where(hit & on_pad & pressing, jnp.clip(depth, face - gel.thickness, face), face)
+    surface = jnp.concatenate([slopes * skin[..., None], (skin - face)[..., None]], axis=-1)
+    skin_normals = tactile.surface_normals(jax.lax.optimization_barrier(surface))
+    light = tactile.phong(sensor.phong, sensor.lights, jax.lax.optimization_barrier(skin_normals))
+    dark = tactile.darken(sensor.phong, face - skin) * jnp.where(on_pad, 1, sensor.room.rim)
     return visual, light * dark[..., None], depth, hit
 
 

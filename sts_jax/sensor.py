@@ -1,11 +1,25 @@
 """All constants of one sensor."""
 
 import dataclasses
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from sts_jax.optics import Camera, Room
 from sts_jax.tactile import Gel, Lights, Phong
+
+# fmt: off
+_POSITIVE = {
+    "camera.distance", "camera.fov", "camera.aspect", "camera.near", "gel.size", "gel.thickness", "gel.stiffness",
+    "gel.max_depth", "gel.max_tilt", "gel.tolerance", "gel.cells", "phong.shininess", "phong.darkening", "room.haze",
+}
+# fmt: on
 
 
 @jax.tree_util.register_dataclass
@@ -18,5 +32,85 @@ class Sensor:
     lights: Lights = dataclasses.field(default_factory=Lights)
     phong: Phong = dataclasses.field(default_factory=Phong)
     room: Room = dataclasses.field(default_factory=Room)
-    # images with a shorter side below this (pixels) are sampled at half a pixel's distance and filtered
+    # images with a shorter side below this (pixels) are sampled at half a pixel's distance and filtered; ours
     fine_below: int = dataclasses.field(default=128, metadata={"static": True})
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write every constant to one JSON file, whole or not at all.
+
+        Args:
+            path: of the file.
+        """
+        path = Path(path)
+        part = path.with_name(path.name + ".part")
+        part.write_text(json.dumps(_plain(self), indent=2) + "\n")
+        part.replace(path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> "Sensor":
+        """Read what `save` wrote.
+
+        Args:
+            path: of the file.
+
+        Returns:
+            Sensor.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is torn, or a field is missing, unknown, of another shape or out of range.
+        """
+        text = Path(path).read_text()
+        try:
+            values = json.loads(text)
+        except json.JSONDecodeError as error:
+            raise ValueError(
+                f"{path} is not a sensor's JSON file (torn?): {error}. Write it again with Sensor.save."
+            ) from error
+        return _typed(cls(), values, "", str(path))
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, tuple):
+        return [_plain(v) for v in value]
+    # The shortest decimal that reads back as the same float32.
+    array = np.asarray(value)
+    return (
+        json.loads(np.array2string(array, separator=",", threshold=array.size + 1, floatmode="unique"))
+        if array.ndim
+        else array.item()
+    )
+
+
+def _typed(default: Any, value: Any, name: str, path: str) -> Any:
+    if dataclasses.is_dataclass(default) and not isinstance(default, type):
+        known = [f.name for f in dataclasses.fields(default)]
+        if not isinstance(value, dict):
+            raise ValueError(f"{path}: field {name or 'sensor'} is {value!r}; it takes the fields {', '.join(known)}.")
+        prefix = f"{name}." if name else ""
+        for missing in set(known) - set(value):
+            raise ValueError(f"{path}: field {prefix}{missing} is missing. Write the file again with Sensor.save.")
+        for unknown in set(value) - set(known):
+            raise ValueError(f"{path}: field {prefix}{unknown} is not known; known are {', '.join(known)}.")
+        fields = {k: _typed(getattr(default, k), value[k], prefix + k, path) for k in known}
+        return dataclasses.replace(default, **fields)
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        array = np.asarray(np.nan)
+    shape = np.shape(default)
+    # Lights and lamps may be any number of rows.
+    fits = array.shape == shape or (len(shape) == 2 and array.ndim == 2 and array.shape[1] == shape[1])
+    if not (fits and np.all(np.isfinite(array))):
+        raise ValueError(f"{path}: field {name} is {value!r}; it takes finite numbers of shape {shape}.")
+    if name in _POSITIVE and not np.all(array > 0):
+        raise ValueError(f"{path}: field {name} is {value!r}; it must be above 0.")
+    if name == "camera.fov" and array >= math.pi:
+        raise ValueError(f"{path}: field {name} is {value!r}; it must be below pi.")
+    if isinstance(default, tuple):
+        return tuple(type(d)(v) for d, v in zip(default, value, strict=True))
+    if isinstance(default, (int, float)):
+        return type(default)(value)
+    return jnp.asarray(array, jnp.float32)

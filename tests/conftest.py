@@ -7,4 +7,4 @@ os.environ.setdefault("MPLBACKEND", "agg")
 
 import jaxtyping
 
-jaxtyping.install_import_hook("sts_jax", "beartype.beartype")
+jaxtyping.install_import_hook("sts_jax", "checker.check")

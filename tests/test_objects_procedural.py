@@ -131,3 +131,14 @@ def test_bottles_are_those_of_the_shaken_scenario():
 def test_unknown_category():
     with pytest.raises(ValueError, match=r"teapot.*bottle.*watch"):
         objects.make(jax.random.key(0), "teapot")
+
+
+@pytest.mark.parametrize("category", objects.CATEGORIES)
+def test_it_stands_or_lies_as_made(bodies, category):
+    for body in bodies[category]:
+        hull = np.asarray(body.hull, float)
+        foot = hull[hull[:, 2] < hull[:, 2].min() + 1.5e-3, :2]
+        for fill in (0.0, 0.5, 1.0):
+            com = np.asarray(objects.rigid(body, fill, 1.0)[1], float)
+            around = np.sort(np.arctan2(*(foot - com[:2]).T))
+            assert np.diff(np.append(around, around[0] + 2 * np.pi)).max() < np.pi  # the balance is over the foot

@@ -150,12 +150,23 @@ def claim(path: Path, content: dict) -> None:
         there = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise records.TornFileError(f"{path} is torn ({error}); give another --workdir or delete this one.") from error
-    for field in sorted({*content, *there}):
-        if content.get(field) != there.get(field):
-            raise ValueError(
-                f"{path} was made with {field} = {there.get(field)!r}, asked for now is {content.get(field)!r}: "
-                "give another --workdir, or delete this one to start anew."
-            )
+    difference = _first_difference(there, content)
+    if difference is not None:
+        field, old, new = difference
+        raise ValueError(
+            f"{path} was made with {field} = {old!r}, asked for now is {new!r}: "
+            "give another --workdir, or delete this one to start anew."
+        )
+
+
+def _first_difference(old: object, new: object, field: str = "") -> tuple[str, object, object] | None:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            inner = _first_difference(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
+            if inner is not None:
+                return inner
+        return None
+    return None if old == new else (field, old, new)
 
 
 def _make_shard(

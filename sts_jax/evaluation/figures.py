@@ -44,23 +44,31 @@ def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, 
 
 
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
-    """Loss, reconstruction and KL against the gradient step, one line a model.
+    """Loss, KL and the reconstruction of each modality against the gradient step, one line a model.
 
     Args:
         path: The PNG to write.
-        logs: For each model its log: dictionaries with `step`, `loss`, `kl` and other numbers.
+        logs: For each model its log: dictionaries with `step`, `loss`, `kl` and one number a modality.
     """
-    figure, axes = plt.subplots(1, 3, figsize=(12, 3.4))
-    for axis, key in zip(axes, ("loss", "reconstruction", "kl"), strict=True):
+    keys = [
+        key
+        for key in ("loss", "kl", "visual", "tactile", "pose")
+        if any(key in e for log in logs.values() for e in log)
+    ]
+    units = {"pose": "squared error (scaled pose)"}
+    figure, axes = plt.subplots(1, len(keys), figsize=(3.6 * len(keys), 3.2), squeeze=False)
+    for axis, key in zip(axes[0], keys, strict=True):
         for name, log in logs.items():
             points = [(entry["step"], entry[key]) for entry in log if key in entry]
             if points:
                 axis.plot(*zip(*points, strict=True), label=name, linewidth=1)
         axis.set_xlabel("gradient step")
-        axis.set_ylabel(f"{key} (nats an item)")
+        axis.set_ylabel(units.get(key, "nats an item"))
+        axis.set_title(key, fontsize=9)
+        if key != "kl":
+            axis.set_yscale("log")
         axis.grid(alpha=0.3)
-    axes[0].set_yscale("log")
-    axes[0].legend(fontsize=7)
+    axes[0, 0].legend(fontsize=7)
     _save(figure, path)
 
 

@@ -5,16 +5,17 @@ gradients of strided ones. Here none has one. Arrays are channels last, `(batch,
 kernels are `(size, size, in, out)` and `size` is a multiple of `stride`.
 """
 
-from functools import partial
+import functools
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
+_FEW = 16  # channels
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def conv(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
@@ -29,12 +30,10 @@ def conv(
     Returns:
         `ho = (h + 2 padding - size) // stride + 1` rows, columns likewise.
     """
-    return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), [(padding, padding)] * 2, dimension_numbers=_LAYOUT
-    )
+    return _convolve(x, kernel, stride, padding)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def conv_transpose(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
@@ -54,61 +53,86 @@ def conv_transpose(
     )
 
 
+def _convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
+    """`conv`; where channels are few, a block of `stride` x `stride` pixels is made one pixel first: quicker."""
+    if stride > 1 and x.shape[3] < _FEW:
+        size = kernel.shape[0]
+        counts = [(n + 2 * padding - size) // stride + size // stride for n in x.shape[1:3]]
+        x, kernel, stride, padding = _fold(x, stride, padding, counts), _fold_kernel(kernel, stride), 1, 0
+    pads = [(padding, padding)] * 2
+    return jax.lax.conv_general_dilated(x, kernel, (stride, stride), pads, dimension_numbers=_LAYOUT)
+
+
 def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, width: int) -> Array:
     """`conv_transpose`, cut or filled with zeros to the size asked for."""
     size, _, _, out = kernel.shape
+    batch, h, w, channels = x.shape
     taps = size // stride
-    # kernel[stride q + r] is tap q of phase r: all phases of the output are the channels of one small convolution.
-    kernel = kernel.reshape(taps, stride, taps, stride, -1, out).transpose(0, 2, 4, 1, 3, 5)
-    batch, h, w, _ = x.shape
-    if stride == 1:
-        flat = kernel.transpose(2, 0, 1, 3, 4, 5).reshape(x.shape[3], -1)
-        y = (x.reshape(-1, x.shape[3]) @ flat).reshape(batch, h, w, taps, taps, out)
-        edges = [(a, taps - 1 - a) for a in range(taps)]
-        y = sum(
-            jnp.pad(y[:, :, :, a, b], ((0, 0), edges[a], edges[b], (0, 0))) for a in range(taps) for b in range(taps)
-        )
-    else:
-        flat = kernel[::-1, ::-1].reshape(taps, taps, x.shape[3], -1)
-        y = jax.lax.conv_general_dilated(x, flat, (1, 1), [(taps - 1, taps - 1)] * 2, dimension_numbers=_LAYOUT)
-        y = y.reshape(batch, h + taps - 1, w + taps - 1, stride, stride, out).transpose(0, 1, 3, 2, 4, 5)
+    if stride == 1:  # one matrix product to all taps, shifted and added
+        y = x.reshape(-1, channels) @ kernel.transpose(2, 0, 1, 3).reshape(channels, -1)
+        y = y.reshape(batch, h, w, size, size, out)
+        edges = [(a, size - 1 - a) for a in range(size)]
+        shifted = [
+            jnp.pad(y[:, :, :, a, b], ((0, 0), edges[a], edges[b], (0, 0))) for a in range(size) for b in range(size)
+        ]
+        y = functools.reduce(jnp.add, shifted)
+    else:  # one small convolution to all phases, interleaved
+        phases = _fold_kernel(kernel.swapaxes(2, 3), stride).swapaxes(2, 3)[::-1, ::-1]
+        y = jax.lax.conv_general_dilated(x, phases, (1, 1), [(taps - 1, taps - 1)] * 2, dimension_numbers=_LAYOUT)
+        y = y.reshape(*y.shape[:3], stride, stride, out).transpose(0, 1, 3, 2, 4, 5)
         y = y.reshape(batch, stride * (h + taps - 1), stride * (w + taps - 1), out)
     return _cut(y, padding, height, width)
 
 
-def _cut(x: Array, before: int, height: int, width: int) -> Array:
-    """Rows and columns `before .. before + size`, zero where the array has ended (or not begun)."""
-    x = jnp.pad(
-        x,
-        (
-            (0, 0),
-            (max(-before, 0), max(before + height - x.shape[1], 0)),
-            (max(-before, 0), max(before + width - x.shape[2], 0)),
-            (0, 0),
-        ),
-    )
-    before = max(before, 0)
-    return x[:, before : before + height, before : before + width]
-
-
 def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int) -> Array:
     """`k[a, A, B] = sum_i wide[stride i + a - padding, A] narrow[i, B]`: either gradient in the kernel."""
-    taps = size // stride
     batch, h, w, channels = narrow.shape
-    wide = _cut(wide, -padding, stride * (h + taps - 1), stride * (w + taps - 1))
-    wide = wide.reshape(batch, h + taps - 1, stride, w + taps - 1, stride, -1).transpose(0, 1, 3, 2, 4, 5)
-    wide = wide.reshape(batch, h + taps - 1, w + taps - 1, -1)
-    flat = narrow.reshape(-1, channels)
-    rows = [
-        jnp.stack([flat.T @ wide[:, a : a + h, b : b + w].reshape(len(flat), -1) for b in range(taps)])
-        for a in range(taps)
-    ]
-    kernel = jnp.stack(rows).reshape(taps, taps, channels, stride, stride, -1)
-    return kernel.transpose(0, 3, 1, 4, 5, 2).reshape(size, size, -1, channels)
+    if stride > 1 and wide.shape[3] < _FEW:
+        counts = [h + size // stride - 1, w + size // stride - 1]
+        folded = _correlate(_fold(wide, stride, padding, counts), narrow, size // stride, 1, 0)
+        return _unfold_kernel(folded, stride)
+    wide = _cut(wide, -padding, stride * (h - 1) + size, stride * (w - 1) + size)
+    columns = [wide[:, :, b : b + stride * (w - 1) + 1 : stride] for b in range(size)]
+    patches = jnp.concatenate(columns, axis=3)
+    flat = narrow.reshape(-1, channels).T
+    rows = [patches[:, a : a + stride * (h - 1) + 1 : stride] for a in range(size)]
+    kernel = jnp.stack([flat @ row.reshape(batch * h * w, -1) for row in rows])
+    return kernel.reshape(size, channels, size, -1).transpose(0, 2, 3, 1)
+
+
+def _cut(x: Array, start: int, height: int, width: int) -> Array:
+    """Rows and columns from `start` on, zero outside of the array."""
+    before = max(-start, 0)
+    after = [max(start + n - m, 0) for n, m in ((height, x.shape[1]), (width, x.shape[2]))]
+    x = jnp.pad(x, ((0, 0), (before, after[0]), (before, after[1]), (0, 0)))
+    start = max(start, 0)
+    return x[:, start : start + height, start : start + width]
+
+
+def _fold(x: Array, stride: int, padding: int, counts: list[int]) -> Array:
+    """`counts` blocks of `stride` x `stride` pixels become pixels, their phases channels."""
+    h, w = counts
+    x = _cut(x, -padding, stride * h, stride * w).reshape(len(x), h, stride, w, stride, -1)
+    return x.transpose(0, 1, 3, 2, 4, 5).reshape(len(x), h, w, -1)
+
+
+def _fold_kernel(kernel: Array, stride: int) -> Array:
+    """The kernel that does on folded pixels what `kernel` does with `stride`."""
+    size, _, channels, out = kernel.shape
+    taps = size // stride
+    kernel = kernel.reshape(taps, stride, taps, stride, channels, out).transpose(0, 2, 1, 3, 4, 5)
+    return kernel.reshape(taps, taps, -1, out)
+
+
+def _unfold_kernel(kernel: Array, stride: int) -> Array:
+    """The inverse of `_fold_kernel`."""
+    taps, _, _, out = kernel.shape
+    kernel = kernel.reshape(taps, taps, stride, stride, -1, out).transpose(0, 2, 1, 3, 4, 5)
+    return kernel.reshape(taps * stride, taps * stride, -1, out)
 
 
 def _conv_forward(x: Array, kernel: Array, stride: int, padding: int) -> tuple[Array, tuple[Array, Array]]:
-    return conv(x, kernel, stride, padding), (x, kernel)
+    return _convolve(x, kernel, stride, padding), (x, kernel)
 
 
 def _conv_backward(stride: int, padding: int, saved: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
@@ -123,7 +147,7 @@ def _transpose_forward(x: Array, kernel: Array, stride: int, padding: int) -> tu
 
 def _transpose_backward(stride: int, padding: int, saved: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
     x, kernel = saved
-    dx = conv(g, kernel.swapaxes(2, 3), stride, padding)
+    dx = _convolve(g, kernel.swapaxes(2, 3), stride, padding)
     return dx, _correlate(g, x, kernel.shape[0], stride, padding).swapaxes(2, 3)
 
 

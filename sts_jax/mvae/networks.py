@@ -114,7 +114,7 @@ class BatchNorm(nnx.Module):
         return x * slope[None, None, None] + offset[None, None, None]
 
 
-class ImageEncoder(nnx.Module):
+class _ImageEncoder(nnx.Module):
     """Four convolutions (with batch normalisation and Swish), then two fully connected layers."""
 
     def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
@@ -135,7 +135,7 @@ class ImageEncoder(nnx.Module):
         return _gaussian(self.second(jax.nn.swish(self.first(x.reshape(len(x), -1)))))
 
 
-class ImageDecoder(nnx.Module):
+class _ImageDecoder(nnx.Module):
     """A fully connected layer, then four transposed convolutions; the last one is linear and gives logits."""
 
     def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
@@ -160,7 +160,7 @@ class ImageDecoder(nnx.Module):
         return x + self.bias[...][None, None, None]
 
 
-class VectorEncoder(nnx.Module):
+class _VectorEncoder(nnx.Module):
     """Two fully connected layers."""
 
     def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
@@ -172,7 +172,7 @@ class VectorEncoder(nnx.Module):
         return _gaussian(self.second(jax.nn.swish(self.first(x))))
 
 
-class VectorDecoder(nnx.Module):
+class _VectorDecoder(nnx.Module):
     """Two fully connected layers."""
 
     def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
@@ -192,8 +192,8 @@ class MVAE(nnx.Module):
 
     def __init__(self, config: Config, *, rngs: nnx.Rngs) -> None:
         self.config = config
-        encoders = {"image": ImageEncoder, "vector": VectorEncoder}
-        decoders = {"image": ImageDecoder, "vector": VectorDecoder}
+        encoders = {"image": _ImageEncoder, "vector": _VectorEncoder}
+        decoders = {"image": _ImageDecoder, "vector": _VectorDecoder}
         self.encoders = nnx.Dict({m.name: encoders[m.kind](m, config, rngs=rngs) for m in config.modalities})
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config, rngs=rngs) for m in config.modalities})
 

@@ -10,8 +10,8 @@ import trimesh
 from PIL import Image
 from scipy.spatial import ConvexHull
 
-from .body import FACE_CLASSES, TEXTURE_CLASSES, Body
-from .solids import CONTENTS, WALL, assemble, linear
+from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.solids import CONTENTS, WALL, assemble, linear
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
 PLAIN = 0.7  # sRGB grey of a mesh that names no colour

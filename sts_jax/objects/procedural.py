@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from scipy.interpolate import PchipInterpolator
 
-from .body import CATEGORIES, Body
-from .solids import CONTENTS, WALL, assemble, linear
+from sts_jax.objects.body import CATEGORIES, Body
+from sts_jax.objects.solids import CONTENTS, WALL, assemble, linear
 
 STEEL = 5.9  # kg/m^2 of each face: stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301) x 1.5 mm, on two faces
 SHEET = 1.5  # mm, thickness of cutlery
@@ -551,14 +551,11 @@ def _scissors(rng: np.random.Generator) -> list[Part]:
     return _scaled([*right, *left, screw], longest)
 
 
-def _cutlery(
-    rng: np.random.Generator, length: Number, end: Number
-) -> tuple[Callable[[float], float], Part, Color, float]:
-    """Height of the handle's middle line over x, from x = 0 to `end`; the handle; its steel; the neck's width."""
+def _cutlery(rng: np.random.Generator, length: Number, end: Number, lift: Number) -> tuple[Part, Color, float]:
+    """The handle from x = 0 on the table to x = `end`, `lift` above it; its steel; the width of its neck."""
     arch = length * rng.uniform(0.015, 0.05)  # handle's rise over length: U(.015, .05)
     wide = length * rng.uniform(0.075, 0.12)  # its end's width: U(.075, .12)
     neck = length * rng.uniform(0.032, 0.045)  # its neck's width: U(.032, .045)
-    lift = length * rng.uniform(0.05, 0.09)  # how far the neck stands above the table: U(.05, .09)
     steel = _steel(rng)
     coloured = rng.uniform() < 0.35  # a third have a coloured handle, thicker than the steel
     tint = _vivid(rng) if coloured else steel
@@ -575,7 +572,7 @@ def _cutlery(
         ]
     )
     handle = _loft(rings, [*[tint] * 5, steel, steel], density=STEEL)
-    return profile, handle, steel, neck
+    return handle, steel, neck
 
 
 def _fork(rng: np.random.Generator) -> list[Part]:
@@ -586,9 +583,9 @@ def _fork(rng: np.random.Generator) -> list[Part]:
     reach = length * rng.uniform(0.2, 0.28)  # tines' length: U(.2, .28)
     palm = length * rng.uniform(0.1, 0.15)  # neck to the roots of the tines: U(.1, .15)
     curl = length * rng.uniform(0.035, 0.07)  # how far the tips curl up: U(.035, .07)
+    drop = length * rng.uniform(0.05, 0.09)  # how far the neck stands above the table: U(.05, .09)
     end = length - reach - palm
-    profile, handle, steel, neck = _cutlery(rng, length, end)
-    drop = float(profile(end))
+    handle, steel, neck = _cutlery(rng, length, end, drop)
     # The middle line: from the neck down to the table, then up to the tips.
     line = PchipInterpolator([end, end + 0.75 * palm, end + palm, length], [drop, 0.04 * drop, 0.0, curl])
     square = _rectangle(1.0, 1.0)
@@ -618,10 +615,9 @@ def _spoon(rng: np.random.Generator) -> list[Part]:
     width = bowl * rng.uniform(0.62, 0.82)  # its width over its length: U(.62, .82)
     sunk = rng.uniform(0.2, 0.32)  # its depth over its width: U(.2, .32)
     egg = rng.uniform(0.05, 0.22)  # how much narrower towards the tip: U(.05, .22)
-    end = length - bowl + 2.0
-    profile, handle, steel, _ = _cutlery(rng, length, end)
-    rim = float(profile(end))
-    depth = min(sunk * width, rim + 0.4 * sunk * width)
+    depth = sunk * width
+    rim = depth + SHEET / 2  # so that bowl and handle touch the table
+    handle, steel, _ = _cutlery(rng, length, length - bowl + 2.0, rim)
     c, s = _circle(1.0, 14).T
 
     def ring(share: float, sink: float) -> np.ndarray:

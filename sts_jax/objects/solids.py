@@ -12,7 +12,7 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-from .body import FACE_CLASSES, HULL_CLASSES, NUM_FILLS, Body
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, NUM_FILLS, Body
 
 WALL = 1.2  # kg/m^2, plastic about 1.2 mm thick: the shell of everything that holds something
 CONTENTS = 1000.0  # kg/m^3, water

@@ -10,7 +10,8 @@ import math
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jaxtyping import ScalarLike as Scalar
+
+Scalar = float | Array
 
 
 @jax.tree_util.register_dataclass

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 _SLACK = 1e-4  # pixels by which faces are grown, so that no pixel centre on a shared edge falls between two
+_Corner = tuple[Array, Array, Array]  # column, row, order
 _NOTHING = np.uint32(0xFFFFFFFF)
 
 
@@ -96,9 +97,7 @@ def rasterise(
         down = local // cols
         row = row0 + down
         long = x0 + (x2 - x0) * _fraction(row, y0, y2)
-        short = jnp.where(
-            row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2)
-        )
+        short = jnp.where(row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2))
         # A face that lies within one row's slack covers that row from end to end.
         flat = y2 - y0 <= 1e-3
         start = jnp.where(flat, _lowest(x0, x1, x2), jnp.minimum(long, short))
@@ -147,11 +146,10 @@ def _cross(a: tuple[Array, ...], b: tuple[Array, ...], c: tuple[Array, ...]) -> 
     return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
 
 
-def _by_row(a: tuple[Array, ...], b: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def _by_row(a: _Corner, b: _Corner) -> tuple[_Corner, _Corner]:
     swap = a[1] > b[1]
-    return tuple(jnp.where(swap, q, p) for p, q in zip(a, b, strict=True)), tuple(
-        jnp.where(swap, p, q) for p, q in zip(a, b, strict=True)
-    )
+    low, high = ([jnp.where(swap, q, p) for p, q in zip(*pair, strict=True)] for pair in ((a, b), (b, a)))
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
 def _lowest(a: Array, b: Array, c: Array) -> Array:

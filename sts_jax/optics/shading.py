@@ -8,9 +8,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jaxtyping import ScalarLike as Scalar
 
 from sts_jax import _math
+
+Scalar = float | Array
 
 
 @jax.tree_util.register_dataclass
@@ -19,16 +20,16 @@ class Room:
     """The light above the sensor, and what the skin does to it on the way to the camera. Constants are ours."""
 
     # light that reaches a surface from all sides, what leaks through and under the object included
-    ambient: Float[Array, "3"] = dataclasses.field(default_factory=lambda: jnp.array([0.62, 0.62, 0.64]))
+    ambient: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.62, 0.62, 0.64]))
     # unit vectors from the object towards a window, a lamp and what the table throws back up
-    directions: Float[Array, "m 3"] = dataclasses.field(
+    directions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[-0.75, -0.45, 0.48], [0.6, 0.3, 0.74], [0.35, -0.5, -0.79]])
     )
-    colors: Float[Array, "m 3"] = dataclasses.field(
+    colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[0.75, 0.75, 0.72], [0.3, 0.29, 0.27], [0.32, 0.32, 0.33]])
     )
     # sRGB of the empty view; the original's (178, 178, 204) / 255
-    background: Float[Array, "3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
+    background: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
     haze: Scalar = 0.12  # m, height over the skin at which 1/e of an object's own light comes through
     vignette: Scalar = 0.1  # share of light lost at the pad's edge, as the square of the distance from the centre
     rim: Scalar = 0.35  # brightness of what lies beyond the pad's edges, of the background's

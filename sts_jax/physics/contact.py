@@ -23,6 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 from sts_jax import _math
 
 NUM_CONTACTS = 4  # what MJX reserves for two boxes
+SAME = 0.0001  # m; points this close to the deepest count as equally deep, or the choice would flicker at rest
 SKIN = 0.001  # m; points this much higher than the deepest one may still belong to the support
 
 
@@ -106,8 +107,9 @@ def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Arra
 
 
 def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"], normal: Float[Array, "c 3"]) -> Float[Array, "4"]:
-    candidate = jnp.where(depth > jnp.maximum(0, jnp.max(depth) - SKIN), 0.0, -1e3)
-    a = jnp.argmax(depth)
+    deepest = jnp.max(depth)
+    candidate = jnp.where(depth > deepest - SKIN, 0.0, -1e3)
+    a = jnp.argmax(depth > deepest - SAME)
     b = jnp.argmax(jnp.sum((points - points[a]) ** 2, axis=1) + candidate)
     side = (points - points[a]) @ jnp.cross(normal[a], points[b] - points[a])
     c = jnp.argmax(side + candidate)

@@ -5,17 +5,18 @@ row 0 is the cell row of lowest y, column 0 that of lowest x, as in an image.
 """
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-from jaxtyping import ScalarLike as Scalar
 
 _NEWTON_STEPS = 14
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
 _LEVER = 0.02  # m, by which tilts are scaled
 _FAR = 1.0  # m, stands for the height where there is no object
+
+
+Scalar = float | Array
 
 
 @jax.tree_util.register_dataclass
@@ -27,7 +28,7 @@ class Gel:
     thickness: Scalar = 0.005  # m (paper, supplement "Simulator Details")
     stiffness: Scalar = 2e6  # N/m^3, per area; about 10 kPa over 5 mm: a bottle sinks 0.2-0.3 mm. Ours.
     max_depth: Scalar = 0.003  # m, deepest imprint that an equilibrium may ask for. Ours.
-    max_tilt: Scalar = math.radians(5)  # rad, about x and about y each, from the given pose. Ours.
+    max_tilt: Scalar = 0.0873  # rad (5 degrees), about x and about y each, from the given pose. Ours.
     tolerance: Scalar = 0.005  # of Fz, and of Fz times 1 cm for the moments: what counts as balanced. Ours.
     cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata={"static": True})  # rows, columns: 1 mm
 
@@ -37,10 +38,10 @@ class Gel:
 class Equilibrium:
     """How a rigid object lies in the gel."""
 
-    sink: Float[Array, ""]  # m, how far it moves along -z, after the turn
-    turn: Float[Array, "2"]  # rad, rotation vector about the sensor's x and y axes
-    pressure: Float[Array, "r c"]  # Pa, on the gel's grid
-    balanced: Bool[Array, ""]  # whether the pressure balances Fz, Mx and My
+    sink: Float[Array, "*n"]  # m, how far it moves along -z, after the turn
+    turn: Float[Array, "*n 2"]  # rad, rotation vector about the sensor's x and y axes
+    pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid
+    balanced: Bool[Array, "*n"]  # whether the pressure balances Fz, Mx and My
 
 
 def cell_centres(gel: Gel) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
@@ -112,7 +113,7 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     tilt = jnp.tan(gel.max_tilt) * _LEVER
     bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
 
-    def newton(_: int, u: Float[Array, "3"]) -> Float[Array, "3"]:
+    def newton(_: Array, u: Float[Array, "3"]) -> Float[Array, "3"]:
         length = _plane(u, fixed_x, fixed_y) - fixed_height
         gradient = _moments(jnp.maximum(length, 0), fixed_x, fixed_y) - fixed_target
         held = ((u >= bound) & (gradient < 0)) | ((u <= -bound) & (gradient > 0))

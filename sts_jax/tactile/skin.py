@@ -4,13 +4,16 @@ Images are float32, (height, width, 3). Nothing here clips to [0, 1]: a pixel ad
 """
 
 import dataclasses
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from jaxtyping import ScalarLike as Scalar
 
 from sts_jax import _math
+
+Scalar = float | Array
 
 
 @jax.tree_util.register_dataclass
@@ -19,11 +22,11 @@ class Lights:
     """Directional lights in the gel's plane, one from each edge: red, green, blue, white (the original's)."""
 
     # unit vectors from the skin towards the lights, sensor frame: left, right, top, bottom edge of the image
-    directions: Float[Array, "m 3"] = dataclasses.field(
+    directions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]])
     )
     # intensity per channel, diffuse and specular alike (paper, supplement: 1.0 in each light's own channels)
-    colors: Float[Array, "m 3"] = dataclasses.field(
+    colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     )
 
@@ -60,12 +63,13 @@ def surface_normals(points: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
         for j in range(3)
         if (i, j) != (1, 1)
     ]
-    mean = [sum(n[k] for n in near) / 9 for k in range(3)]
+    total = [functools.reduce(operator.add, (n[k] for n in near)) for k in range(3)]
 
     def covariance(i: int, j: int) -> Float[Array, "h w"]:
-        return sum(n[i] * n[j] for n in near) / 9 - mean[i] * mean[j]
+        return functools.reduce(operator.add, (n[i] * n[j] for n in near)) / 9 - total[i] * total[j] / 81
 
-    normal = _math.smallest_eigenvector(*(covariance(i, j) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))))
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    normal = _math.smallest_eigenvector(*(covariance(i, j) for i, j in pairs))
     away = normal[2] > 0
     return jnp.stack([jnp.where(away, -n, n) for n in normal], axis=-1)
 

@@ -17,8 +17,6 @@ from flax import nnx
 from jaxtyping import Array, Int
 from orbax.checkpoint import v1 as ocp
 
-from sts_jax import mvae
-
 
 class TrainState(NamedTuple):
     """All that changes while a model is trained."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import zipfile
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -46,9 +47,18 @@ def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
 
 
 def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The visual and the tactile image of the empty sensor, `uint8 (height, width, 3)` each."""
-    with np.load(folder / "blank.npz", allow_pickle=False) as arrays:
-        return arrays["visual"], arrays["tactile"]
+    """The visual and the tactile image of the empty sensor, `uint8 (height, width, 3)` each.
+
+    Raises:
+        FileNotFoundError: The file is missing.
+        ValueError: It is torn.
+    """
+    path = folder / "blank.npz"
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return arrays["visual"], arrays["tactile"]
+    except (zipfile.BadZipFile, KeyError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} is torn ({error}); start the training again, it writes the file anew.") from error
 
 
 def preprocessing_from_json(content: dict) -> Preprocessing:

@@ -290,7 +290,7 @@ def _settle(workdir: Path, settings: dict[str, Any]) -> dict[str, Any]:
     elif old != settings:
         differ = sorted(key for key in old.keys() | settings.keys() if old.get(key) != settings.get(key))
         raise ValueError(
-            f"{workdir / 'config.json'}: made with another {', '.join(differ)}; give another workdir, or delete this one"
+            f"{workdir / 'config.json'}: made with another {', '.join(differ)}; give another workdir or delete it"
         )
     return settings
 

@@ -1,0 +1,95 @@
+"""A small collection from objects to shards: resumable, reproducible, split by object."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sts_jax as sts
+from sts_jax import _math, dataset
+from sts_jax.dataset import collect as rooms
+
+SMALL = dataset.Collection(
+    sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dataset")
+    dataset.collect(SMALL, sts.Sensor(), folder)
+    return folder
+
+
+def test_every_object_is_in_one_part_and_shares_are_kept():
+    collection = dataset.Collection(num_objects=160)
+    split = dataset.split_objects(collection)
+    assert {name: len(part) for name, part in split.items()} == {"train": 112, "validation": 16, "test": 32}
+    np.testing.assert_array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(160))
+    for part in split.values():  # each category alike
+        np.testing.assert_array_equal(np.bincount(part % 8, minlength=8), len(part) // 8)
+
+
+def test_frames_are_those_that_sense_draws(folder):
+    data = dataset.load(folder)
+    assert data.trajectory["pose"].shape == (8, 12, 7)
+    pairs = data.pairs(np.array([5, 0]), turns=True)
+    assert pairs.visual.shape == (8, 2, 64, 64, 3)
+    body = dataset.make_bodies(SMALL, np.array([2]))[0]
+    for quarter in range(4):
+        pose = pairs.pose[quarter, 1]
+        wrench = rooms.turn_wrench(jnp.asarray(data.trajectory["wrench"][5, -1]), quarter)
+        frame = jax.jit(lambda p, w: sts.sense(sts.Sensor(), body, p, w))(jnp.asarray(pose), wrench)
+        for stored, drawn in ((pairs.visual, frame.visual), (pairs.tactile, frame.tactile)):
+            difference = np.abs(stored[quarter, 1].astype(int) - np.round(np.asarray(drawn) * 255))
+            assert np.mean(difference > 1) < 0.01
+    np.testing.assert_array_equal(pairs.trajectory, [5] * 4 + [0] * 4)
+    np.testing.assert_array_equal(pairs.object, data.trajectory["body"][pairs.trajectory])
+
+
+def test_all_frames_of_the_full_ones_and_two_of_the_others(folder):
+    data = dataset.load(folder)
+    np.testing.assert_array_equal(data.full_trajectories(), [0])
+    assert data.strip(0).visual.shape == (12, 64, 64, 3)
+    assert len(data.frames) == 12 + 7 * 2 + 8 * 6
+
+
+def test_a_turn_turns_position_orientation_and_wrench():
+    key = jax.random.key(3)
+    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), _math.random_quat(key)])
+    point = jnp.array([0.005, -0.01, 0.02])
+    x, y, z = np.asarray(_math.transform(pose, point))
+    turned = rooms.turn(pose, 1)
+    np.testing.assert_allclose(_math.transform(turned, point), [-y, x, z], atol=1e-7)
+    wrench = jnp.array([1.0, 2, 3, 4, 5, 6])
+    np.testing.assert_allclose(rooms.turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
+
+
+def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):
+    names = sorted(path.name for path in folder.iterdir())
+    for name in names:  # a kill after the first shard, with a half-written second one
+        if "00001-of" not in name:
+            (tmp_path / name).write_bytes((folder / name).read_bytes())
+    second = next(name for name in names if name.startswith("shard-00001") and name.endswith("array_record"))
+    (tmp_path / second).write_bytes((folder / second).read_bytes()[:1000])
+    with pytest.raises(FileNotFoundError, match="not finished"):
+        dataset.load(tmp_path)
+    before = (tmp_path / "shard-00000-of-00002.npz").stat().st_mtime_ns
+    seen = []
+    dataset.collect(SMALL, sts.Sensor(), tmp_path, progress=seen.append)
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    for name in names:
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
+    assert (tmp_path / "shard-00000-of-00002.npz").stat().st_mtime_ns == before
+    assert seen[-1].done == seen[-1].total
+    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    dataset.collect(SMALL, sts.Sensor(), tmp_path)
+    assert stamps == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+
+
+def test_another_collection_in_the_same_folder_is_refused(folder):
+    other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
+    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.03, asked for now is 0\.02"):
+        dataset.collect(other, sts.Sensor(), folder)

@@ -1,0 +1,259 @@
+"""Whole frames: orientation, consistency, emptiness, gradients."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from optics_bodies import body_mesh, embree, from_trimesh, interior
+
+import sts_jax as sts
+from sts_jax import objects
+
+SENSOR = sts.Sensor()
+SIZES = [(64, 64), (97, 53), (200, 200)]
+FLAT = np.array([178, 178, 204]) / 255
+sense = jax.jit(sts.sense, static_argnames=("resolution", "crop"))
+
+
+@pytest.fixture(autouse=True)
+def strict_ranks():
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+# Sensor frame, mm: (left, right, top, bottom), as a reader looking out through the gel sees an F.
+LETTER = [(-12, -6, -15, 15), (-12, 12, -15, -9), (-12, 4, -2, 4)]
+ON_LETTER = [(-9, 10), (-9, -12), (9, -12), (1, 1)]  # (x, y) mm
+OFF_LETTER = [(9, 10), (9, 1), (-3, 10), (9, -4), (-3, -6)]
+
+
+def letter():
+    """A white box with a red F under it, 2 mm proud, its face in z = 0."""
+    parts = []
+    for left, right, top, bottom in LETTER:
+        part = trimesh.creation.box((right - left, bottom - top, 2))
+        part.apply_translation(((left + right) / 2, (top + bottom) / 2, 1))
+        parts.append(part)
+    plate = trimesh.creation.box((50, 50, 10))
+    plate.apply_translation((0, 0, 7))
+    mesh = trimesh.util.concatenate([*parts, plate])
+    mesh.apply_scale(1e-3)
+    colors = np.ones((len(mesh.faces), 3)) * 0.9
+    colors[:36] = [0.8, 0.02, 0.02]
+    return from_trimesh(mesh, colors=colors)
+
+
+def ball(radius=0.03):
+    return from_trimesh(trimesh.creation.icosphere(subdivisions=4, radius=radius))
+
+
+def weight(force, x, y):
+    return jnp.array([0.0, 0.0, force, y * force, -x * force, 0.0], jnp.float32)
+
+
+def at(x, y, z):
+    return jnp.array([x, y, z, 1.0, 0, 0, 0], jnp.float32)
+
+
+@pytest.mark.parametrize("resolution", SIZES)
+def test_a_letter_reads_the_right_way_round_in_both_streams(resolution):
+    frame = sense(SENSOR, letter(), at(0, 0, -0.0008), resolution=resolution)
+    height, width = resolution
+    scale = height / 150  # pixels per mm on the gel's face
+
+    def pixel(x, y):
+        return round(height / 2 + y * scale - 0.5), round(width / 2 + x * scale - 0.5)
+
+    for x, y in ON_LETTER:
+        red, green, _ = np.asarray(frame.visual)[pixel(x, y)]
+        assert red > green + 0.3
+        assert np.asarray(frame.tactile)[pixel(x, y)].max() < FLAT.max() - 0.1
+    for x, y in OFF_LETTER:
+        red, green, _ = np.asarray(frame.visual)[pixel(x, y)]
+        assert abs(red - green) < 0.1
+        np.testing.assert_allclose(np.asarray(frame.tactile)[pixel(x, y)], FLAT, atol=0.02)
+
+
+@pytest.mark.parametrize("resolution", SIZES)
+@pytest.mark.parametrize("category", ["spoon", "camera"])
+def test_depth_and_segmentation_are_embrees_of_the_balanced_pose(category, resolution):
+    body = objects.make(jax.random.key(4), category)
+    pose = jnp.asarray([0.01, -0.01, 0.03, 0.8, 0.6, 0.0, 0.0])
+    frame = sense(SENSOR, body, pose, weight(0.0, 0, 0), resolution=resolution)
+    truth = embree(body_mesh(body, frame.pose), SENSOR.camera, resolution)
+    inner = interior(truth)
+    error = np.abs(np.asarray(frame.depth)[inner] - truth[inner])
+    assert np.sum(error > 1e-4) <= 0.01 * error.size
+    assert np.mean(np.asarray(frame.segmentation) != np.isfinite(truth)) < 2e-3
+    assert np.array_equal(np.isfinite(frame.depth), frame.segmentation)
+
+
+@pytest.mark.parametrize("resolution", SIZES)
+def test_the_balanced_pose_sinks_as_deep_as_its_pressure_says(resolution):
+    pose = at(0.012, -0.008, 0.0302)
+    frame = sense(SENSOR, ball(), pose, weight(1.0, 0.012, -0.008), resolution=resolution)
+    assert bool(frame.balanced)
+    assert float(jnp.sum(frame.pressure)) * 1e-6 == pytest.approx(1.0, rel=0.005)
+    # the ball of radius R whose centre is at z dips R - z below the face
+    depth = 0.03 - float(frame.pose[2])
+    assert float(jnp.max(frame.pressure)) == pytest.approx(SENSOR.gel.stiffness * depth, rel=0.03)
+    assert 0.1 - float(jnp.min(frame.depth)) == pytest.approx(depth, abs=5e-5)
+
+
+def test_a_tilt_turns_the_pose_as_the_pressure_says():
+    body = from_trimesh(trimesh.creation.box((0.06, 0.04, 0.03)))
+    x, y = 0.004, -0.003
+    frame = sense(SENSOR, body, at(0, 0, 0.015), weight(1.5, x, y))
+    assert bool(frame.balanced)
+    grid_x, grid_y = sts.tactile.cell_centres(SENSOR.gel)
+    inside = (jnp.abs(grid_x) < 0.028) & (jnp.abs(grid_y) < 0.018)
+    # depth of the box's underside below the face, from the pose alone
+    mesh = body_mesh(body, frame.pose)
+    corners = mesh.vertices[mesh.vertices[:, 2] < 0.01]
+    plane = np.linalg.lstsq(np.c_[corners[:, :2], np.ones(4)], corners[:, 2], rcond=None)[0]
+    depth = -(plane[0] * grid_x + plane[1] * grid_y + plane[2])
+    np.testing.assert_allclose(
+        np.asarray(frame.pressure)[inside], (SENSOR.gel.stiffness * np.asarray(depth))[inside], atol=10
+    )
+    assert plane[0] < 0 < plane[1]  # deeper towards the centre of pressure
+
+
+@pytest.mark.parametrize("body", [ball(), letter()], ids=["ball", "letter"])
+def test_more_load_never_makes_the_imprint_smaller(body):
+    start = float(-np.asarray(body.vertices)[:, 2].min())
+    sizes, dark = [], []
+    for force in (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, 4.0):
+        frame = sense(SENSOR, body, at(0, 0, start), weight(force, 0, 0))
+        change = np.abs(np.asarray(frame.tactile) - FLAT).max(-1)
+        sizes.append(int((change > 1.5 / 255).sum()))
+        dark.append(float((FLAT - np.asarray(frame.tactile)).sum()))
+    assert sizes[0] == 0
+    assert np.all(np.diff(sizes) >= 0)
+    assert sizes[-1] > sizes[1] > 0
+
+
+@pytest.mark.parametrize("resolution", SIZES)
+@pytest.mark.parametrize("crop", [False, True])
+def test_an_object_that_has_fallen_off_leaves_empty_images(resolution, crop):
+    gone = sense(SENSOR, ball(), at(0.12, 0.0, -0.08), weight(0, 0, 0), resolution=resolution, crop=crop)
+    far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), None, resolution=resolution, crop=crop)
+    assert not np.any(gone.segmentation)
+    assert np.all(np.isinf(gone.depth))
+    assert np.array_equal(gone.visual, far.visual)
+    assert np.array_equal(gone.tactile, far.tactile)
+    assert np.array_equal(gone.window, far.window)
+    assert np.array_equal(
+        np.round(np.asarray(gone.tactile)[20:-20, 20:-20] * 255),
+        np.broadcast_to([178, 178, 204], (resolution[0] - 40, resolution[1] - 40, 3)),
+    )
+
+
+def test_a_hovering_object_is_seen_and_not_felt():
+    frame = sense(SENSOR, ball(), at(0.01, 0.0, 0.05), weight(0, 0, 0))
+    assert np.any(frame.segmentation)
+    assert np.ptp(np.asarray(frame.tactile), axis=(0, 1)).max() == 0
+    assert bool(frame.balanced)
+    np.testing.assert_allclose(frame.pose, at(0.01, 0.0, 0.05), atol=1e-7)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["position", "quaternion", "wrench"])
+def test_a_value_that_is_not_finite_lowers_the_flag_and_spoils_no_image(bad, where):
+    pose, wrench = at(0, 0, 0.03), weight(1.0, 0, 0)
+    if where == "wrench":
+        wrench = wrench.at[3].set(bad)
+    else:
+        pose = pose.at[1 if where == "position" else 4].set(bad)
+    frame = sense(SENSOR, ball(), pose, wrench)
+    assert not bool(frame.balanced)
+    assert not np.any(frame.segmentation)
+    for image in (frame.visual, frame.tactile, frame.pressure, frame.window):
+        assert np.all(np.isfinite(image))
+
+
+@pytest.mark.parametrize("resolution", SIZES)
+def test_images_lie_in_0_to_1(resolution):
+    frame = sense(SENSOR, letter(), at(0.01, 0.02, 0.0), weight(3.0, 0.012, 0.02), resolution=resolution)
+    for image in (frame.visual, frame.tactile):
+        assert image.dtype == jnp.float32
+        assert image.shape == (*resolution, 3)
+        assert float(jnp.min(image)) >= 0
+        assert float(jnp.max(image)) <= 1
+    assert frame.depth.shape == resolution
+
+
+def test_a_crop_shows_what_the_whole_shows():
+    body = letter()
+    pose, wrench = at(0.02, -0.01, 0.0), weight(1.0, 0.02, -0.01)
+    crop = sense(SENSOR, body, pose, wrench, resolution=(200, 200), crop=True)
+    whole = sense(SENSOR, body, pose, wrench, resolution=(600, 600))
+    np.testing.assert_allclose(crop.pose, whole.pose)
+    np.testing.assert_allclose(crop.pressure, whole.pressure)
+    left, top, width, height = np.asarray(crop.window)
+    assert width == pytest.approx(height)
+    # pixel of the whole under each pixel of the crop
+    u = ((left + (np.arange(200) + 0.5) / 200 * width) + 0.075) / 0.15 * 600 - 0.5
+    v = ((top + (np.arange(200) + 0.5) / 200 * height) + 0.075) / 0.15 * 600 - 0.5
+    under = np.asarray(whole.visual)[np.round(v).astype(int)][:, np.round(u).astype(int)]
+    assert np.median(np.abs(under - np.asarray(crop.visual)).max(-1)) < 0.005
+    # 50 mm across, seen from 100 mm and more: the crop is filled to its edge
+    seen = np.asarray(crop.segmentation)
+    assert seen[:, 1:-1].any(0).all()
+    assert seen.mean() > 0.8
+
+
+def test_vmap_is_the_single_frame():
+    poses = jnp.stack([at(0.01 * k, -0.005 * k, 0.029) for k in range(3)])
+    wrenches = jnp.stack([weight(0.3 * k, 0.01 * k, -0.005 * k) for k in range(3)])
+    body = ball()
+    batch = jax.jit(jax.vmap(lambda p, w: sts.sense(SENSOR, body, p, w)))(poses, wrenches)
+    for k in range(3):
+        one = sense(SENSOR, body, poses[k], wrenches[k])
+        np.testing.assert_allclose(batch.tactile[k], one.tactile, atol=2e-3)
+        np.testing.assert_allclose(batch.visual[k], one.visual, atol=2e-3)
+        assert bool(batch.balanced[k]) == bool(one.balanced)
+
+
+def test_one_compilation_serves_all_objects_of_a_class():
+    counted = jax.jit(sts.sense)
+    for k, category in enumerate(("bottle", "watch", "fork")):
+        body = objects.make(jax.random.key(k), category)
+        assert body.faces.shape == (2048, 3)
+        counted(SENSOR, body, at(0, 0, 0.05), weight(0, 0, 0))
+    assert counted._cache_size() == 1
+
+
+def test_gradients_are_finite_everywhere():
+    body = letter()
+
+    def loss(sensor, pose, wrench):
+        frame = sts.sense(sensor, body, pose, wrench)
+        return jnp.sum(frame.tactile**2) + jnp.sum(frame.visual**2) + jnp.sum(frame.pose)
+
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2), allow_int=True))
+    for pose, wrench in [
+        (at(0.001, 0.002, 0.0), weight(1.0, 0.002, 0.001)),
+        (at(0, 0, 0.05), weight(0, 0, 0)),
+        (at(0, 0, -0.5), weight(0, 0, 0)),
+    ]:
+        for leaf in jax.tree.leaves(gradient(SENSOR, pose, wrench)):
+            assert np.all(np.isfinite(leaf))
+
+
+def test_gradients_through_the_load_are_the_finite_differences():
+    body = ball()
+
+    def dark(stiffness, force):
+        sensor = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, stiffness=stiffness))
+        frame = sts.sense(sensor, body, at(0, 0, 0.03), weight(1.0, 0.0, 0.0) * force)
+        return jnp.mean(frame.tactile)
+
+    dark = jax.jit(dark)
+    gradient = jax.grad(dark, argnums=(0, 1))(jnp.float32(2e6), jnp.float32(1.0))
+    by_stiffness = (dark(jnp.float32(2.04e6), jnp.float32(1)) - dark(jnp.float32(1.96e6), jnp.float32(1))) / 0.08e6
+    by_force = (dark(jnp.float32(2e6), jnp.float32(1.02)) - dark(jnp.float32(2e6), jnp.float32(0.98))) / 0.04
+    assert float(gradient[0]) == pytest.approx(float(by_stiffness), rel=0.1)
+    assert float(gradient[1]) == pytest.approx(float(by_force), rel=0.1)

@@ -1,0 +1,188 @@
+"""The bound: equal subsets computed once, masks, and a loop over subsets as the truth."""
+
+from itertools import combinations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from sts_jax import mvae
+
+CONFIG = mvae.Config(
+    (
+        mvae.Modality("visual", "image", (32, 32, 3)),
+        mvae.Modality("tactile", "image", (32, 32, 3)),
+        mvae.Modality("pose", "vector", (7,), 100.0),
+    ),
+    latent=5,
+    hidden=12,
+    widths=(4, 6, 8, 10),
+)
+VECTORS = mvae.Config(
+    tuple(mvae.Modality(n, "vector", (size,), w) for n, size, w in (("a", 3, 1.0), ("b", 4, 10.0), ("c", 2, 0.5))),
+    latent=4,
+    hidden=8,
+)
+BATCH = 6
+
+
+@pytest.fixture(autouse=True)
+def _no_rank_promotion():
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def batch(config, seed=0):
+    rng = np.random.default_rng(seed)
+    return {m.name: jnp.asarray(rng.random((BATCH, *m.shape)), jnp.float32) for m in config.modalities}
+
+
+def gradient(config, inputs, targets, *, seed=0, **options):
+    """Loss, gradient, new statistics."""
+    graphdef, params, stats = mvae.init(jax.random.key(seed), config)
+
+    @jax.jit
+    def run(params, stats, inputs, targets):
+        return jax.value_and_grad(
+            lambda p: mvae.loss(graphdef, p, stats, jax.random.key(7), inputs, targets, **options), has_aux=True
+        )(params)
+
+    (value, (stats, terms)), grads = run(params, stats, inputs, targets)
+    assert jax.tree.structure(grads) == jax.tree.structure(params)
+    return value, grads, stats, terms
+
+
+def close(a, b, rtol=2e-4):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=rtol, atol=rtol * max(1e-3, float(jnp.max(jnp.abs(y)))))
+
+
+@pytest.mark.parametrize("asked", ["all", "own"])
+@pytest.mark.parametrize("absent", [("tactile",), ("visual", "pose"), ("visual", "tactile", "pose")])
+def test_equal_subsets_once_are_the_plain_enumeration(asked, absent):
+    inputs, targets = batch(CONFIG), batch(CONFIG, 1)
+    masks = {name: jnp.zeros(BATCH, bool) for name in absent}
+    plain = gradient(CONFIG, inputs, targets, present=masks, asked=asked)
+    quick = gradient(CONFIG, inputs, targets, absent=absent, asked=asked)
+    close(plain, quick)
+
+
+def test_an_input_that_is_not_given_is_absent():
+    inputs, targets = batch(CONFIG), batch(CONFIG, 1)
+    a = gradient(CONFIG, inputs, targets, absent=("tactile",))
+    del inputs["tactile"]
+    b = gradient(CONFIG, inputs, targets)
+    close(a, b, 1e-6)
+
+
+@pytest.mark.parametrize("asked", ["all", "own"])
+def test_the_loss_is_a_loop_over_subsets_and_samples(asked):
+    """Vectors only, so that samples are independent; noise from the definition of the key."""
+    inputs, targets = batch(VECTORS), batch(VECTORS, 1)
+    rng = np.random.default_rng(5)
+    present = {name: jnp.asarray(rng.random(BATCH) < 0.6) for name in VECTORS.names}
+    known = {name: jnp.asarray(rng.random(BATCH) < 0.6) for name in VECTORS.names}
+    value, _, _, terms = gradient(
+        VECTORS, inputs, targets, present=present, target_present=known, asked=asked, beta=0.3
+    )
+    graphdef, params, stats = mvae.init(jax.random.key(0), VECTORS)
+    model = nnx.merge(graphdef, params, stats)
+    key = jax.random.key(7)
+    total = kl = 0.0
+    for size in (1, 2, 3):
+        for subset in combinations(range(3), size):
+            for b in range(BATCH):
+                left = [i for i in subset if present[VECTORS.names[i]][b]]
+                precision, weighted = np.ones(4), np.zeros(4)
+                for i in left:
+                    name = VECTORS.names[i]
+                    q = model.encode(name, inputs[name][b : b + 1], None)
+                    precision = precision + np.exp(-np.asarray(q.log_var[0]))
+                    weighted = weighted + np.exp(-np.asarray(q.log_var[0])) * np.asarray(q.mean[0])
+                mean, var = weighted / precision, 1 / precision
+                divergence = 0.5 * np.sum(mean**2 + var - 1 - np.log(var))
+                eps = jax.random.normal(jax.random.fold_in(key, sum(1 << i for i in left)), (BATCH, 4))[b]
+                z = jnp.asarray(mean + np.sqrt(var) * eps, jnp.float32)[None]
+                kl += divergence / BATCH
+                total += 0.3 * divergence / BATCH
+                for i, m in enumerate(VECTORS.modalities):
+                    if (asked == "all" or i in subset) and known[m.name][b]:
+                        error = np.sum((model.decode(m.name, z, None)[0] - targets[m.name][b]) ** 2)
+                        total += m.weight * error / BATCH
+    np.testing.assert_allclose(value, total, rtol=1e-4)
+    np.testing.assert_allclose(terms.kl, kl / 7, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["inputs", "targets"])
+def test_what_fills_the_place_of_a_missing_modality_changes_no_bit(kind):
+    present = {
+        "visual": jnp.array([1, 1, 0, 1, 0, 1], bool),
+        "tactile": jnp.array([0, 1, 0, 1, 1, 0], bool),
+        "pose": jnp.array([1, 0, 0, 1, 1, 1], bool),
+    }
+    results = []
+    for fill in (0.0, np.nan, np.inf, 1e9):
+        data = {"inputs": batch(CONFIG), "targets": batch(CONFIG, 1)}
+        for name, mask in present.items():
+            x = data[kind][name]
+            data[kind][name] = jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, fill)
+        option = {"present": present} if kind == "inputs" else {"target_present": present}
+        results.append(gradient(CONFIG, data["inputs"], data["targets"], **option))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(results[0]))
+    for other in results[1:]:
+        jax.tree.map(np.testing.assert_array_equal, other, results[0])
+
+
+@pytest.mark.parametrize("fill", [0.0, np.nan])
+def test_prediction_falls_back_to_what_is_present(fill):
+    inputs = batch(CONFIG)
+    graphdef, params, stats = mvae.init(jax.random.key(0), CONFIG)
+    state = nnx.merge_state(params, stats)
+    run = jax.jit(lambda inputs, present: mvae.predict(graphdef, state, inputs, present=present))
+    mask = jnp.array([1, 0, 1, 0, 1, 1], bool)
+    filled = inputs | {"visual": jnp.where(mask[:, None, None, None], inputs["visual"], fill)}
+    touch = {"tactile": inputs["tactile"]}
+    expected, _ = run({"visual": inputs["visual"], **touch}, {})
+    got, _ = run({"visual": filled["visual"], **touch}, {"visual": mask})
+    for name in expected:
+        np.testing.assert_allclose(got[name][mask], expected[name][mask], atol=1e-5)
+    alone, _ = run(touch, {})
+    for name in alone:
+        np.testing.assert_allclose(got[name][~mask], alone[name][~mask], atol=1e-5)
+
+
+def test_nothing_present_is_the_prior():
+    graphdef, params, stats = mvae.init(jax.random.key(0), CONFIG)
+    state = nnx.merge_state(params, stats)
+    posterior = mvae.infer(graphdef, state, batch(CONFIG), present={n: jnp.zeros(BATCH, bool) for n in CONFIG.names})
+    np.testing.assert_array_equal(posterior.mean, 0)
+    np.testing.assert_array_equal(posterior.log_var, 0)
+
+
+def test_a_condition_reaches_the_decoders():
+    config = mvae.Config((mvae.Modality("a", "vector", (3,)),), latent=4, hidden=8, condition=2)
+    inputs = batch(config)
+    losses = [gradient(config, inputs, inputs, condition=jnp.full((BATCH, 2), c))[0] for c in (0.0, 1.0)]
+    assert losses[0] != losses[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"absent": ("sound",)}, "sound"), ({"condition": jnp.ones((BATCH, 2))}, "width 2")],
+)
+def test_bad_options_are_named(options, message):
+    inputs = batch(VECTORS)
+    with pytest.raises(ValueError, match=message):
+        gradient(VECTORS, inputs, inputs, **options)
+
+
+def test_nothing_given_and_unknown_names_are_errors():
+    graphdef, params, stats = mvae.init(jax.random.key(0), VECTORS)
+    state = nnx.merge_state(params, stats)
+    for inputs in ({}, {"sound": jnp.ones((2, 3))}):
+        with pytest.raises(ValueError, match="give at least one"):
+            mvae.predict(graphdef, state, inputs)
+    with pytest.raises(ValueError, match="targets named"):
+        gradient(VECTORS, batch(VECTORS), {})

@@ -1,0 +1,84 @@
+"""Sizes of the paper's networks, and batch normalisation with weights."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from sts_jax import mvae
+
+PAPER = mvae.Config(
+    (
+        mvae.Modality("visual", "image", (64, 64, 3)),
+        mvae.Modality("tactile", "image", (64, 64, 3)),
+        mvae.Modality("pose", "vector", (7,), 1000.0),
+    )
+)
+
+
+def test_sizes_are_the_papers():
+    _, params, _ = mvae.init(jax.random.key(0), PAPER)
+    shapes = jax.tree.map(jnp.shape, nnx.to_pure_dict(params))
+    encoder, decoder = shapes["encoders"]["visual"], shapes["decoders"]["tactile"]
+    assert list(encoder["kernels"].values()) == [(4, 4, 3, 32), (4, 4, 32, 64), (4, 4, 64, 128), (4, 4, 128, 256)]
+    assert encoder["first"]["kernel"] == (256 * 5 * 5, 512)
+    assert encoder["second"]["kernel"] == (512, 2 * 256)
+    assert decoder["first"]["kernel"] == (256, 256 * 5 * 5)
+    assert list(decoder["kernels"].values()) == [(4, 4, 256, 128), (4, 4, 128, 64), (4, 4, 64, 32), (4, 4, 32, 3)]
+    assert len(decoder["norms"]) == 3  # the last block is linear
+    assert shapes["encoders"]["pose"]["first"]["kernel"] == (7, 512)
+
+
+@pytest.mark.parametrize("shape", [(32, 32, 3), (64, 64, 3), (48, 64, 1)])
+def test_any_size_of_image_comes_back(shape):
+    config = mvae.Config((mvae.Modality("a", "image", shape),), latent=6, hidden=9, widths=(4, 4, 4, 4), condition=2)
+    graphdef, params, stats = mvae.init(jax.random.key(0), config)
+    state = nnx.merge_state(params, stats)
+    out, posterior = mvae.predict(graphdef, state, {"a": jnp.full((3, *shape), 0.5)}, condition=jnp.ones((3, 2)))
+    assert out["a"].shape == (3, *shape)
+    assert posterior.mean.shape == (3, 6)
+    z = jnp.zeros((5, 3, 6))
+    assert mvae.decode(graphdef, state, z, condition=jnp.ones((5, 3, 2)))["a"].shape == (5, 3, *shape)
+    with pytest.raises(ValueError, match="condition of width 0"):
+        mvae.decode(graphdef, state, z)
+
+
+def test_config_survives_json():
+    assert mvae.Config.from_json(json.loads(json.dumps(PAPER.to_json()))) == PAPER
+
+
+@pytest.mark.parametrize("shape", [(30, 32, 3), (24, 24, 3), (64, 64)])
+def test_an_image_of_a_wrong_size_is_refused(shape):
+    with pytest.raises(ValueError, match="visual"):
+        mvae.Modality("visual", "image", shape)
+
+
+def test_a_name_given_twice_is_refused():
+    with pytest.raises(ValueError, match="each name once"):
+        mvae.Config((mvae.Modality("a", "vector", (2,)), mvae.Modality("a", "vector", (3,))))
+
+
+def test_batch_norm_weighs_samples():
+    x = np.random.default_rng(0).normal(2, 3, size=(4, 5, 6, 7)).astype(np.float32)
+    weights = np.array([2, 0, 1, 3])
+    repeated = np.repeat(x.astype(np.float64), weights, axis=0)
+    mean, var = repeated.mean((0, 1, 2)), repeated.var((0, 1, 2))
+    norm = mvae.BatchNorm(7, momentum=0.9)
+    y = norm(jnp.asarray(x), jnp.asarray(weights, jnp.float32))
+    np.testing.assert_allclose(y, (x - mean) / np.sqrt(var + 1e-5), atol=1e-5)
+    np.testing.assert_allclose(norm.mean[...], 0.1 * mean, rtol=1e-4)
+    np.testing.assert_allclose(norm.var[...], 0.9 + 0.1 * var, rtol=1e-4)
+    y = norm(jnp.asarray(x), None)
+    np.testing.assert_allclose(y, (x - 0.1 * mean) / np.sqrt(0.9 + 0.1 * var + 1e-5), atol=1e-4)
+
+
+def test_batch_norm_without_a_present_sample_changes_nothing():
+    norm = mvae.BatchNorm(3, momentum=0.9)
+    x = jnp.ones((2, 4, 4, 3)) * 5
+
+    assert np.isfinite(norm(x, jnp.zeros(2))).all()
+    np.testing.assert_array_equal(norm.mean[...], 0)
+    np.testing.assert_array_equal(norm.var[...], 1)

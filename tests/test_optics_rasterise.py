@@ -1,0 +1,163 @@
+"""The rasteriser against embree and against every pixel tested with every face."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from optics_bodies import body_mesh, embree, from_trimesh, interior
+
+from sts_jax import _math, objects, optics
+
+CAMERA = optics.Camera()
+SHAPES = [(64, 64), (97, 53), (200, 200)]
+
+
+@pytest.fixture(autouse=True)
+def strict_ranks():
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def draw(vertices, faces, two_sided, pose, shape):
+    points = _math.transform(pose, vertices)
+    pixels, depth = optics.to_pixels(CAMERA, optics.full_window(CAMERA, shape), shape, points)
+    inverse = 1 / jnp.maximum(depth, CAMERA.near)
+    keep = jnp.all(depth[faces] > CAMERA.near, axis=1)
+    winner = optics.rasterise(pixels, -inverse, faces, keep, two_sided, shape)
+    weights = optics.barycentrics(pixels, faces, winner)
+    corners = inverse[faces][jnp.maximum(winner, 0)]
+    return jnp.where(winner >= 0, 1 / sum(w * corners[..., k] for k, w in enumerate(weights)), jnp.inf), winner
+
+
+drawn = jax.jit(draw, static_argnames="shape")
+
+
+def bodies():
+    rng = np.random.default_rng(0)
+    bumpy = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
+    bumpy.vertices *= 1 + 0.2 * np.sin(300 * bumpy.vertices[:, :1])
+    slivers = trimesh.creation.cylinder(radius=0.004, height=0.12, sections=200)
+    slivers.apply_transform(trimesh.transformations.rotation_matrix(1.1, [0.3, 1, 0.2]))
+    ring = trimesh.creation.torus(0.03, 0.008)
+    yield "bumpy", from_trimesh(bumpy)
+    yield "slivers", from_trimesh(slivers)
+    yield "ring", from_trimesh(ring)
+    yield "box", from_trimesh(trimesh.creation.box((0.05, 0.02, 0.09)))
+    for category in ("bottle", "fork", "watch"):
+        yield category, objects.make(jax.random.key(int(rng.integers(100))), category)
+
+
+BODIES = dict(bodies())
+
+
+def some_pose(rng):
+    place = [*rng.uniform(-0.03, 0.03, 2), rng.uniform(0.04, 0.09)]
+    quat = rng.normal(size=4)
+    return jnp.asarray([*place, *quat / np.linalg.norm(quat)], jnp.float32)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("name", BODIES)
+def test_depth_is_embrees(name, shape):
+    body = BODIES[name]
+    rng = np.random.default_rng(1)
+    for _ in range(2):
+        pose = some_pose(rng)
+        depth, _ = drawn(body.vertices, body.faces, body.two_sided, pose, shape)
+        depth = np.asarray(depth)
+        truth = embree(body_mesh(body, pose), CAMERA, shape)
+        inner = interior(truth)
+        error = np.abs(depth[inner] - truth[inner])
+        assert np.sum(error > 1e-5) <= 0.001 * error.size
+        assert error.max(initial=0) < 1e-4
+        # The silhouette may differ where a pixel's neighbours are not all the same.
+        differs = np.isfinite(depth) != np.isfinite(truth)
+        hit = np.isfinite(truth)
+        padded = np.pad(hit, 1, mode="edge")
+        around = np.stack([padded[i : i + shape[0], j : j + shape[1]] for i in range(3) for j in range(3)])
+        boundary = np.any(around, 0) & ~np.all(around, 0)
+        assert not np.any(differs & ~boundary)
+        assert differs.sum() <= max(2, 0.01 * boundary.sum())
+
+
+@pytest.mark.parametrize("chunk", [64, 2048])
+def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
+    rng = np.random.default_rng(3)
+    shape = (31, 23)
+    centre = rng.uniform(-5, 35, (60, 1, 2))
+    corners = centre + rng.normal(size=(60, 3, 2)) * np.exp(rng.uniform(-4, 4, (60, 1, 1)))
+    order = rng.uniform(0, 1, (60, 1)) + 0.01 * rng.normal(size=(60, 3))
+    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(float)
+    best, winner = np.full(shape, np.inf), np.full(shape, -1)
+    near_edge = np.zeros(shape, bool)
+    for k, (triangle, depth) in enumerate(zip(corners, order, strict=True)):
+        (x0, y0), (x1, y1), (x2, y2) = triangle
+        area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        w = [
+            ((x1 - columns) * (y2 - rows) - (x2 - columns) * (y1 - rows)) / area,
+            ((x2 - columns) * (y0 - rows) - (x0 - columns) * (y2 - rows)) / area,
+        ]
+        w = np.stack([*w, 1 - w[0] - w[1]])
+        if area >= 0:
+            continue  # from behind
+        near_edge |= np.abs(w * area).min(0) < 1e-2 * np.abs(triangle - triangle[[1, 2, 0]]).max()
+        value = np.tensordot(depth, w, 1)
+        closer = np.all(w >= 0, axis=0) & (value < best)
+        best[closer], winner[closer] = value[closer], k
+    got = jax.jit(lambda p, o: optics.rasterise(
+        p, o, jnp.arange(180).reshape(60, 3), jnp.ones(60, bool), jnp.bool_(False), shape, chunk=chunk
+    ))(jnp.asarray(corners.reshape(-1, 2), jnp.float32), jnp.asarray(order.ravel(), jnp.float32))
+    assert np.array_equal(np.asarray(got)[~near_edge], winner[~near_edge])
+    assert (~near_edge).mean() > 0.5
+
+
+def test_a_surface_has_no_cracks():
+    # a fan of slivers that meet in one point, and a fine grid: every pixel inside is covered
+    angles = np.linspace(0, 2 * np.pi, 101)[:-1]
+    rim = np.stack([32.3 + 29 * np.cos(angles), 31.7 + 29 * np.sin(angles)], -1)
+    points = jnp.asarray(np.concatenate([rim, [[32.3, 31.7]]]), jnp.float32)
+    k = np.arange(100)
+    faces = jnp.asarray(np.stack([np.full(100, 100), (k + 1) % 100, k], -1))
+    winner = jax.jit(lambda p: optics.rasterise(
+        p, jnp.ones(101), faces, jnp.ones(100, bool), jnp.bool_(False), (64, 64)
+    ))(points)
+    rows, columns = np.mgrid[:64, :64]
+    inside = np.hypot(columns - 32.3, rows - 31.7) < 28.9
+    assert np.all(np.asarray(winner)[inside] >= 0)
+
+
+def test_two_sided_faces_are_seen_from_behind():
+    points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]])
+    faces = jnp.array([[0, 1, 2]])
+    for two_sided in (False, True):
+        seen = optics.rasterise(points, jnp.ones(3), faces, jnp.ones(1, bool), jnp.bool_(two_sided), (16, 16))
+        assert bool(jnp.any(seen >= 0)) == two_sided
+
+
+def test_vmap_is_the_loop():
+    body = BODIES["ring"]
+    rng = np.random.default_rng(5)
+    poses = jnp.stack([some_pose(rng) for _ in range(3)])
+    batch = jax.jit(jax.vmap(lambda pose: draw(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]))(poses)
+    for pose, winner in zip(poses, batch, strict=True):
+        assert np.array_equal(drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1], winner)
+
+
+def test_depths_gradient_is_the_finite_difference():
+    body = BODIES["box"]
+    pose = jnp.asarray([0.004, -0.003, 0.06, 0.9, 0.3, 0.2, 0.24])
+    pose = pose.at[3:].divide(jnp.linalg.norm(pose[3:]))
+
+    def mean(pose, inner):
+        depth, _ = draw(body.vertices, body.faces, body.two_sided, pose, (64, 64))
+        return jnp.sum(jnp.where(inner, jnp.where(jnp.isfinite(depth), depth, 0), 0)) / jnp.sum(inner)
+
+    _, winner = drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))
+    inner = jnp.asarray(interior(np.where(np.asarray(winner) >= 0, np.asarray(winner) // 2 * 1.0, np.inf), span=0.5))
+    mean = jax.jit(mean)
+    gradient = jax.grad(mean)(pose, inner)
+    for k in range(7):
+        step = 2e-4
+        numeric = (mean(pose.at[k].add(step), inner) - mean(pose.at[k].add(-step), inner)) / (2 * step)
+        assert float(gradient[k]) == pytest.approx(float(numeric), rel=0.02, abs=2e-3)

@@ -1,0 +1,209 @@
+"""The gel's equilibrium against a float64 solver, closed forms and its own balance."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from sts_jax import tactile
+
+GEL = tactile.Gel()
+settle = jax.jit(tactile.settle)
+
+
+@pytest.fixture(autouse=True)
+def strict_ranks():
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+def grid(gel=GEL):
+    x, y = tactile.cell_centres(gel)
+    return np.asarray(x, float), np.asarray(y, float)
+
+
+def ball(x, y, radius=0.03, centre=(0.01, -0.02), gap=0.0):
+    square = radius**2 - (x - centre[0]) ** 2 - (y - centre[1]) ** 2
+    return np.where(square > 0, radius - np.sqrt(np.maximum(square, 0)) + gap, np.inf)
+
+
+def box(x, y, size=(0.04, 0.03), centre=(0.0, 0.01), tilt=(0.0, 0.0)):
+    inside = (np.abs(x - centre[0]) < size[0] / 2) & (np.abs(y - centre[1]) < size[1] / 2)
+    return np.where(inside, tilt[0] * y - tilt[1] * x + 0.001, np.inf)
+
+
+def push(force, x, y):
+    return jnp.array([0.3, -0.2, force, y * force, -x * force, 0.01], jnp.float32)
+
+
+CASES = {
+    "ball": (ball, push(1.0, 0.01, -0.02)),
+    "hovering ball": (lambda x, y: ball(x, y, gap=0.002), push(1.0, 0.01, -0.02)),
+    "sunken ball": (lambda x, y: ball(x, y, gap=-0.002), push(0.3, 0.01, -0.02)),
+    "box": (box, push(0.5, 0.0, 0.01)),
+    "box pushed off its middle": (box, push(0.5, 0.004, 0.012)),
+    "box on an edge": (lambda x, y: box(x, y, tilt=(0.02, 0.01)), push(1.0, 0.003, 0.01)),
+    "box pushed near its edge": (box, push(0.5, 0.012, 0.01)),
+    "two feet": (
+        lambda x, y: np.minimum(box(x, y, (0.004, 0.004), (-0.04, 0.0)), box(x, y, (0.003, 0.01), (0.03, 0.01))),
+        push(0.1, -0.01, 0.004),
+    ),
+    "thin bar": (lambda x, y: box(x, y, (0.1, 0.0021), (0.0, 0.0)), push(0.2, 0.01, 0.0)),
+}
+
+
+def true_pressure(gel, height, wrench):
+    """Newton's method is not trusted here: BFGS in float64, from another start."""
+    x, y = grid(gel)
+    area = 0.15 * 0.15 / x.size
+    there = np.isfinite(height)
+    x, y, h = x[there], y[there], height[there]
+    fz, mx, my = (float(w) for w in wrench[2:5])
+    lever = 0.02
+
+    def energy(u):
+        d, a, b = u[0] * 1e-3, u[1] * 1e-3 / lever, u[2] * 1e-3 / lever
+        length = np.maximum(d - h - a * y + b * x, 0)
+        pressed = gel.stiffness * area * length
+        value = 0.5 * np.sum(pressed * length) - fz * d + mx * a + my * b
+        slope = np.array([pressed.sum() - fz, (mx - np.sum(pressed * y)) / lever, (my + np.sum(pressed * x)) / lever])
+        return value * 1e6, slope * 1e3
+
+    start = [1e3 * h.min() + 0.1, 0, 0]
+    for _ in range(5):
+        start = minimize(energy, start, jac=True, method="BFGS", options={"gtol": 1e-7, "maxiter": 2000}).x
+    d, a, b = start[0] * 1e-3, start[1] * 1e-3 / lever, start[2] * 1e-3 / lever
+    pressure = np.zeros(height.shape)
+    pressure[there] = gel.stiffness * np.maximum(d - h - a * y + b * x, 0)
+    return pressure, np.array([d, a, b])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_equilibrium_is_the_float64_solvers(name):
+    make, wrench = CASES[name]
+    height = make(*grid())
+    got = settle(GEL, jnp.asarray(height, jnp.float32), wrench)
+    assert bool(got.balanced)
+    pressure, (depth, a, b) = true_pressure(GEL, height, wrench)
+    assert float(got.sink) == pytest.approx(depth, abs=2e-6)
+    np.testing.assert_allclose(got.turn, [a, b], atol=1e-4)
+    np.testing.assert_allclose(got.pressure, pressure, atol=0.01 * pressure.max())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pressure_adds_up_to_the_wrench(name):
+    make, wrench = CASES[name]
+    x, y = grid()
+    pressure = np.asarray(settle(GEL, jnp.asarray(make(x, y), jnp.float32), wrench).pressure, float)
+    area = float(tactile.cell_area(GEL))
+    force = float(wrench[2])
+    assert pressure.min() >= 0
+    assert pressure.sum() * area == pytest.approx(force, rel=0.005)
+    assert (pressure * y).sum() * area == pytest.approx(float(wrench[3]), abs=0.005 * force * 0.01)
+    assert -(pressure * x).sum() * area == pytest.approx(float(wrench[4]), abs=0.005 * force * 0.01)
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.04])
+@pytest.mark.parametrize("force", [0.2, 1.0])
+def test_a_ball_sinks_as_the_springs_closed_form_says(radius, force):
+    # F = k * volume of the cap, pi d^2 (3 R - d) / 3
+    x, y = grid()
+    got = settle(GEL, jnp.asarray(ball(x, y, radius), jnp.float32), push(force, 0.01, -0.02))
+    roots = np.roots([-np.pi / 3, np.pi * radius, 0, -force / GEL.stiffness])
+    depth = min(r.real for r in roots if abs(r.imag) < 1e-9 and r.real > 0)
+    assert float(got.sink) == pytest.approx(depth, rel=0.02)
+    imprint = np.asarray(got.pressure) > 0
+    assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_more_load_never_makes_the_imprint_smaller(name):
+    make, wrench = CASES[name]
+    height = jnp.asarray(make(*grid()), jnp.float32)
+    loads = jnp.linspace(0, 6, 25)[1:]
+    several = jax.jit(jax.vmap(lambda load: tactile.settle(GEL, height, wrench * load)))(loads)
+    cells = np.asarray(several.pressure > 0).sum((1, 2))
+    depth = np.asarray(several.pressure).max((1, 2))
+    assert np.all(np.diff(cells) >= 0)
+    assert np.all(np.diff(depth) >= -1e-3 * depth[1:])
+
+
+@pytest.mark.parametrize(
+    ("height", "wrench"),
+    [
+        (lambda x, y: box(x, y) + 0.05, push(0.5, 0.0, 0.01)),  # out of reach
+        (lambda x, y: np.full(x.shape, np.inf), push(0.5, 0.0, 0.01)),  # nothing there
+        (box, push(0.5, 0.05, 0.01)),  # centre of pressure outside the footprint
+        (box, push(0.5, 0.2, 0.01)),  # and off the pad
+        (box, push(50.0, 0.0, 0.01)),  # deeper than the limit
+        (lambda x, y: box(x, y, tilt=(0.0, 0.3)), push(2.0, 0.0, 0.01)),  # flatter than the limit allows
+    ],
+)
+def test_without_equilibrium_the_limits_hold_and_the_flag_falls(height, wrench):
+    got = settle(GEL, jnp.asarray(height(*grid()), jnp.float32), wrench)
+    assert not bool(got.balanced)
+    assert np.all(np.isfinite(got.pressure))
+    assert np.asarray(got.pressure).max() <= GEL.stiffness * GEL.max_depth * 1.001
+    assert np.abs(got.turn).max() <= np.tan(GEL.max_tilt) * 1.001
+
+
+@pytest.mark.parametrize("force", [0.0, -1.0])
+def test_nothing_is_pressed_without_a_push(force):
+    got = settle(GEL, jnp.asarray(box(*grid()) - 0.0012, jnp.float32), push(force, 0.0, 0.0))
+    assert bool(got.balanced)
+    assert float(got.sink) == 0
+    assert not np.any(got.turn)
+    assert not np.any(got.pressure)
+
+
+def test_grids_of_1_and_half_a_millimetre_agree():
+    fine = dataclasses.replace(GEL, cells=(300, 300))
+    one = settle(GEL, jnp.asarray(ball(*grid()), jnp.float32), push(1.0, 0.01, -0.02))
+    two = settle(fine, jnp.asarray(ball(*grid(fine)), jnp.float32), push(1.0, 0.01, -0.02))
+    assert float(one.sink) == pytest.approx(float(two.sink), rel=0.02)
+    assert float(one.pressure.max()) == pytest.approx(float(two.pressure.max()), rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["ball", "box pushed off its middle", "box pushed near its edge"])
+def test_gradients_are_the_finite_differences(name):
+    make, wrench = CASES[name]
+    height = jnp.asarray(make(*grid()), jnp.float32)
+
+    def measure(wrench, stiffness, lift):
+        gel = dataclasses.replace(GEL, stiffness=stiffness)
+        got = tactile.settle(gel, height + lift, wrench)
+        return got.sink + 0.03 * got.turn[0] - 0.05 * got.turn[1]
+
+    arguments = (wrench, jnp.float32(2e6), jnp.float32(0))
+    measure = jax.jit(measure)
+    gradient = jax.grad(measure, argnums=(0, 1, 2))(*arguments)
+    change = (jnp.array([0.0, 0.0, 0.02, 1e-4, 1e-4, 0.0]), jnp.float32(4e4), jnp.float32(2e-5))
+    for k in range(3):
+        moved = [[a + s * change[k] if i == k else a for i, a in enumerate(arguments)] for s in (1, -1)]
+        numeric = (measure(*moved[0]) - measure(*moved[1])) / 2
+        assert float(jnp.sum(gradient[k] * change[k])) == pytest.approx(float(numeric), rel=0.05, abs=1e-8)
+
+
+def test_gradients_stay_finite_where_nothing_balances():
+    x, y = grid()
+    for height, wrench in [
+        (np.full(x.shape, np.inf), push(1, 0, 0)),
+        (box(x, y), push(0, 0, 0)),
+        (box(x, y), push(50, 0.2, 0)),
+    ]:
+        gradient = jax.jit(jax.grad(lambda h, w: jnp.sum(tactile.settle(GEL, h, w).pressure), argnums=(0, 1)))(
+            jnp.asarray(height, jnp.float32), wrench
+        )
+        assert all(jnp.all(jnp.isfinite(g)) for g in gradient)
+
+
+def test_the_pose_alone_indents_by_its_own_depth():
+    x, y = grid()
+    height = ball(x, y, gap=-0.001)
+    got = tactile.indent(GEL, jnp.asarray(height, jnp.float32))
+    np.testing.assert_allclose(got.pressure, 2e6 * np.maximum(-height, 0), atol=1)
+    deep = tactile.indent(GEL, jnp.asarray(height - 0.01, jnp.float32))
+    assert float(deep.pressure.max()) == pytest.approx(2e6 * 0.005)

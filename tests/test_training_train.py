@@ -1,0 +1,198 @@
+"""Training: resuming to the last bit, the order of samples, folders that are not what they should be, learning."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sts_jax import mvae, training
+
+SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
+CONFIG = training.TrainConfig(steps=12, batch_size=8, log_every=2, checkpoint_every=4)
+
+
+def arrays(samples=20, seed=0):
+    rng = np.random.default_rng(seed)
+    data = {"a": rng.random((samples, 3), np.float32), "b": rng.random((samples, 2), np.float32)}
+    return training.Arrays(data, data, {"b": rng.random(samples) < 0.5})
+
+
+class Killed(Exception):
+    pass
+
+
+def kill_at(step):
+    def progress(done, total, record):
+        if done == step:
+            raise Killed
+
+    return progress
+
+
+def files(folder):
+    return {str(p): (p.stat().st_mtime_ns, p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    workdir = tmp_path_factory.mktemp("run")
+    return workdir, training.train(CONFIG, SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
+
+
+@pytest.mark.parametrize("step", [3, 4, 7])
+def test_a_killed_run_ends_with_the_same_bits(tmp_path, finished, step):
+    with pytest.raises(Killed):
+        training.train(CONFIG, SMALL, arrays(), workdir=tmp_path, preprocessing={"view": "pad"}, progress=kill_at(step))
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write('{"step": 6, "lo')  # torn
+    model = training.train(CONFIG, SMALL, arrays(), workdir=tmp_path, preprocessing={"view": "pad"})
+    same(model.state, finished[1].state)
+    for name in ("metrics.jsonl", "config.json"):
+        assert (tmp_path / name).read_text() == (finished[0] / name).read_text()
+    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").open()] == [2, 4, 6, 8, 10, 12]
+
+
+def test_a_finished_run_is_left_alone(finished):
+    workdir, model = finished
+    before = files(workdir)
+    again = training.train(CONFIG, SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
+    same(again.state, model.state)
+    assert files(workdir) == before
+
+
+def test_a_model_comes_back_from_its_folder(finished):
+    workdir, model = finished
+    loaded = training.load(str(workdir))
+    same(loaded.state, model.state)
+    assert loaded.config == SMALL
+    assert loaded.graphdef == model.graphdef
+    assert loaded.step == 12
+    assert loaded.settings["preprocessing"] == {"view": "pad"}
+    assert [p.name for p in (workdir / "checkpoints").iterdir()] == ["00000012"]
+
+
+def test_another_config_or_other_data_are_refused(finished):
+    workdir, _ = finished
+    with pytest.raises(ValueError, match=r"config.json: made with another training"):
+        training.train(training.TrainConfig(steps=13), SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
+    with pytest.raises(ValueError, match=r"made with another data"):
+        training.train(CONFIG, SMALL, arrays(seed=1), workdir=workdir, preprocessing={"view": "pad"})
+
+
+@pytest.mark.parametrize("torn", ["checkpoint", "config", "no checkpoint", "nothing"])
+def test_a_torn_folder_is_named(tmp_path, torn):
+    if torn != "nothing":
+        training.train(
+            training.TrainConfig(steps=2, log_every=1, checkpoint_every=1), SMALL, arrays(), workdir=tmp_path
+        )
+    if torn == "checkpoint":
+        for path in (tmp_path / "checkpoints").rglob("*"):
+            if path.is_file() and path.stat().st_size > 500:
+                path.write_bytes(path.read_bytes()[:200])
+    if torn == "config":
+        path = tmp_path / "config.json"
+        path.write_text(path.read_text()[:50])
+    if torn == "no checkpoint":
+        (tmp_path / "checkpoints").rename(tmp_path / "elsewhere")
+    with pytest.raises((ValueError, FileNotFoundError), match=f"{tmp_path}.*(train again|train one there|run its)"):
+        training.load(tmp_path)
+
+
+def test_a_state_keeps_its_structure_and_dtypes():
+    graphdef, state = training.initial(CONFIG, SMALL, 12)
+    batch = arrays().take(np.arange(8))
+    after, _ = jax.eval_shape(lambda s, b: training.step(graphdef, CONFIG, 12, s, b), state, batch)
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
+        assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, getattr(b, "weak_type", False))
+
+
+@pytest.mark.parametrize(("samples", "size"), [(10, 4), (7, 7), (3, 8)])
+def test_every_sample_once_an_epoch_wherever_it_starts(samples, size):
+    steps = 3 * samples
+    whole = list(training.order(0, samples, size, 0, steps))
+    flat = np.concatenate(whole)
+    for epoch in range(len(flat) // samples):
+        assert sorted(flat[epoch * samples : (epoch + 1) * samples]) == list(range(samples))
+    np.testing.assert_array_equal(whole[5:], list(training.order(0, samples, size, 5, steps)))
+    assert not np.array_equal(flat[:samples], flat[samples : 2 * samples])
+
+
+def test_beta_warms_up_over_its_share_of_the_steps():
+    graphdef, state = training.initial(CONFIG, SMALL, 100)
+    batch = arrays().take(np.arange(8))
+
+    @jax.jit
+    def parts(state):
+        return training.step(graphdef, CONFIG, 100, state, batch)[1]
+
+    for step, beta in ((0, 0.0), (10, 0.4), (25, 1.0), (90, 1.0)):
+        terms = parts(state._replace(step=jnp.int32(step)))
+        rest = sum(3 * v for v in terms.reconstruction.values())  # three subsets, all asked for both
+        np.testing.assert_allclose(terms.loss, rest + beta * 3 * terms.kl, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"absent": ("b",)}, "b is declared absent"),
+        ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "inputs named"),
+        ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "arrays of"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_named(tmp_path, change, message):
+    data = arrays()
+    absent = change.pop("absent", ())
+    data = training.Arrays(**{"inputs": data.inputs, "targets": data.targets, "present": data.present} | change)
+    with pytest.raises(ValueError, match=message):
+        training.train(CONFIG, SMALL, data, workdir=tmp_path / "run", absent=absent)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_loss_that_is_not_finite_ends_the_run(tmp_path):
+    config = training.TrainConfig(steps=40, batch_size=8, log_every=1, checkpoint_every=1, learning_rate=1e30)
+    with pytest.raises(FloatingPointError, match="learning_rate"):
+        training.train(config, SMALL, arrays(), workdir=tmp_path)
+
+
+def squares(samples, seed):
+    """A bright square at p becomes one at f(p) = (y, 31 - x); uint8."""
+    rng = np.random.default_rng(seed)
+    at = rng.integers(0, 24, (samples, 2))
+    images = [np.full((samples, 32, 32, 1), 40, np.uint8) for _ in range(2)]
+    for i, (y, x) in enumerate(at):
+        images[0][i, y : y + 8, x : x + 8] = 230
+        images[1][i, x : x + 8, 24 - y : 32 - y] = 230
+    return images[0], images[1]
+
+
+def test_it_learns_where_a_square_goes(tmp_path: Path):
+    """Skill against the mean image on held-out squares, with running statistics, and close to training's."""
+    model = mvae.Config((mvae.Modality("visual", "image", (32, 32, 1)),), latent=16, hidden=64, widths=(8, 16, 16, 32))
+    x, y = squares(400, 0)
+    config = training.TrainConfig(steps=250, batch_size=32, learning_rate=3e-3, log_every=25, checkpoint_every=250)
+    trained = training.train(config, model, training.Arrays({"visual": x}, {"visual": y}), workdir=tmp_path)
+    run = jax.jit(lambda x: mvae.predict(trained.graphdef, trained.state, {"visual": x})[0]["visual"])
+
+    def excess(logits, y):
+        entropy = -(y * np.log(y) + (1 - y) * np.log1p(-y))
+        return float(np.mean(np.logaddexp(0, logits) - logits * y - entropy))
+
+    def skill(x, y):
+        mean = np.mean(squares(400, 0)[1] / 255.0, axis=0)
+        constant = np.log(mean) - np.log1p(-mean)
+        return 1 - excess(np.asarray(run(jnp.asarray(x, jnp.float32) / 255)), y / 255) / excess(constant, y / 255)
+
+    assert skill(*squares(100, 1)) > 0.3
+    # The bound of training (batch statistics, a sampled z) against the prediction (running ones, the mean).
+    logits = np.asarray(run(jnp.asarray(x, jnp.float32) / 255))
+    evaluated = np.mean(np.sum(np.logaddexp(0, logits) - logits * (y / 255), axis=(1, 2, 3)))
+    last = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])
+    assert evaluated < 1.02 * last["visual"]
