@@ -66,9 +66,12 @@ def main(config: stages.Config, workdir: Path) -> None:
     data = stages.collect(config, workdir, sensor)
     for split in config.splits:
         stages.train(config, data, workdir, sensor, split)
-        stages.evaluate(config, data, workdir, sensor, split)
+        print(stages.evaluate(config, data, workdir, sensor, split))
 
 
 if __name__ == "__main__":
     args = tyro.cli(Args, description=__doc__)
-    main(PRESETS[args.preset], args.workdir)
+    if args.plan:
+        print(stages.plan(PRESETS[args.preset]))
+    else:
+        main(PRESETS[args.preset], args.workdir)

@@ -3,17 +3,18 @@
 import dataclasses
 import itertools
 import json
-import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm import tqdm
 
 import sts_jax as sts
+from experiments.progress import Bar, say
 from sts_jax import dataset, evaluation, mvae, training
 
 # The rows of the paper's Table 1, by the modalities a model has.
@@ -38,7 +39,9 @@ class Config:
     collection: dataset.Collection
     training: training.TrainConfig
     steps: tuple[int, ...] | None = None  # gradient steps of each of MODELS; None: training.epochs decide
-    targets: str = "all"  # a subset of modalities is asked for "all" targets, or for its "own" (paper)
+    targets: Literal["all", "own"] = (
+        "all"  # a subset of modalities is asked for "all" targets, or for its "own" (paper)
+    )
     mask_blank_touch: bool = True  # a touch without contact is no input; False: the blank image is fed (paper)
     # Held out: whole "object"s (70/10/20), or a fifth of the shuffled "trajectory"s, which shows each object on both
     # sides (paper). With several, each has its own models and table.
@@ -87,12 +90,7 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
     pairs = data.pairs(parts(data, split)["train"], turns=True)
     blank = empty_frame(sensor, config.collection)
     for number, (name, modalities) in enumerate(MODELS.items()):
-        preprocessing = training.Preprocessing(
-            resolution=config.collection.resolution,
-            crop=config.collection.crop,
-            mask_blank_touch=config.mask_blank_touch,
-        )
-        arrays, preprocessing = learnable(pairs, modalities, preprocessing, blank.tactile)
+        arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
@@ -105,7 +103,7 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
                 arrays,
                 workdir=folder,
                 absent=preprocessing.absent,
-                targets=config.targets,  # type: ignore[arg-type]
+                targets=config.targets,
                 preprocessing=dataclasses.asdict(preprocessing),
                 progress=lambda done, total, record, bar=bar, name=folder.name: bar(
                     f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else ""
@@ -113,11 +111,19 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
             )
 
 
+def preprocessing_of(config: Config) -> training.Preprocessing:
+    """How an experiment's measurements are made ready for the networks."""
+    collection = config.collection
+    return training.Preprocessing(collection.resolution, collection.crop, mask_blank_touch=config.mask_blank_touch)
+
+
 def model_config(modalities: tuple[str, ...], resolution: tuple[int, int]) -> mvae.Config:
     """The paper's networks for some modalities; lambda is 1 for images and 1000 for the pose."""
     return mvae.Config(
         tuple(
-            mvae.Modality("pose", "vector", (7,), 1000.0) if name == "pose" else mvae.Modality(name, "image", (*resolution, 3))
+            mvae.Modality("pose", "vector", (7,), 1000.0)
+            if name == "pose"
+            else mvae.Modality(name, "image", (*resolution, 3))
             for name in modalities
         )
     )
@@ -129,7 +135,9 @@ def learnable(
     """First moments as inputs, last ones as targets, and which inputs no trajectory has."""
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     moments = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
-    touched = np.asarray(preprocessing.touched(jnp.asarray(pairs.tactile[:, 0] / 255, jnp.float32), jnp.asarray(blank / 255)))
+    touched = np.asarray(
+        preprocessing.touched(jnp.asarray(pairs.tactile[:, 0] / 255, jnp.float32), jnp.asarray(blank / 255))
+    )
     absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
     arrays = training.Arrays(
         inputs={name: np.ascontiguousarray(moments[name][:, 0]) for name in modalities if name not in absent},
@@ -149,14 +157,18 @@ def empty_frame(sensor: sts.Sensor, collection: dataset.Collection) -> dataset.I
     return dataset.Images(*(np.asarray(leaf)[0] for leaf in images))
 
 
-def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
-    """Score every model on held-out trajectories; write `metrics.json`, `table.md` and `figures/`."""
+def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
+    """Score every model on held-out trajectories; write `metrics.json`, `table.md` and `figures/`; return the table."""
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done = workdir / f"table{suffix}.md"
     if done.exists():
-        return
+        return done.read_text()
     part = parts(data, split)
-    train_pairs, validation, test = data.pairs(part["train"], turns=True), data.pairs(part["validation"]), data.pairs(part["test"])
+    train_pairs, validation, test = (
+        data.pairs(part["train"], turns=True),
+        data.pairs(part["validation"]),
+        data.pairs(part["test"]),
+    )
     blank = training.load_blank(model_folder(workdir, "mvae", config, split))[0] / 255
     rows = evaluation.baselines(train_pairs, test)
     with Bar() as bar:
@@ -178,23 +190,23 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     category = np.array([int(i) % len(sts.objects.CATEGORIES) for i in test.object])
     best = rows[both] if both in rows else rows[single]
     evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category)
-    logs = {
-        TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS
-    }
+    logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
     evaluation.figures.training_curves(figures / "training.png", logs)
     if split == config.splits[0]:
         draw_strip(config, data, figures / "fall.png", sensor)
 
     steps = {name: log[-1]["step"] if log else 0 for name, log in logs.items()}
     notes = [
-        "Gradient steps: " + ", ".join(f"{name} {count}" for name, count in steps.items()) + f"; batch {config.training.batch_size}.",
+        "Gradient steps: "
+        + ", ".join(f"{name} {count}" for name, count in steps.items())
+        + f"; batch {config.training.batch_size}.",
     ]
     content = (json.dumps({"split": split, **summary}, indent=2) + "\n").encode()
     _write(workdir / f"metrics{suffix}.json", content)
     title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
     text = evaluation.table(summary, title=title, notes=notes)
     _write(done, text.encode())
-    say(text)
+    return text
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
@@ -242,6 +254,90 @@ def predict(
     return evaluation.Predicted(out.visual, out.tactile, out.pose, outcome)
 
 
+def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
+    """Seconds a stage, measured on a little of each and everything twice, so that compilation counts once.
+
+    Args:
+        config: The experiment.
+        drops: Trajectories to simulate; each has its first and last frame and their quarter turns rendered.
+        steps: Gradient steps of each model.
+
+    Returns:
+        One line a stage.
+    """
+    sensor, collection = sts.Sensor(), config.collection
+    kinds = len(sts.objects.CATEGORIES)
+    lines = []
+    with tempfile.TemporaryDirectory() as name, Bar() as bar:
+        spent: dict[str, list[float]] = {"drops": [], "frames": []}
+        for seed in (0, 1):
+            little = dataclasses.replace(
+                collection, num_objects=kinds, num_per_object=drops // kinds, num_full=0, quarter_turns=True, seed=seed
+            )
+            stamps = {"start": time.perf_counter()}
+
+            def watch(progress: dataset.Progress, stamps: dict[str, float] = stamps) -> None:
+                stamps[progress.stage] = time.perf_counter()
+                bar(f"plan: {progress.stage}", progress.done, progress.total)
+
+            dataset.collect(little, sensor, Path(name) / str(seed), progress=watch)
+            spent["drops"].append(stamps["drops"] - stamps["start"])
+            spent["frames"].append(stamps["frames"] - stamps["drops"])
+        last = collection.scenario.frames
+        ends = collection.num_trajectories * (8 if collection.quarter_turns else 2)
+        frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
+        for stage, total, measured in (
+            ("drops", collection.num_trajectories, drops),
+            ("frames", frames, 8 * drops),
+        ):
+            first, again = spent[stage]
+            rate = measured / again
+            seconds = max(first - again, 0) + total / rate
+            lines.append(
+                (f"collect: {total} {stage}", seconds, f"{rate:.3g} a second, {first - again:.0f} s to compile")
+            )
+
+        data = dataset.load(Path(name) / "0")
+        tiny = dataclasses.replace(
+            config, collection=dataclasses.replace(collection, num_objects=kinds), splits=("trajectory",)
+        )
+        pairs = data.pairs(np.arange(drops), turns=True)
+        blank = empty_frame(sensor, collection)
+        share = 0.7 if config.splits[0] == "object" else 0.8
+        samples = round(share * collection.num_trajectories) * (4 if collection.quarter_turns else 1)
+        for number, (model, modalities) in enumerate(MODELS.items()):
+            arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
+            stamps_of_steps = [time.perf_counter()]
+
+            def tick(done: int, total: int, _: dict, stamps: list[float] = stamps_of_steps, model: str = model) -> None:
+                stamps.append(time.perf_counter())
+                bar(f"plan: train {model}", done, total)
+
+            training.train(
+                dataclasses.replace(config.training, steps=steps, log_every=1, checkpoint_every=steps),
+                model_config(modalities, collection.resolution),
+                arrays,
+                workdir=model_folder(Path(name), model, tiny, "trajectory"),
+                absent=preprocessing.absent,
+                targets=config.targets,
+                preprocessing=dataclasses.asdict(preprocessing),
+                progress=tick,
+            )
+            training.save_blank(model_folder(Path(name), model, tiny, "trajectory"), blank.visual, blank.tactile)
+            each = float(np.median(np.diff(stamps_of_steps)[1:]))
+            compiling = stamps_of_steps[1] - stamps_of_steps[0] - each
+            total = config.steps[number] if config.steps is not None else config.training.total(samples)
+            note = f"{each:.3g} s a step, {compiling:.0f} s to compile"
+            lines.append((f"train {model}: {total} steps", compiling + total * each, note))
+        start = time.perf_counter()
+        evaluate(tiny, data, Path(name), sensor, "trajectory")
+        lines.append(("evaluate and draw", time.perf_counter() - start, f"of {round(0.2 * drops)} trajectories"))
+    repeats = len(config.splits)
+    lines = [(what, seconds * (1 if what.startswith("collect") else repeats), note) for what, seconds, note in lines]
+    lines.append(("together", sum(seconds for _, seconds, _ in lines), f"for {', '.join(config.splits)} split"))
+    return "\n".join(f"{what:<36}{seconds:>9.0f} s   ({note})" for what, seconds, note in lines)
+
+
 def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Sensor) -> None:
     """The first fully rendered trajectory that stays on the pad, from outside and through the sensor."""
     full = data.full_trajectories()
@@ -265,41 +361,6 @@ def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Se
     )
 
 
-class Bar:
-    """A progress bar on a terminal, a plain line every ten seconds or so elsewhere."""
-
-    def __init__(self) -> None:
-        self._bar: tqdm | None = None
-        self._stage = ""
-        self._said = 0.0
-
-    def __enter__(self) -> "Bar":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show that `done` of `total` are done."""
-        if sys.stderr.isatty():
-            if stage != self._stage or self._bar is None:
-                if self._bar is not None:
-                    self._bar.close()
-                self._bar = tqdm(total=total, desc=stage, initial=done, dynamic_ncols=True)
-            self._bar.set_postfix_str(note, refresh=False)
-            self._bar.update(done - self._bar.n)
-        elif stage != self._stage or done == total or time.monotonic() - self._said > 10:
-            say(f"{stage}: {done}/{total} {note}".rstrip())
-            self._said = time.monotonic()
-        self._stage = stage
-
-
-def say(text: str) -> None:
-    """One line for the user, on standard error."""
-    print(text, file=sys.stderr, flush=True)
-
-
 def _read_lines(path: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
@@ -310,10 +371,3 @@ def _write(path: Path, data: bytes) -> None:
 
 def _write_bytes(path: Path, data: bytes) -> None:
     path.write_bytes(data)
-
-
-def timed(work: Callable[[], object]) -> float:
-    """Seconds that a call takes."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start

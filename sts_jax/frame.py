@@ -166,7 +166,7 @@ def _draw(
     # seen through the skin
     on_face = slopes * camera.distance
     half = jnp.stack([jnp.asarray(gel.size[0]), jnp.asarray(gel.size[1])]) / 2
-    on_pad = jnp.all(jnp.abs(on_face) <= half[None, None, :], axis=-1)
+    on_pad = jnp.all(jnp.abs(on_face) <= 1.0001 * half[None, None, :], axis=-1)  # its edge is the image's: no rounding
     square_radius = jnp.sum((on_face / half[None, None, :]) ** 2, axis=-1)
     empty = optics.empty_view(sensor.room, square_radius, on_pad.astype(jnp.float32))
     turned = body.normals @ _math.quat_matrix(pose[3:]).T

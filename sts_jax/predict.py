@@ -166,7 +166,9 @@ class Predictor:
             ValueError: Nothing given, a modality the model does not have or was never given in training, a wrong
                 shape, a value out of range, NaN. The message names it and what to do.
         """
-        given = {name: value for name, value in zip(MODALITIES, (visual, tactile, pose), strict=True) if value is not None}
+        given = {
+            name: value for name, value in zip(MODALITIES, (visual, tactile, pose), strict=True) if value is not None
+        }
         if not given:
             raise ValueError(f"nothing to predict from: give at least one of {', '.join(self.modalities)}.")
         arrays = {name: self._checked_name(name, value) for name, value in given.items()}
@@ -245,7 +247,9 @@ class Predictor:
                     "give position (m) and a unit quaternion [w, x, y, z]."
                 )
             if array.size and np.abs(array[..., :3]).max() > 10:
-                raise ValueError(f"pose has a position {np.abs(array[..., :3]).max():.3g} m away; are these millimetres?")
+                raise ValueError(
+                    f"pose has a position {np.abs(array[..., :3]).max():.3g} m away; are these millimetres?"
+                )
         elif array.size and (array.min() < 0 or array.max() > 1):
             raise ValueError(
                 f"{name} has values in [{array.min():.3g}, {array.max():.3g}]; images are in [0, 1] (divide by 255?)."

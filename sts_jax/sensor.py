@@ -64,9 +64,7 @@ class Sensor:
         try:
             values = json.loads(text)
         except json.JSONDecodeError as error:
-            raise ValueError(
-                f"{path} is not a sensor's JSON file (torn?): {error}. Write it again with Sensor.save."
-            ) from error
+            raise ValueError(f"{path} is torn or no JSON: {error}. Write it again with Sensor.save.") from error
         return _typed(cls(), values, "", str(path))
 
 
@@ -75,13 +73,10 @@ def _plain(value: Any) -> Any:
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, tuple):
         return [_plain(v) for v in value]
-    # The shortest decimal that reads back as the same float32.
-    array = np.asarray(value)
-    return (
-        json.loads(np.array2string(array, separator=",", threshold=array.size + 1, floatmode="unique"))
-        if array.ndim
-        else array.item()
-    )
+    if isinstance(value, int | float):
+        return value
+    # float32 by way of its shortest decimal
+    return np.asarray(value).astype(str).astype(float).tolist()
 
 
 def _typed(default: Any, value: Any, name: str, path: str) -> Any:

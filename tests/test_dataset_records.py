@@ -18,7 +18,9 @@ def some_images(num: int = 5) -> records.Images:
 
 def test_frames_come_back_in_the_order_asked_for(tmp_path):
     images, path = some_images(), tmp_path / "a.array_record"
-    records.write_images(path, [records.Images(*(leaf[:3] for leaf in images)), records.Images(*(x[3:] for x in images))])
+    records.write_images(
+        path, [records.Images(*(leaf[:3] for leaf in images)), records.Images(*(x[3:] for x in images))]
+    )
     back = records.read_images(path, np.array([4, 0, 2]), resolution=(9, 7), total=5)
     for there, here in zip(images, back, strict=True):
         np.testing.assert_array_equal(there[[4, 0, 2]], here)

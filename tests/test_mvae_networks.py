@@ -32,7 +32,7 @@ def test_sizes_are_the_papers():
     assert shapes["encoders"]["pose"]["first"]["kernel"] == (7, 512)
 
 
-@pytest.mark.parametrize("shape", [(32, 32, 3), (64, 64, 3), (48, 64, 1)])
+@pytest.mark.parametrize("shape", [(32, 32, 3), (48, 64, 1)])
 def test_any_size_of_image_comes_back(shape):
     config = mvae.Config((mvae.Modality("a", "image", shape),), latent=6, hidden=9, widths=(4, 4, 4, 4), condition=2)
     graphdef, params, stats = mvae.init(jax.random.key(0), config)

@@ -105,9 +105,11 @@ def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
         value = np.tensordot(depth, w, 1)
         closer = np.all(w >= 0, axis=0) & (value < best)
         best[closer], winner[closer] = value[closer], k
-    got = jax.jit(lambda p, o: optics.rasterise(
-        p, o, jnp.arange(180).reshape(60, 3), jnp.ones(60, bool), jnp.bool_(False), shape, chunk=chunk
-    ))(jnp.asarray(corners.reshape(-1, 2), jnp.float32), jnp.asarray(order.ravel(), jnp.float32))
+    got = jax.jit(
+        lambda p, o: optics.rasterise(
+            p, o, jnp.arange(180).reshape(60, 3), jnp.ones(60, bool), jnp.bool_(False), shape, chunk=chunk
+        )
+    )(jnp.asarray(corners.reshape(-1, 2), jnp.float32), jnp.asarray(order.ravel(), jnp.float32))
     assert np.array_equal(np.asarray(got)[~near_edge], winner[~near_edge])
     assert (~near_edge).mean() > 0.5
 
@@ -119,9 +121,9 @@ def test_a_surface_has_no_cracks():
     points = jnp.asarray(np.concatenate([rim, [[32.3, 31.7]]]), jnp.float32)
     k = np.arange(100)
     faces = jnp.asarray(np.stack([np.full(100, 100), (k + 1) % 100, k], -1))
-    winner = jax.jit(lambda p: optics.rasterise(
-        p, jnp.ones(101), faces, jnp.ones(100, bool), jnp.bool_(False), (64, 64)
-    ))(points)
+    winner = jax.jit(
+        lambda p: optics.rasterise(p, jnp.ones(101), faces, jnp.ones(100, bool), jnp.bool_(False), (64, 64))
+    )(points)
     rows, columns = np.mgrid[:64, :64]
     inside = np.hypot(columns - 32.3, rows - 31.7) < 28.9
     assert np.all(np.asarray(winner)[inside] >= 0)

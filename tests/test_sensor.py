@@ -27,7 +27,8 @@ def test_saved_and_loaded_are_equal(tmp_path):
     sensor.save(tmp_path / "sensor.json")
     loaded = Sensor.load(tmp_path / "sensor.json")
     assert jax.tree.structure(loaded) == jax.tree.structure(sensor)
-    assert jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b), sensor, loaded))
+    for wrote, read in zip(jax.tree.leaves(sensor), jax.tree.leaves(loaded), strict=True):
+        assert np.array_equal(wrote, read)
     assert [p.name for p in tmp_path.iterdir()] == ["sensor.json"]
 
 

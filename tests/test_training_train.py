@@ -46,7 +46,7 @@ def finished(tmp_path_factory):
     return workdir, training.train(CONFIG, SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
 
 
-@pytest.mark.parametrize("step", [3, 4, 7])
+@pytest.mark.parametrize("step", [3, 6])
 def test_a_killed_run_ends_with_the_same_bits(tmp_path, finished, step):
     with pytest.raises(Killed):
         training.train(CONFIG, SMALL, arrays(), workdir=tmp_path, preprocessing={"view": "pad"}, progress=kill_at(step))
@@ -56,7 +56,14 @@ def test_a_killed_run_ends_with_the_same_bits(tmp_path, finished, step):
     same(model.state, finished[1].state)
     for name in ("metrics.jsonl", "config.json"):
         assert (tmp_path / name).read_text() == (finished[0] / name).read_text()
-    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").open()] == [2, 4, 6, 8, 10, 12]
+    assert [json.loads(line)["step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()] == [
+        2,
+        4,
+        6,
+        8,
+        10,
+        12,
+    ]
 
 
 def test_a_finished_run_is_left_alone(finished):
@@ -122,7 +129,7 @@ def test_every_sample_once_an_epoch_wherever_it_starts(samples, size):
     for epoch in range(len(flat) // samples):
         assert sorted(flat[epoch * samples : (epoch + 1) * samples]) == list(range(samples))
     np.testing.assert_array_equal(whole[5:], list(training.order(0, samples, size, 5, steps)))
-    assert not np.array_equal(flat[:samples], flat[samples : 2 * samples])
+    assert len({tuple(epoch) for epoch in flat[: 9 * samples].reshape(9, samples)}) > 1
 
 
 def test_beta_warms_up_over_its_share_of_the_steps():
@@ -130,11 +137,11 @@ def test_beta_warms_up_over_its_share_of_the_steps():
     batch = arrays().take(np.arange(8))
 
     @jax.jit
-    def parts(state):
+    def parts(state, batch):
         return training.step(graphdef, CONFIG, 100, state, batch)[1]
 
     for step, beta in ((0, 0.0), (10, 0.4), (25, 1.0), (90, 1.0)):
-        terms = parts(state._replace(step=jnp.int32(step)))
+        terms = parts(state._replace(step=jnp.int32(step)), batch)
         rest = sum(3 * v for v in terms.reconstruction.values())  # three subsets, all asked for both
         np.testing.assert_allclose(terms.loss, rest + beta * 3 * terms.kl, rtol=1e-4)
 
@@ -177,7 +184,7 @@ def test_it_learns_where_a_square_goes(tmp_path: Path):
     """Skill against the mean image on held-out squares, with running statistics, and close to training's."""
     model = mvae.Config((mvae.Modality("visual", "image", (32, 32, 1)),), latent=16, hidden=64, widths=(8, 16, 16, 32))
     x, y = squares(400, 0)
-    config = training.TrainConfig(steps=250, batch_size=32, learning_rate=3e-3, log_every=25, checkpoint_every=250)
+    config = training.TrainConfig(steps=200, batch_size=32, learning_rate=3e-3, log_every=25, checkpoint_every=200)
     trained = training.train(config, model, training.Arrays({"visual": x}, {"visual": y}), workdir=tmp_path)
     run = jax.jit(lambda x: mvae.predict(trained.graphdef, trained.state, {"visual": x})[0]["visual"])
 

@@ -9,12 +9,14 @@ Images are `(batch, height, width, channel)` in [0, 1] at the input and logits a
 Source: the paper's supplement, "Network Architecture". Hidden widths are Wu and Goodman's (2018).
 """
 
+import itertools
 import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -80,6 +82,15 @@ class Config:
         return cls(**{**values, "modalities": modalities, "widths": tuple(values["widths"])})
 
 
+class _Linear(nnx.Module):
+    def __init__(self, a: int, b: int) -> None:
+        self.kernel = nnx.Param(_spread((a, b), a))
+        self.bias = nnx.Param(jnp.zeros(b, jnp.float32))
+
+    def __call__(self, x: Array) -> Array:
+        return x @ self.kernel[...] + self.bias[...][None]
+
+
 class BatchNorm(nnx.Module):
     """Batch normalisation with a weight per sample.
 
@@ -117,17 +128,17 @@ class BatchNorm(nnx.Module):
 class _ImageEncoder(nnx.Module):
     """Four convolutions (with batch normalisation and Swish), then two fully connected layers."""
 
-    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, modality: Modality, config: Config) -> None:
         channels = (modality.shape[2], *config.widths)
         self.kernels = nnx.List(
             [
-                nnx.Param(_kernel(rngs.params(), a, b, _SIZE**2 * a))
+                nnx.Param(_spread((_SIZE, _SIZE, a, b), _SIZE**2 * a))
                 for a, b in zip(channels, config.widths, strict=False)
             ]
         )
         self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in config.widths])
-        self.first = nnx.Linear(math.prod(_core(modality)) * config.widths[-1], config.hidden, rngs=rngs)
-        self.second = nnx.Linear(config.hidden, 2 * config.latent, rngs=rngs)
+        self.first = _Linear(math.prod(_core(modality)) * config.widths[-1], config.hidden)
+        self.second = _Linear(config.hidden, 2 * config.latent)
 
     def __call__(self, x: Array, weights: Array | None) -> Gaussian:
         for kernel, norm, (stride, padding) in zip(self.kernels, self.norms, _LAYERS, strict=True):
@@ -138,13 +149,13 @@ class _ImageEncoder(nnx.Module):
 class _ImageDecoder(nnx.Module):
     """A fully connected layer, then four transposed convolutions; the last one is linear and gives logits."""
 
-    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, modality: Modality, config: Config) -> None:
         channels = (*config.widths[::-1], modality.shape[2])
         self.core = (*_core(modality), channels[0])
-        self.first = nnx.Linear(config.latent + config.condition, math.prod(self.core), rngs=rngs)
+        self.first = _Linear(config.latent + config.condition, math.prod(self.core))
         self.kernels = nnx.List(
             [
-                nnx.Param(_kernel(rngs.params(), a, b, (_SIZE // stride) ** 2 * a))
+                nnx.Param(_spread((_SIZE, _SIZE, a, b), (_SIZE // stride) ** 2 * a))
                 for a, b, (stride, _) in zip(channels, channels[1:], _LAYERS[::-1], strict=False)
             ]
         )
@@ -163,9 +174,9 @@ class _ImageDecoder(nnx.Module):
 class _VectorEncoder(nnx.Module):
     """Two fully connected layers."""
 
-    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
-        self.first = nnx.Linear(modality.shape[0], config.hidden, rngs=rngs)
-        self.second = nnx.Linear(config.hidden, 2 * config.latent, rngs=rngs)
+    def __init__(self, modality: Modality, config: Config) -> None:
+        self.first = _Linear(modality.shape[0], config.hidden)
+        self.second = _Linear(config.hidden, 2 * config.latent)
 
     def __call__(self, x: Array, weights: Array | None) -> Gaussian:
         del weights
@@ -175,9 +186,9 @@ class _VectorEncoder(nnx.Module):
 class _VectorDecoder(nnx.Module):
     """Two fully connected layers."""
 
-    def __init__(self, modality: Modality, config: Config, *, rngs: nnx.Rngs) -> None:
-        self.first = nnx.Linear(config.latent + config.condition, config.hidden, rngs=rngs)
-        self.second = nnx.Linear(config.hidden, modality.shape[0], rngs=rngs)
+    def __init__(self, modality: Modality, config: Config) -> None:
+        self.first = _Linear(config.latent + config.condition, config.hidden)
+        self.second = _Linear(config.hidden, modality.shape[0])
 
     def __call__(self, z: Array, weights: Array | None) -> Array:
         del weights
@@ -190,12 +201,12 @@ class MVAE(nnx.Module):
     `encode` and `decode` take a weight per sample for the batch statistics; `None` means evaluation.
     """
 
-    def __init__(self, config: Config, *, rngs: nnx.Rngs) -> None:
+    def __init__(self, config: Config) -> None:
         self.config = config
         encoders = {"image": _ImageEncoder, "vector": _VectorEncoder}
         decoders = {"image": _ImageDecoder, "vector": _VectorDecoder}
-        self.encoders = nnx.Dict({m.name: encoders[m.kind](m, config, rngs=rngs) for m in config.modalities})
-        self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config, rngs=rngs) for m in config.modalities})
+        self.encoders = nnx.Dict({m.name: encoders[m.kind](m, config) for m in config.modalities})
+        self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
 
     def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
         """The expert of one modality, `(batch, latent)`."""
@@ -207,16 +218,31 @@ class MVAE(nnx.Module):
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
-    """A new model as `(graphdef, params, stats)`; consumes `key`."""
-    return nnx.split(MVAE(config, rngs=nnx.Rngs(key)), nnx.Param, nnx.BatchStat)
+    """A new model as `(graphdef, params, stats)`; consumes `key`.
+
+    Kernels are normal with variance `1 / fan_in`, biases 0, scales 1. All kernels are drawn in one call, since
+    each shape of a draw is a compilation.
+    """
+    graphdef, params, stats = nnx.split(MVAE(config), nnx.Param, nnx.BatchStat)
+    leaves, tree = jax.tree.flatten(params)
+    noise = np.cumsum([0] + [x.size if x.ndim > 1 else 0 for x in leaves])
+
+    @jax.jit
+    def draw(key: PRNGKeyArray) -> list[Array]:
+        drawn = jax.random.normal(key, (int(noise[-1]),), jnp.float32)
+        ends = itertools.pairwise(noise)
+        return [x if a == b else x * drawn[a:b].reshape(x.shape) for x, (a, b) in zip(leaves, ends, strict=True)]
+
+    return graphdef, jax.tree.unflatten(tree, draw(key)), stats
 
 
 def _core(modality: Modality) -> tuple[int, int]:
     return modality.shape[0] // 8 - 3, modality.shape[1] // 8 - 3
 
 
-def _kernel(key: Array, a: int, b: int, fan_in: int) -> Array:
-    return jax.random.normal(key, (_SIZE, _SIZE, a, b), jnp.float32) / math.sqrt(fan_in)
+def _spread(shape: tuple[int, ...], fan_in: int) -> Array:
+    """A kernel before `init` has drawn it: its standard deviation."""
+    return jnp.full(shape, 1 / math.sqrt(fan_in), jnp.float32)
 
 
 def _gaussian(x: Array) -> Gaussian:

@@ -1,8 +1,8 @@
-"""Where a convex hull touches the pad: exact candidates, and up to four contact points chosen among them.
+"""Where a convex hull touches the pad: exact candidates, and up to eight contact points chosen among them.
 
 MJX's own test of a mesh against a box was tried and left: beside a face it counts every pair of edges, so a small
 object lying on a pad much larger than itself is pushed by contacts between its edges and the pad's distant rims (it
-never comes to rest, and some are thrown off), and it keeps each mesh in its compiled structure. The pad is a box
+never comes to rest, and some are thrown off), and every mesh compiles anew. The pad is a box
 whose sides face along the axes, so its contacts with a convex hull are three kinds only:
 
 - a vertex of the hull inside the pad: the nearest of the top and the four sides pushes it out;
@@ -17,30 +17,30 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax import _math
 
-NUM_CONTACTS = 4  # what MJX reserves for two boxes
-SAME = 0.0001  # m; points this close to the deepest count as equally deep, or the choice would flicker at rest
+NUM_CONTACTS = 8  # MJX reserves four for each pair of boxes: the object's stand-in is two
+STEEP = 5.0  # depth against extent in the choice of points
 SKIN = 0.001  # m; points this much higher than the deepest one may still belong to the support
 
 
 class Hull(NamedTuple):
     """A convex hull in the mesh frame, padded to its class by repetition."""
 
-    vertices: Float[Array, "*n h 3"]  # m
-    edges: Float[Array, "*n e 2 3"]  # m, both ends; diagonals of flat faces are among them and do no harm
-    planes: Float[Array, "*n f 4"]  # outward unit normal, offset (m): inside is normal . x < offset
+    vertices: Float[Array | np.ndarray, "*n h 3"]  # m
+    edges: Float[Array | np.ndarray, "*n e 2 3"]  # m, both ends; diagonals of flat faces are among them and do no harm
+    planes: Float[Array | np.ndarray, "*n f 4"]  # outward unit normal, offset (m): inside is normal . x < offset
 
 
 class Contacts(NamedTuple):
     """Contact points in the sensor frame, in MuJoCo's convention."""
 
-    dist: Float[Array, "4"]  # m, negative is penetration, 1 where there is no contact
-    pos: Float[Array, "4 3"]  # m, halfway between the two surfaces
-    frame: Float[Array, "4 3 3"]  # rows: normal from pad to object, two tangents
+    dist: Float[Array, "k"]  # m, negative is penetration, 1 where there is no contact
+    pos: Float[Array, "k 3"]  # m, halfway between the two surfaces
+    frame: Float[Array, "k 3 3"]  # rows: normal from pad to object, two tangents
 
 
 def hull(vertices: np.ndarray) -> Hull:
@@ -106,15 +106,14 @@ def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Arra
     return depth, corners - depth[:, None] * normal, normal
 
 
-def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"], normal: Float[Array, "c 3"]) -> Float[Array, "4"]:
+def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"]) -> Int[Array, "k"]:
     deepest = jnp.max(depth)
-    candidate = jnp.where(depth > deepest - SKIN, 0.0, -1e3)
-    a = jnp.argmax(depth > deepest - SAME)
-    b = jnp.argmax(jnp.sum((points - points[a]) ** 2, axis=1) + candidate)
-    side = (points - points[a]) @ jnp.cross(normal[a], points[b] - points[a])
-    c = jnp.argmax(side + candidate)
-    d = jnp.argmax(-side + candidate)
-    return jnp.stack([a, b, c, d])
+    candidate = jnp.where(depth > jnp.maximum(0, deepest - SKIN), 0.0, -1e3)
+    # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
+    angle = 0.4 + 2 * np.pi * np.arange(NUM_CONTACTS - 1) / (NUM_CONTACTS - 1)
+    directions = jnp.array(np.stack([np.cos(angle), np.sin(angle)]), points.dtype)
+    score = points[:, :2] @ directions + (STEEP * depth + candidate)[:, None]
+    return jnp.append(jnp.argmax(score, axis=0), jnp.argmax(depth))
 
 
 def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -126,7 +125,7 @@ def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
 def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"]) -> Contacts:
     """The contacts of a hull with the pad.
 
-    The deepest point is always among them; the others, within SKIN of its depth, span the largest area with it.
+    The deepest point is always among them; the others, within SKIN of its depth, reach farthest in fixed directions.
 
     Args:
         body: the hull.
@@ -141,7 +140,7 @@ def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"]) -> Con
     rims = [_rim(ends, half, axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)]
     kinds = [_vertices(points, half), *rims, _corners(planes, half)]
     depth, points, normal = (jnp.concatenate(x) for x in zip(*kinds, strict=True))
-    chosen = _spread(depth, points, normal)
+    chosen = _spread(depth, points)
     new = jnp.sum(jnp.tril(chosen == chosen[:, None]), axis=1) == 1
     depth, points, normal = depth[chosen], points[chosen], normal[chosen]
     dist = jnp.where(new & (depth > 0), -depth, 1.0)

@@ -47,12 +47,12 @@ class Freefall:
 
     height: float = 0.05  # m, lowest point of the object above the pad in frame 0
     spread: float = 0.03  # m, radius of the disc from which the object's origin is drawn
-    rate: float = 25.0  # frames/s
+    rate: float = 40.0  # frames/s
     frames: int = 60
     fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.4, 0.8)
-    contact: Contact = Contact()
+    contact: Contact = dataclasses.field(default_factory=Contact)
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
         """Draws the hidden values of one trajectory; consumes `key`."""

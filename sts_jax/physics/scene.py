@@ -1,7 +1,7 @@
 """The one scene of all scenarios, as MuJoCo and as MJX models: a fixed pad and one free object above it.
 
 The pad is a box whose top face lies in z = 0 of the sensor frame. The object's body frame is its mesh frame
-(its inertia is given about an explicit centre of mass), so `qpos` is the pose of `design`: position and quaternion.
+(its inertia is given about an explicit centre of mass), so `qpos` is the object's pose.
 
 MJX steps one template model for all objects (`step`, `template`): what differs between two is a few arrays and the
 contacts. `compile_scene` is the same scene with the object's mesh, for C MuJoCo.
@@ -15,13 +15,12 @@ import io
 import mujoco
 import numpy as np
 
-from sts_jax.physics.contact import Contacts
+from sts_jax.physics.contact import NUM_CONTACTS, Contacts
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, another engine, is not installed
     from mujoco import mjx
 
 PAD_DEPTH = 0.2  # m; what leaves the pad slides down its side and never gets beneath it
-FACE_VERTICES = 20  # MJX's largest polygon
 
 _SCENE = """
 <mujoco>
@@ -38,7 +37,7 @@ _SCENE = """
     <body name="object">
       <freejoint/>
       <inertial pos="0 0 0.001" mass="1" fullinertia="2e-4 2e-4 3e-4 0 0 1e-5"/>
-      <geom name="object" {shape} friction="0.5 {torsional} {rolling}"/>
+      {shapes}
     </body>
   </worldbody>
 </mujoco>
@@ -58,13 +57,14 @@ class Contact:
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
     rolling: float = 0.0005  # m, rolling friction: lathed objects come to rest
     impratio: float = 10.0  # stiffness of friction against the normal force: what holds does not creep
-    iterations: int = 10  # Newton iterations of one step
-    ls_iterations: int = 20  # line-search iterations of one Newton iteration
+    iterations: int = 8  # Newton iterations of one step
+    ls_iterations: int = 8  # line-search iterations of one Newton iteration
 
 
-def _xml(pad: tuple[float, float], contact: Contact, shape: str, asset: str = "") -> str:
+def _xml(pad: tuple[float, float], contact: Contact, shapes: list[str], asset: str = "") -> str:
+    friction = f"0.5 {contact.torsional} {contact.rolling}"
     return _SCENE.format(
-        shape=shape,
+        shapes="\n".join(f'<geom {shape} friction="{friction}"/>' for shape in shapes),
         asset=asset,
         pad_x=pad[0] / 2,
         pad_y=pad[1] / 2,
@@ -84,7 +84,7 @@ def compile_scene(vertices: np.ndarray, pad: tuple[float, float], contact: Conta
     """
     points = " ".join(f"{x:.9g}" for x in np.unique(vertices, axis=0).ravel())
     asset = f'<asset><mesh name="hull" inertia="convex" vertex="{points}"/></asset>'
-    return mujoco.MjModel.from_xml_string(_xml(pad, contact, 'type="mesh" mesh="hull"', asset))
+    return mujoco.MjModel.from_xml_string(_xml(pad, contact, ['type="mesh" mesh="hull"'], asset))
 
 
 def set_rigid(
@@ -107,12 +107,12 @@ def set_rigid(
     if principal[2] <= 0:
         raise ValueError(f"principal moments of inertia are {principal} kg m^2; they must be positive")
     axes[:, 2] *= np.sign(np.linalg.det(axes))
-    body, geom = model.body("object"), model.geom("object")
+    body = model.body("object")
     body.mass = mass
     body.ipos = com
     body.inertia = principal
     mujoco.mju_mat2Quat(model.body_iquat[body.id], axes.ravel())
-    geom.friction[0] = friction
+    model.geom_friction[1:, 0] = friction  # geom 0 is the pad
     mujoco.mj_setConst(model, data)
     model.stat.meaninertia = model.dof_M0.mean()  # scales the solver's tolerance; the compiler alone sets it
 
@@ -134,14 +134,14 @@ DRAWN = (
 @functools.cache
 def template(pad: tuple[float, float], contact: Contact) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
     """The scene that MJX steps, for every object: a box stands for the hull, whose contacts `collide` finds."""
-    model = mujoco.MjModel.from_xml_string(_xml(pad, contact, 'type="box" size=".01 .01 .01"'))
+    model = mujoco.MjModel.from_xml_string(_xml(pad, contact, ['type="box" size=".01 .01 .01"'] * (NUM_CONTACTS // 4)))
     return model, mjx.put_model(model), mjx.make_data(model)
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
     """What `set_rigid` changed, under the names of `mjx.Model`'s fields."""
     fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
-    return fields | {"stat.meaninertia": np.float32(model.stat.meaninertia)}
+    return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 
 
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:

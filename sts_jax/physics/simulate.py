@@ -1,6 +1,7 @@
 """`simulate`: bodies, draws and chunks on the host, MJX underneath."""
 
 import concurrent.futures
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -22,8 +23,7 @@ from sts_jax.sensor import Sensor
 
 SUNK_LIMIT = 0.003  # m; a trajectory in which the object went deeper into the pad is drawn again
 ATTEMPTS = 5  # draws of one trajectory before giving up
-CHUNK = 64  # trajectories of one call: a fixed number, so that their count compiles nothing
-WORKERS = 1
+WORKERS = 2  # chunks under way at once: XLA runs these small steps on one CPU core each
 
 
 class Trajectory(NamedTuple):
@@ -72,9 +72,9 @@ def _draw(
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
-def _gravity(condition: Float[Array, "n c"], scenario: Freefall) -> Float[Array, "n f s 3"]:
-    steps = _steps(scenario)
-    time = (jnp.arange(scenario.frames) - 1)[:, None] / scenario.rate + jnp.arange(steps) * scenario.contact.timestep
+def _gravity(
+    condition: Float[Array, "n c"], time: Float[np.ndarray, "f s"], scenario: Freefall
+) -> Float[Array, "n f s 3"]:
     return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
 
 
@@ -110,6 +110,9 @@ def _check(bodies: Sequence[Body], scenario: Freefall, num: int) -> None:
         low, high = getattr(scenario, name)
         if not (np.isfinite([low, high]).all() and low <= high and low >= 0 and (name == "fill" or low > 0)):
             raise ValueError(f"scenario.{name} is {(low, high)}; it must be (low, high), positive and finite")
+    for name in ("height", "spread"):
+        if not (np.isfinite(getattr(scenario, name)) and getattr(scenario, name) >= 0):
+            raise ValueError(f"scenario.{name} is {getattr(scenario, name)} m; it must be finite and not negative")
     if scenario.fill[1] > 1:
         raise ValueError(f"scenario.fill is {scenario.fill}; a share is at most 1")
     if scenario.frames < 1:
@@ -121,6 +124,8 @@ def _check(bodies: Sequence[Body], scenario: Freefall, num: int) -> None:
             )
         if not np.isfinite(body.hull).all():
             raise ValueError(f"body {i}: hull has a non-finite vertex")
+        if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
+            raise ValueError(f"body {i}: shell_mass is {body.shell_mass} kg; it must be positive and finite")
 
 
 def _check_hidden(hidden: Hidden, count: int) -> Hidden:
@@ -138,7 +143,8 @@ def _draws(
     bodies: Sequence[Body], which: np.ndarray, hidden: Hidden, pad: tuple[float, float], constants: Contact
 ) -> dict[str, np.ndarray]:
     """The model's fields of each draw: MuJoCo derives them from mass, centre of mass, inertia and friction."""
-    model, like, _ = scene.template(pad, constants)
+    original, like, _ = scene.template(pad, constants)
+    model = copy.copy(original)
     data = mujoco.MjData(model)
     fields = []
     for index, body in enumerate(bodies):
@@ -162,6 +168,7 @@ def simulate(
     *,
     hidden: Hidden | None = None,
     progress: Callable[[int], object] | None = None,
+    chunk: int = 32,
 ) -> Trajectory:
     """Simulates `num` trajectories of each body: random start, hidden values, contact with the pad.
 
@@ -176,6 +183,7 @@ def simulate(
         num: trajectories of each body.
         hidden: (bodies * num,) each, body-major: rolls the starts of `key` with these instead of drawn ones.
         progress: called with the number of trajectories done so far, after each chunk.
+        chunk: trajectories that MJX steps at once; another number compiles anew. Larger ones suit a GPU.
 
     Returns:
         bodies * num trajectories, body-major.
@@ -193,34 +201,37 @@ def simulate(
     vertices = np.stack([np.pad(b.hull, ((0, sizes.max() - len(b.hull)), (0, 0)), "edge") for b in bodies])
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
     _, model, data = scene.template(pad, scenario.contact)
+    frame = np.arange(scenario.frames)[:, None] / scenario.rate
+    time = (frame - np.arange(_steps(scenario), 0, -1) * scenario.contact.timestep).astype(np.float32)  # of each step
 
-    def chunk(indices: np.ndarray, starts: Start, fields: dict[str, np.ndarray]) -> tuple[State, Record]:
-        padded = np.pad(indices, (0, CHUNK - len(indices)), "edge")
+    def run(starts: Start, fields: dict[str, np.ndarray], indices: np.ndarray) -> tuple[State, Record]:
+        padded = np.pad(indices, (0, chunk - len(indices)), "edge")
         start = jax.tree.map(lambda x: x[padded], starts)
         worlds = _Worlds(
             fields={name: x[padded] for name, x in fields.items()},
             hull=jax.tree.map(lambda *x: np.stack(x), *(hulls[which[i]] for i in padded)),
             start=start,
-            gravity=_gravity(start.condition, scenario=scenario),
+            gravity=_gravity(start.condition, time, scenario=scenario),
         )
         return jax.tree.map(lambda x: np.asarray(x)[: len(indices)], _roll(worlds, model, data))
 
     attempt = np.zeros(count, np.int32)
     pending = np.arange(count)
-    rows: list[tuple[State, Record] | None] = [None] * count
+    rows: dict[int, tuple[State, Record]] = {}
     while len(pending):
         starts, drawn = _draw(key, which, nth, attempt, vertices, scenario=scenario)
         drawn = drawn if given is None else given
         fields = _draws(bodies, which, drawn, pad, scenario.contact)
         by_size = [pending[sizes[which[pending]] == size] for size in np.unique(sizes)]
-        chunks = [c for part in by_size for c in np.split(part, range(CHUNK, len(part), CHUNK)) if len(c)]
+        chunks = [c for part in by_size for c in np.split(part, range(chunk, len(part), chunk)) if len(c)]
         with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
-            for indices, result in zip(chunks, pool.map(lambda c: chunk(c, starts, fields), chunks), strict=True):
-                for row, i in enumerate(indices):
+            results = pool.map(functools.partial(run, starts, fields), chunks)
+            for indices, result in zip(chunks, results, strict=True):
+                for row, i in enumerate(indices.tolist()):
                     rows[i] = jax.tree.map(lambda x, row=row: x[row], result)
                 if progress is not None:
-                    progress(sum(row is not None for row in rows))
-        ok = np.array([bool(row[0].finite and row[0].sunk <= SUNK_LIMIT) for row in rows])
+                    progress(len(rows))
+        ok = np.array([bool(row[0].finite and row[0].sunk <= SUNK_LIMIT) for row in (rows[i] for i in range(count))])
         pending = np.flatnonzero(~ok)
         attempt[pending] += 1
         if attempt.max() >= ATTEMPTS:
@@ -230,7 +241,7 @@ def simulate(
                 f"{ATTEMPTS} draws; is its hull too thin or its mass out of scale?"
             )
 
-    last, records = jax.tree.map(lambda *x: jnp.stack(x), *rows)
+    last, records = jax.tree.map(lambda *x: jnp.stack(x), *(rows[i] for i in range(count)))
     frozen_or_slow = last.gone | (last.slow * scenario.contact.timestep >= SLOW_TIME)
     return Trajectory(
         time=jnp.tile(jnp.arange(scenario.frames) / scenario.rate, (count, 1)),
@@ -238,7 +249,7 @@ def simulate(
         velocity=records.velocity,
         wrench=records.wrench,
         contact=records.contact,
-        gravity=_gravity(starts.condition, scenario=scenario)[:, :, -1],
+        gravity=_gravity(starts.condition, time[:, -1:], scenario=scenario)[:, :, 0],
         settled=frozen_or_slow,
         outcome=jax.vmap(outcome)(records.pose[:, 0], records.pose[:, -1]),
         touches=last.touches,

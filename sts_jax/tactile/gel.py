@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-_NEWTON_STEPS = 14
+_NEWTON_STEPS = 12
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
 _LEVER = 0.02  # m, by which tilts are scaled
+_BOTTOM = 300.0  # how many times stiffer the springs are beyond the deepest imprint
 _FAR = 1.0  # m, stands for the height where there is no object
 
 
@@ -81,7 +82,8 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
     are the stationarity of `E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b`, which is convex and piecewise
     quadratic: projected Newton steps with a line search, from an imprint as deep as the limit allows below first
-    touch. Derivatives are those of the equilibrium (implicit function theorem: one more Newton step, undamped).
+    touch. Beyond `max_depth` the springs meet a hard bottom, which carries what is left and counts for nothing in the
+    pressure. Derivatives are those of the equilibrium (implicit function theorem: one more Newton step, undamped).
 
     Args:
         gel: its constants.
@@ -112,16 +114,25 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     reach = touch <= gel.max_depth
     tilt = jnp.tan(gel.max_tilt) * _LEVER
     bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
+    near_bound = 0.9999 * bound
+
+    def pushed(length: Float[Array, "r c"]) -> Float[Array, "r c"]:
+        return jnp.maximum(length, 0) + _BOTTOM * jnp.maximum(length - gel.max_depth, 0)
 
     def newton(_: Array, u: Float[Array, "3"]) -> Float[Array, "3"]:
         length = _plane(u, fixed_x, fixed_y) - fixed_height
-        gradient = _moments(jnp.maximum(length, 0), fixed_x, fixed_y) - fixed_target
-        held = ((u >= bound) & (gradient < 0)) | ((u <= -bound) & (gradient > 0))
-        step = -_solve(_curvature(length, fixed_x, fixed_y), gradient, held)
-        step = jnp.clip(u + step, -bound, bound) - u
+        gradient = _moments(pushed(length), fixed_x, fixed_y) - fixed_target
+        held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
+        curvature = _curvature(length, gel.max_depth, fixed_x, fixed_y)
+        step = -_solve(curvature, gradient, held)
+        # At a limit, and still led beyond it by the other unknowns: without this one.
+        held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
+        step = -_solve(curvature, gradient, held)
+        room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
+        step = step * jnp.clip(jnp.min(jnp.where(step == 0, 1, room)), 0, 1)
         along = _plane(step, fixed_x, fixed_y)
         slopes = [
-            jnp.sum(step * (_moments(jnp.maximum(length + t * along, 0), fixed_x, fixed_y) - fixed_target))
+            jnp.sum(step * (_moments(pushed(length + t * along), fixed_x, fixed_y) - fixed_target))
             for t in _STEP_LENGTHS
         ]
         best = jnp.argmin(jnp.abs(jnp.stack(slopes)))
@@ -132,14 +143,12 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     u = jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON_STEPS, newton, start))
 
     length = _plane(u, x, y) - height
-    gradient = _moments(jnp.maximum(length, 0), x, y) - target
-    curvature = jax.lax.stop_gradient(_curvature(length, x, y))
-    u = jnp.clip(u - _solve(curvature, gradient, jnp.abs(u) >= bound), -bound, bound)
+    gradient = _moments(pushed(length), x, y) - target
+    curvature = jax.lax.stop_gradient(_curvature(length, gel.max_depth, x, y))
+    u = jnp.clip(u - _solve(curvature, gradient, jnp.abs(u) >= near_bound), -bound, bound)
 
-    deepest = jnp.max(_plane(u, x, y) - height)
-    u = u - jnp.maximum(deepest - gel.max_depth, 0) * jnp.array([1.0, 0.0, 0.0])
     u = jnp.where(pressed & reach, u, 0)
-    length = jnp.where(pressed & reach, jnp.maximum(_plane(u, x, y) - height, 0), 0)
+    length = jnp.where(pressed & reach, jnp.clip(_plane(u, x, y) - height, 0, gel.max_depth), 0)
 
     # the moments' errors over a lever of 1 cm
     residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
@@ -168,8 +177,10 @@ def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "
     return jnp.stack([sums[0, 0], sums[1, 0], sums[0, 1]])
 
 
-def _curvature(length: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3 3"]:
-    s = _sums((length > 0).astype(length.dtype), x, y)
+def _curvature(
+    length: Float[Array, "r c"], limit: Scalar, x: Float[Array, "c"], y: Float[Array, "r"]
+) -> Float[Array, "3 3"]:
+    s = _sums((length > 0) + _BOTTOM * (length > limit), x, y)
     rows = [[s[0, 0], s[1, 0], s[0, 1]], [s[1, 0], s[2, 0], s[1, 1]], [s[0, 1], s[1, 1], s[0, 2]]]
     return jnp.stack([jnp.stack(row) for row in rows]) + (1e-6 + 1e-5 * s[0, 0]) * jnp.eye(3)
 

@@ -273,7 +273,7 @@ def load(workdir: str | os.PathLike[str]) -> Model:
         )
     model, config = mvae.Config.from_json(settings["model"]), TrainConfig(**settings["training"])
     total = config.total(settings["data"]["samples"])
-    graphdef, _, _ = mvae.init(jax.random.key(0), model)
+    graphdef = nnx.graphdef(nnx.eval_shape(lambda: mvae.MVAE(model)))
     state = restore(workdir, jax.eval_shape(lambda: initial(config, model, total)[1]))
     if state is None:
         raise FileNotFoundError(f"{workdir}: has no checkpoint; run its training to the first one")

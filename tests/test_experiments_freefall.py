@@ -1,0 +1,127 @@
+"""The whole line at the smallest size: from drops to a table, resumed, refused, and called as the README calls it."""
+
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sts_jax as sts
+from experiments import freefall, stages
+from sts_jax import dataset, physics
+
+TINY = dataclasses.replace(
+    freefall.SMOKE,
+    collection=dataclasses.replace(
+        freefall.SMOKE.collection, scenario=physics.Freefall(frames=15), num_objects=16, num_per_object=1
+    ),
+    steps=(2, 2, 2, 2),
+    training=dataclasses.replace(freefall.SMOKE.training, batch_size=4, checkpoint_every=2),
+    num_shown=2,
+)
+
+
+@pytest.fixture(scope="module")
+def workdir(tmp_path_factory):
+    workdir = tmp_path_factory.mktemp("runs") / "freefall"
+    freefall.main(TINY, workdir)
+    return workdir
+
+
+def test_the_workdir_holds_what_is_promised(workdir):
+    names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
+    assert {"config.json", "dataset", "metrics.json", "table.md"} <= names
+    assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS} <= names
+    assert {f"figures/{name}.png" for name in ("predictions", "training", "fall", "line_up")} <= names
+    metrics = json.loads((workdir / "metrics.json").read_text())
+    predictors = metrics["predictors"]
+    assert {
+        "MVAE with pose, from visual",
+        "MVAE with pose, from all inputs",
+        "MVAE without pose, from visual",
+        "VAE visual only, from visual",
+        "VAE tactile only, no input: the first touch is always blank",
+        "constant (mean training target)",
+        "copy of the input",
+        "nearest neighbour",
+    } <= set(predictors)
+    assert predictors["constant (mean training target)"]["visual_skill"]["value"] == 0
+    table = (workdir / "table.md").read_text()
+    assert all(name in table for name in predictors)
+
+
+def test_started_again_it_touches_nothing(workdir):
+    stamps = {path: path.stat().st_mtime_ns for path in workdir.rglob("*")}
+    freefall.main(TINY, workdir)
+    assert stamps == {path: path.stat().st_mtime_ns for path in workdir.rglob("*")}
+
+
+def test_another_configuration_is_refused(workdir):
+    other = dataclasses.replace(TINY, steps=(3, 2, 2, 2))
+    with pytest.raises(ValueError, match=r"config\.json was made with steps = \[2, 2, 2, 2\]"):
+        freefall.main(other, workdir)
+
+
+def test_what_is_promised_to_callers_runs(workdir):
+    key = jax.random.key(1)
+    body = sts.objects.make(jax.random.key(0), "bottle")
+    sensor = sts.Sensor()
+    traj = sts.physics.simulate(key, body, sensor, sts.physics.Freefall(), num=4)
+    pose, wrench = traj.pose[0, -1], traj.wrench[0, -1]
+    frame = sts.sense(sensor, body, pose, wrench, resolution=(64, 64), crop=False)
+    predict = sts.Predictor.load(workdir / "models/mvae")
+    out = predict(visual=frame.visual)
+    assert out.visual.shape == out.tactile.shape == (64, 64, 3)
+    assert out.pose.shape == (7,)
+    with pytest.raises(ValueError, match="cannot use tactile"):
+        predict(tactile=frame.tactile)
+
+
+def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
+    spec = importlib.util.find_spec("miniworld")
+    assert spec is not None
+    assert spec.origin is not None
+    meshes = Path(spec.origin).parent / "meshes"
+    body = sts.objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
+    sensor = sts.Sensor()
+    traj = sts.physics.simulate(jax.random.key(2), body, sensor, physics.Freefall(), num=4)
+    rests = np.flatnonzero((traj.outcome == physics.Outcome.RESTS) & traj.settled)
+    assert len(rests) > 0
+    one = int(rests[0])
+    frame = jax.jit(lambda p, w: sts.sense(sensor, body, p, w, resolution=(200, 200)))(
+        traj.pose[one, -1], traj.wrench[one, -1]
+    )
+    empty = sts.sense(sensor, body, jnp.array([0.0, 0, -1, 1, 0, 0, 0]), jnp.zeros(6), resolution=(200, 200))
+    seen = np.asarray(frame.segmentation)
+    assert seen.mean() > 0.01
+    assert np.asarray(frame.visual)[seen].std(0).max() > 0.03  # a texture, not one colour
+    imprint = np.abs(np.asarray(frame.tactile - empty.tactile)).max(-1) > 5 / 255
+    assert imprint.sum() > 20
+    assert bool(frame.balanced)
+    area = 1e-6
+    assert float(frame.pressure.sum() * area) == pytest.approx(float(traj.wrench[one, -1, 2]), rel=0.01)
+
+
+def test_the_paper_preset_has_the_papers_counts():
+    paper = freefall.PAPER
+    assert paper.collection.num_trajectories == 1700
+    assert paper.collection.scenario.frames == 60
+    assert paper.collection.crop
+    assert paper.collection.num_full == 1700
+    assert (paper.training.epochs, paper.training.batch_size) == (200, 64)
+    assert paper.training.beta_warmup == 50 / 200
+    assert (paper.targets, paper.splits[0], paper.mask_blank_touch) == ("own", "trajectory", False)
+    assert {name: m.weight for name in ("mvae",) for m in stages.model_config(stages.MODELS[name], (64, 64)).modalities}
+    weights = [m.weight for m in stages.model_config(stages.MODELS["mvae"], (64, 64)).modalities]
+    assert weights == [1, 1, 1000]
+
+
+def test_the_papers_split_is_a_fifth_of_shuffled_trajectories(workdir):
+    data = dataset.load(workdir / "dataset")
+    parts = stages.parts(data, "trajectory")
+    assert len(parts["test"]) == round(0.2 * 16)
+    np.testing.assert_array_equal(np.sort(np.concatenate([parts["train"], parts["test"]])), np.arange(16))
