@@ -58,11 +58,11 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
     config = training.TrainConfig(batch_size=size)
     graphdef, state = training.initial(config, model, 100)
     run = jax.jit(lambda s, b: training.step(graphdef, config, 100, s, b, absent=absent), donate_argnums=0)
-    run = run.lower(state, batch).compile()
+    compiled = run.lower(state, batch).compile()
 
     def call() -> None:
         nonlocal state
-        state, _ = jax.block_until_ready(run(state, batch))
+        state, _ = jax.block_until_ready(compiled(state, batch))
 
     return call
 

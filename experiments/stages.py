@@ -119,14 +119,9 @@ def preprocessing_of(config: Config) -> training.Preprocessing:
 
 def model_config(modalities: tuple[str, ...], resolution: tuple[int, int]) -> mvae.Config:
     """The paper's networks for some modalities; lambda is 1 for images and 1000 for the pose."""
-    return mvae.Config(
-        tuple(
-            mvae.Modality("pose", "vector", (7,), 1000.0)
-            if name == "pose"
-            else mvae.Modality(name, "image", (*resolution, 3))
-            for name in modalities
-        )
-    )
+    pose = mvae.Modality("pose", "vector", (7,), weight=1000.0)
+    images = {name: mvae.Modality(name, "image", (*resolution, 3), start=0.7) for name in ("visual", "tactile")}
+    return mvae.Config(tuple({**images, "pose": pose}[name] for name in modalities))
 
 
 def learnable(

@@ -6,26 +6,29 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sts_jax.objects.body import NUM_FILLS, Body
+from sts_jax.objects.body import FACE_CLASSES, NUM_FILLS, Body
 
 
-def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None, faces: int | None = None) -> Body:
-    """A body with flat normals; `colors` per face, `faces` a number to pad to."""
+def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
+    """A body with flat normals, of the smallest size class where it fits; `colors` are per face."""
     number = len(mesh.faces)
-    padded = max(faces or number, number)
+    padded = next(size for size in FACE_CLASSES if size >= number)
     normals = np.repeat(mesh.face_normals[:, None], 3, axis=1)
     colors = np.broadcast_to(np.asarray(color if colors is None else colors, float), (number, 3))
-    pad = lambda a: np.concatenate([a, np.zeros((padded - number, *a.shape[1:]), a.dtype)])  # noqa: E731
-    hull = mesh.convex_hull.vertices[:32]
+    hull = mesh.convex_hull.vertices[:64]
+
+    def pad(values, size, filler=0):
+        return np.concatenate([values, np.zeros((size - len(values), *values.shape[1:]), values.dtype) + filler])
+
     return Body(
-        vertices=jnp.asarray(mesh.vertices, jnp.float32),
-        faces=jnp.asarray(pad(np.asarray(mesh.faces)), jnp.int32),
-        normals=jnp.asarray(pad(normals), jnp.float32),
-        colors=jnp.asarray(pad(np.repeat(colors[:, None], 3, axis=1)), jnp.float32),
+        vertices=jnp.asarray(pad(mesh.vertices, padded, mesh.vertices[-1]), jnp.float32),
+        faces=jnp.asarray(pad(np.asarray(mesh.faces), padded), jnp.int32),
+        normals=jnp.asarray(pad(normals, padded), jnp.float32),
+        colors=jnp.asarray(pad(np.repeat(colors[:, None], 3, axis=1), padded), jnp.float32),
         uv=jnp.zeros((padded, 3, 2)),
         texture=jnp.ones((1, 1, 3)),
         two_sided=jnp.bool_(False),
-        hull=jnp.asarray(hull, jnp.float32),
+        hull=jnp.asarray(pad(hull, 64, hull[-1]), jnp.float32),
         shell_mass=jnp.float32(0.1),
         shell_com=jnp.zeros(3),
         shell_inertia=jnp.eye(3) * 1e-4,

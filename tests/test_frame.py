@@ -47,7 +47,7 @@ def letter():
 
 
 def ball(radius=0.03):
-    return from_trimesh(trimesh.creation.icosphere(subdivisions=4, radius=radius))
+    return from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
 def weight(force, x, y):
@@ -100,7 +100,7 @@ def test_the_balanced_pose_sinks_as_deep_as_its_pressure_says(resolution):
     # the ball of radius R whose centre is at z dips R - z below the face
     depth = 0.03 - float(frame.pose[2])
     assert float(jnp.max(frame.pressure)) == pytest.approx(SENSOR.gel.stiffness * depth, rel=0.03)
-    assert 0.1 - float(jnp.min(frame.depth)) == pytest.approx(depth, abs=5e-5)
+    assert 0.1 - float(jnp.min(frame.depth)) == pytest.approx(depth, abs=1e-4)  # facets
 
 
 def test_a_tilt_turns_the_pose_as_the_pressure_says():
@@ -135,11 +135,12 @@ def test_more_load_never_makes_the_imprint_smaller(body):
     assert sizes[-1] > sizes[1] > 0
 
 
-@pytest.mark.parametrize("resolution", SIZES)
-@pytest.mark.parametrize("crop", [False, True])
+@pytest.mark.parametrize(
+    ("resolution", "crop"), [((64, 64), False), ((64, 64), True), ((97, 53), False), ((200, 200), True)]
+)
 def test_an_object_that_has_fallen_off_leaves_empty_images(resolution, crop):
     gone = sense(SENSOR, ball(), at(0.12, 0.0, -0.08), weight(0, 0, 0), resolution=resolution, crop=crop)
-    far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), None, resolution=resolution, crop=crop)
+    far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), weight(0, 0, 0), resolution=resolution, crop=crop)
     assert not np.any(gone.segmentation)
     assert np.all(np.isinf(gone.depth))
     assert np.array_equal(gone.visual, far.visual)
@@ -251,9 +252,10 @@ def test_gradients_through_the_load_are_the_finite_differences():
         frame = sts.sense(sensor, body, at(0, 0, 0.03), weight(1.0, 0.0, 0.0) * force)
         return jnp.mean(frame.tactile)
 
-    dark = jax.jit(dark)
-    gradient = jax.grad(dark, argnums=(0, 1))(jnp.float32(2e6), jnp.float32(1.0))
-    by_stiffness = (dark(jnp.float32(2.04e6), jnp.float32(1)) - dark(jnp.float32(1.96e6), jnp.float32(1))) / 0.08e6
-    by_force = (dark(jnp.float32(2e6), jnp.float32(1.02)) - dark(jnp.float32(2e6), jnp.float32(0.98))) / 0.04
+    both = jax.jit(jax.value_and_grad(dark, argnums=(0, 1)))
+    value = lambda stiffness, force: both(jnp.float32(stiffness), jnp.float32(force))[0]  # noqa: E731
+    gradient = both(jnp.float32(2e6), jnp.float32(1.0))[1]
+    by_stiffness = (value(2.04e6, 1.0) - value(1.96e6, 1.0)) / 0.08e6
+    by_force = (value(2e6, 1.02) - value(2e6, 0.98)) / 0.04
     assert float(gradient[0]) == pytest.approx(float(by_stiffness), rel=0.1)
     assert float(gradient[1]) == pytest.approx(float(by_force), rel=0.1)

@@ -73,4 +73,4 @@ def test_transform_is_the_quaternions_rotation_then_the_shift():
     w, v = quat[0], quat[1:]
     turned = points + 2 * np.cross(v, np.cross(v, points) + w * points)
     got = _math.transform(jnp.asarray([0.1, -0.2, 0.3, *quat]), jnp.asarray(points))
-    np.testing.assert_allclose(got, turned + [0.1, -0.2, 0.3], atol=1e-6)
+    np.testing.assert_allclose(got, turned + np.array([0.1, -0.2, 0.3]), atol=1e-6)

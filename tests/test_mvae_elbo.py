@@ -127,7 +127,7 @@ def test_the_loss_is_a_loop_over_subsets_and_samples(asked):
                 total += 0.3 * divergence / BATCH
                 for i, m in enumerate(VECTORS.modalities):
                     if (asked == "all" or i in subset) and known[m.name][b]:
-                        error = np.sum((model.decode(m.name, z, None)[0] - targets[m.name][b]) ** 2)
+                        error = np.mean((model.decode(m.name, z, None)[0] - targets[m.name][b]) ** 2)
                         total += m.weight * error / BATCH
     np.testing.assert_allclose(value, total, rtol=1e-4)
     np.testing.assert_allclose(terms.kl, kl / 7, rtol=1e-4)

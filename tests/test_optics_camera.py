@@ -60,10 +60,10 @@ def test_a_crop_is_the_square_around_the_projected_points():
 
 
 def test_a_crop_stays_in_the_view_and_has_the_images_aspect():
-    left, top, width, height = window_of([[0.06, 0.05, 0.0], [0.2, 0.06, 0.0]])
+    left, _, width, height = window_of([[0.06, 0.05, 0.0], [0.2, 0.06, 0.0]])
     assert left + width == pytest.approx(0.075, abs=1e-6)
     assert width == pytest.approx(height) == pytest.approx(0.015, abs=1e-6)
-    left, top, width, height = window_of([[0.0, 0.0, 0.0], [0.02, 0.02, 0.0]], (50, 100))
+    _, _, width, height = window_of([[0.0, 0.0, 0.0], [0.02, 0.02, 0.0]], (50, 100))
     assert width == pytest.approx(2 * height)
     assert height == pytest.approx(0.02, abs=1e-6)
 

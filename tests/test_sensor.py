@@ -72,9 +72,9 @@ def test_a_bad_field_is_named(tmp_path, field, value):
 
 def test_a_torn_or_missing_file_is_named(tmp_path):
     path = tmp_path / "sensor.json"
-    with pytest.raises(FileNotFoundError, match="sensor.json"):
+    with pytest.raises(FileNotFoundError, match=r"sensor\.json"):
         Sensor.load(path)
     Sensor().save(path)
     path.write_text(path.read_text()[:200])
-    with pytest.raises(ValueError, match=r"sensor.json is torn"):
+    with pytest.raises(ValueError, match=r"sensor\.json is torn"):
         Sensor.load(path)

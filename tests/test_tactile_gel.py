@@ -189,15 +189,13 @@ def test_gradients_are_the_finite_differences(name):
 
 def test_gradients_stay_finite_where_nothing_balances():
     x, y = grid()
+    total = jax.jit(jax.grad(lambda h, w: jnp.sum(tactile.settle(GEL, h, w).pressure), argnums=(0, 1)))
     for height, wrench in [
         (np.full(x.shape, np.inf), push(1, 0, 0)),
         (box(x, y), push(0, 0, 0)),
         (box(x, y), push(50, 0.2, 0)),
     ]:
-        gradient = jax.jit(jax.grad(lambda h, w: jnp.sum(tactile.settle(GEL, h, w).pressure), argnums=(0, 1)))(
-            jnp.asarray(height, jnp.float32), wrench
-        )
-        assert all(jnp.all(jnp.isfinite(g)) for g in gradient)
+        assert all(jnp.all(jnp.isfinite(g)) for g in total(jnp.asarray(height, jnp.float32), wrench))
 
 
 def test_the_pose_alone_indents_by_its_own_depth():

@@ -2,8 +2,8 @@
 
 `L(x_t, x_T) = sum_{X} [ sum_{m asked of X} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
 over the non-empty subsets `X` (paper, "Learning Intuitive Physics with MVAEs"), to be minimised. `E_m` is the
-binary cross-entropy with logits of an image, summed over pixels and channels, or the squared error of a vector,
-summed over components. The batch is averaged, subsets are summed, the expectation is one draw of `z`.
+binary cross-entropy with logits of an image, summed over pixels and channels, or the mean squared error of a
+vector's components. The batch is averaged, subsets are summed, the expectation is one draw of `z`.
 """
 
 from typing import Literal, NamedTuple
@@ -22,7 +22,7 @@ class Terms(NamedTuple):
 
     loss: Float[Array, ""]
     kl: Float[Array, ""]  # nats
-    reconstruction: dict[str, Float[Array, ""]]  # nats per image, squared error per vector
+    reconstruction: dict[str, Float[Array, ""]]  # nats per image, mean squared error per vector
 
 
 class _Group(NamedTuple):
@@ -251,4 +251,4 @@ def _error(modality: Modality, output: Array, target: Array) -> Array:
     if modality.kind == "image":
         error = jax.nn.softplus(output) - output * target
         return jnp.sum(error, axis=(-3, -2, -1))
-    return jnp.sum((output - target) ** 2, axis=-1)
+    return jnp.mean((output - target) ** 2, axis=-1)

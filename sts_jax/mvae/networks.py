@@ -27,6 +27,7 @@ _SIZE = 4  # side of every kernel
 _LAYERS = ((2, 1), (2, 1), (2, 1), (1, 0))  # stride and padding of the encoder; the decoder's backwards
 _EPSILON = 1e-5  # added to a variance
 _LOG_VAR_LIMIT = 8.0  # an encoder's variances lie within exp(-8) .. exp(8)
+_FIRST_LOG_VAR = -4.0  # of an untrained encoder: noise as wide as the prior's teaches the decoder to ignore the latent
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,11 @@ class Modality:
     kind: Literal["image", "vector"]
     shape: tuple[int, ...]  # (height, width, channel), sides multiples of 8 and at least 32; or (size,)
     weight: float = 1.0  # lambda of its reconstruction; the paper: 1 for images, 1000 for the pose
+    start: float = 0.5  # grey value that an image's decoder says at first: the background's saves many steps
 
     def __post_init__(self) -> None:
+        if not 0 < self.start < 1:
+            raise ValueError(f"{self.name}: start={self.start}; a grey value between 0 and 1, both excluded")
         if self.kind == "vector" and len(self.shape) == 1 and self.shape[0] > 0:
             return
         if self.kind == "image" and len(self.shape) == 3:
@@ -160,7 +164,9 @@ class _ImageDecoder(nnx.Module):
             ]
         )
         self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in channels[1:-1]])
-        self.bias = nnx.Param(jnp.zeros(channels[-1], jnp.float32))
+        # An untrained decoder says `start` nearly everywhere.
+        self.kernels[-1][...] *= 0.1
+        self.bias = nnx.Param(jnp.full(channels[-1], math.log(modality.start / (1 - modality.start)), jnp.float32))
 
     def __call__(self, z: Array, weights: Array | None) -> Array:
         x = jax.nn.swish(self.first(z)).reshape(len(z), *self.core)
@@ -247,4 +253,4 @@ def _spread(shape: tuple[int, ...], fan_in: int) -> Array:
 
 def _gaussian(x: Array) -> Gaussian:
     mean, log_var = jnp.split(x, 2, axis=-1)
-    return Gaussian(mean, _LOG_VAR_LIMIT * jnp.tanh(log_var / _LOG_VAR_LIMIT))
+    return Gaussian(mean, _LOG_VAR_LIMIT * jnp.tanh((_FIRST_LOG_VAR + log_var) / _LOG_VAR_LIMIT))

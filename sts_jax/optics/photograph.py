@@ -58,9 +58,9 @@ def photograph(
     winner = rasterise(pixels, -inverse, faces, keep, jnp.asarray(two_sided), shape)
     nearest = jnp.maximum(winner, 0)
     shares = [w * inverse[faces[:, k]][nearest] for k, w in enumerate(barycentrics(pixels, faces, winner))]
-    total = sum(shares)
+    total = shares[0] + shares[1] + shares[2]
     corners = jnp.concatenate([normals, albedo], -1)[nearest]
-    values = sum((w / total)[..., None] * corners[..., k, :] for k, w in enumerate(shares))
+    values = jnp.einsum("hwk,hwkc->hwc", jnp.stack(shares, -1) / total[..., None], corners)
 
     slopes = rays(camera, window, shape)
     ray = jnp.concatenate([slopes, jnp.ones_like(slopes[..., :1])], -1) @ turn

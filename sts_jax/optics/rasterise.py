@@ -88,7 +88,7 @@ def rasterise(
     def body(state: tuple[Array, Array]) -> tuple[Array, Array]:
         base, image = state
         candidate = base + jnp.arange(chunk, dtype=jnp.int32)
-        face = jnp.searchsorted(end, candidate, side="right", method="scan_unrolled").astype(jnp.int32)
+        face = jnp.searchsorted(end, candidate, side="right").astype(jnp.int32)
         live = face < num_faces
         face = jnp.minimum(face, num_faces - 1)
         x0, x1, x2, y0, y1, y2, o0, sx, sy, low, high, row0, cols = jnp.moveaxis(table[face], 1, 0)

@@ -20,17 +20,17 @@ class Room:
     """The light above the sensor, and what the skin does to it on the way to the camera. Constants are ours."""
 
     # light that reaches a surface from all sides, what leaks through and under the object included
-    ambient: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.62, 0.62, 0.64]))
+    ambient: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.36, 0.36, 0.37]))
     # unit vectors from the object towards a window, a lamp and what the table throws back up
     directions: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[-0.75, -0.45, 0.48], [0.6, 0.3, 0.74], [0.35, -0.5, -0.79]])
+        default_factory=lambda: jnp.array([[-0.8, -0.5, 0.1], [0.6, 0.3, 0.74], [0.4, -0.5, -0.77]])
     )
     colors: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[0.75, 0.75, 0.72], [0.3, 0.29, 0.27], [0.32, 0.32, 0.33]])
+        default_factory=lambda: jnp.array([[0.7, 0.7, 0.68], [0.3, 0.29, 0.27], [0.3, 0.3, 0.31]])
     )
     # sRGB of the empty view; the original's (178, 178, 204) / 255
     background: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
-    haze: Scalar = 0.12  # m, height over the skin at which 1/e of an object's own light comes through
+    haze: Scalar = 0.1  # m, height over the skin at which 1/e of an object's own light comes through
     vignette: Scalar = 0.1  # share of light lost at the pad's edge, as the square of the distance from the centre
     rim: Scalar = 0.35  # brightness of what lies beyond the pad's edges, of the background's
 

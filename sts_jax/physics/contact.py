@@ -111,9 +111,11 @@ def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"]) -> Int[Array,
     candidate = jnp.where(depth > jnp.maximum(0, deepest - SKIN), 0.0, -1e3)
     # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
     angle = 0.4 + 2 * np.pi * np.arange(NUM_CONTACTS - 1) / (NUM_CONTACTS - 1)
-    directions = jnp.array(np.stack([np.cos(angle), np.sin(angle)]), points.dtype)
-    score = points[:, :2] @ directions + (STEEP * depth + candidate)[:, None]
-    return jnp.append(jnp.argmax(score, axis=0), jnp.argmax(depth))
+    reach = [x * points[:, 0] + y * points[:, 1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
+    score = jnp.stack([depth, *(r + STEEP * depth for r in reach)]) + candidate
+    # XLA's argmax is slow on CPU: the largest value, then the first place where it stands.
+    places = jnp.where(score == jnp.max(score, axis=1, keepdims=True), jnp.arange(len(depth)), len(depth) - 1)
+    return jnp.min(places, axis=1)
 
 
 def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -133,8 +135,8 @@ def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"]) -> Con
         half: (2,) m, half the pad's size; its top is z = 0.
     """
     rotation = _math.quat_matrix(pose[3:])
-    points = body.vertices @ rotation.T + pose[:3]
-    ends = body.edges @ rotation.T + pose[:3]
+    points = jnp.asarray(body.vertices) @ rotation.T + pose[:3]
+    ends = jnp.asarray(body.edges) @ rotation.T + pose[:3]
     normals = body.planes[:, :3] @ rotation.T
     planes = jnp.concatenate([normals, (body.planes[:, 3] + normals @ pose[:3])[:, None]], axis=1)
     rims = [_rim(ends, half, axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)]

@@ -72,9 +72,7 @@ def _draw(
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
-def _gravity(
-    condition: Float[Array, "n c"], time: Float[np.ndarray, "f s"], scenario: Freefall
-) -> Float[Array, "n f s 3"]:
+def _gravity(condition: Float[Array, "n c"], time: Float[Array, "f s"], scenario: Freefall) -> Float[Array, "n f s 3"]:
     return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
 
 
@@ -202,7 +200,7 @@ def simulate(
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
     _, model, data = scene.template(pad, scenario.contact)
     frame = np.arange(scenario.frames)[:, None] / scenario.rate
-    time = (frame - np.arange(_steps(scenario), 0, -1) * scenario.contact.timestep).astype(np.float32)  # of each step
+    time = jnp.asarray(frame - np.arange(_steps(scenario), 0, -1) * scenario.contact.timestep)  # of each step
 
     def run(starts: Start, fields: dict[str, np.ndarray], indices: np.ndarray) -> tuple[State, Record]:
         padded = np.pad(indices, (0, chunk - len(indices)), "edge")

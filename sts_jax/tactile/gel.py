@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-_NEWTON_STEPS = 12
+_NEWTON_STEPS = 10
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
 _LEVER = 0.02  # m, by which tilts are scaled
 _BOTTOM = 300.0  # how many times stiffer the springs are beyond the deepest imprint

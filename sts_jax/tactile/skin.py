@@ -41,7 +41,7 @@ class Phong:
     specular: Scalar = 0.5  # k_s (paper, as above)
     shininess: Scalar = 5.0  # alpha (paper, as above)
     ambient_color: tuple[Scalar, Scalar, Scalar] = (0.8725, 0.8725, 1.0)  # i_a: a flat gel is (178, 178, 204) / 255
-    darkening: Scalar = 0.0015  # m, depth at which the skin is 1/e as bright; the paper names the mask, not its shape
+    darkening: Scalar = 0.001  # m, depth at which the skin is 1/e as bright; the paper names the mask, not its shape
 
 
 def surface_normals(points: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:

@@ -18,7 +18,7 @@ class Preprocessing:
 
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object instead of the whole pad
-    position_scale: float = 0.05  # m; positions are divided by it, so that they are of the size of a quaternion
+    position_scale: float = 0.1  # m; positions are divided by it, so that they are of the size of a quaternion's parts
     mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is fed, as the paper)
     touch_threshold: float = 3 / 255  # a touch is one where a pixel differs from the blank gel by more than this
     absent: tuple[str, ...] = ()  # modalities that no training input ever had

@@ -1,0 +1,124 @@
+"""Contacts of a hull with the pad, against C MuJoCo's collision of the same mesh."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from sts_jax import _math, physics
+from sts_jax.physics import contact, scene
+
+PAD = (0.15, 0.15)
+HALF = jnp.array([0.075, 0.075])
+
+
+def points(name: str) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    if name == "box":
+        grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.04]
+    elif name == "rod":
+        turn = np.arange(16) * np.pi / 8
+        grid = np.concatenate(
+            [np.stack([0.015 * np.cos(turn), 0.015 * np.sin(turn), 0 * turn + z], 1) for z in (0, 0.1)]
+        )
+    else:
+        grid = rng.normal(size=(30, 3))
+        grid *= 0.03 / np.linalg.norm(grid, axis=1, keepdims=True)
+    return np.concatenate([grid, np.repeat(grid[-1:], 32 - len(grid), axis=0)]).astype(np.float32)
+
+
+def in_c(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    data.qpos[:] = pose
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_collision(model, data)
+    if not data.ncon:
+        return 1.0, np.zeros(3), np.zeros(3)
+    deepest = int(np.argmin(data.contact.dist))
+    return data.contact.dist[deepest], data.contact.frame[deepest, :3], data.contact.pos[deepest]
+
+
+def deepest_in_ours(hull: contact.Hull, poses: np.ndarray) -> tuple[np.ndarray, ...]:
+    found = jax.jit(jax.vmap(contact.collide, in_axes=(None, 0, None)))(hull, poses, HALF)
+    index = jnp.argmin(found.dist, axis=1)
+    rows = jnp.arange(len(poses))
+    return tuple(np.asarray(x) for x in (found.dist[rows, index], found.frame[rows, index, 0], found.pos[rows, index]))
+
+
+def touching(shape: np.ndarray, where: str, depth: float, count: int = 40) -> np.ndarray:
+    """Poses in which the hull is pushed `depth` into the pad, found by bisection of C MuJoCo's distance."""
+    model = scene.compile_scene(shape, PAD, physics.Contact())
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    poses = []
+    for _ in range(count):
+        quat = rng.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        xy = {"middle": rng.uniform(-0.01, 0.01, 2), "rim": [0.075, rng.uniform(-0.02, 0.02)], "corner": [0.075, 0.075]}
+        low, high = -0.1, 0.2
+        for _ in range(30):
+            middle = (low + high) / 2
+            pose = np.array([*xy[where], middle, *quat])
+            low, high = (low, middle) if in_c(model, data, pose)[0] > -depth else (middle, high)
+        poses.append(pose)
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("where", ["middle", "rim", "corner"])
+@pytest.mark.parametrize("name", ["box", "rod", "ball"])
+def test_deepest_contact_is_that_of_c_mujoco(name: str, where: str) -> None:
+    shape = points(name)
+    model = scene.compile_scene(shape, PAD, physics.Contact())
+    poses = touching(shape, where, 0.0005)
+    dist, normal, pos = deepest_in_ours(contact.hull(shape), poses)
+    truth = [in_c(model, mujoco.MjData(model), pose) for pose in poses]
+    near = np.abs(dist - [t[0] for t in truth]) < 2e-5
+    along = np.sum(normal * [t[1] for t in truth], axis=1) > 0.99
+    # A flat or parallel touch has no single point, and two rims near a corner are as good as each other.
+    close = np.linalg.norm(pos - [t[2] for t in truth], axis=1) < 1e-3
+    share = 0.97 if where == "middle" else 0.9
+    assert np.mean(near) >= share
+    assert np.mean(along) >= share
+    assert np.mean(close) >= share
+
+
+@pytest.mark.parametrize("where", ["middle", "rim", "corner"])
+def test_no_contact_where_c_mujoco_has_none(where: str) -> None:
+    shape = points("box")
+    poses = touching(shape, where, 0.0005)
+    poses[:, 2] += 0.003
+    model = scene.compile_scene(shape, PAD, physics.Contact())
+    apart = np.array([in_c(model, mujoco.MjData(model), pose)[0] > 0 for pose in poses])
+    assert apart.mean() > 0.5
+    assert np.all(deepest_in_ours(contact.hull(shape), poses)[0][apart] > 0)
+
+
+def test_a_flat_base_is_supported_all_round() -> None:
+    hull = contact.hull(points("rod"))
+    found = contact.collide(hull, jnp.array([0.01, 0.0, -1e-4, 1.0, 0, 0, 0]), HALF)
+    used = np.asarray(found.pos)[np.asarray(found.dist) < 0] - [0.01, 0, 0]
+    np.testing.assert_allclose(np.asarray(found.dist)[np.asarray(found.dist) < 0], -1e-4, atol=1e-7)
+    angle = np.sort(np.arctan2(used[:, 1], used[:, 0]))
+    assert len(used) >= 7
+    assert np.max(np.diff(np.append(angle, angle[0] + 2 * np.pi))) < np.deg2rad(70)
+
+
+def test_frames_are_right_handed_and_start_with_the_normal() -> None:
+    poses = touching(points("ball"), "rim", 0.0005, count=10)
+    found = jax.vmap(contact.collide, in_axes=(None, 0, None))(contact.hull(points("ball")), poses, HALF)
+    frames = np.asarray(found.frame).reshape(-1, 3, 3)
+    np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (len(frames), 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-5)
+
+
+def test_padding_changes_nothing() -> None:
+    shape = points("box")
+    more = np.concatenate([shape, np.repeat(shape[-1:], 32, axis=0)])
+    pose = jnp.array([0.05, 0.01, 0.0398, *_math.random_quat(jax.random.key(0)) * 0 + jnp.array([1.0, 0, 0, 0])])
+    a, b = (contact.collide(contact.hull(s), pose, HALF) for s in (shape, more))
+    np.testing.assert_array_equal(np.sort(a.dist), np.sort(b.dist))
+
+
+def test_flat_points_are_refused() -> None:
+    with pytest.raises(ValueError, match="no volume"):
+        contact.hull(np.random.default_rng(0).normal(size=(32, 3)) * [1, 1, 0])

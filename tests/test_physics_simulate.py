@@ -1,0 +1,322 @@
+"""Drops: against C MuJoCo, closed forms, and what `simulate` promises."""
+
+import copy
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from sts_jax import objects, physics
+from sts_jax.physics import contact, roll, scene
+from sts_jax.physics.scenarios import G
+from sts_jax.sensor import Sensor
+
+NUM = 6
+PAD = (0.15, 0.15)
+SCENARIO = physics.Freefall()
+ROLL = jax.jit(roll.roll)  # compiled once, for (3, 100) steps
+
+
+@pytest.fixture(scope="module")
+def bodies() -> list[objects.Body]:
+    return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "webcam", "watch"])]
+
+
+@pytest.fixture(scope="module")
+def drops(bodies: list[objects.Body]) -> physics.Trajectory:
+    return jax.tree.map(np.asarray, physics.simulate(jax.random.key(3), bodies, Sensor(), SCENARIO, NUM, chunk=24))
+
+
+def rigid(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[float, np.ndarray, np.ndarray]:
+    mass, com, inertia = objects.rigid(
+        bodies[drops.body[row]], jnp.asarray(drops.hidden.fill[row]), jnp.asarray(drops.hidden.shell_scale[row])
+    )
+    return float(mass), np.asarray(com, np.float64), np.asarray(inertia, np.float64)
+
+
+def c_model(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = scene.compile_scene(np.asarray(bodies[drops.body[row]].hull), PAD, SCENARIO.contact)
+    data = mujoco.MjData(model)
+    scene.set_rigid(model, data, *rigid(bodies, drops, row), float(drops.hidden.friction[row]))
+    return model, data
+
+
+def test_shapes_and_order(drops: physics.Trajectory) -> None:
+    count, frames = 4 * NUM, SCENARIO.frames
+    for name, width in {"pose": 7, "velocity": 6, "wrench": 6, "gravity": 3}.items():
+        assert getattr(drops, name).shape == (count, frames, width)
+    assert drops.condition.shape == (count, 0)
+    np.testing.assert_array_equal(drops.body, np.repeat(np.arange(4), NUM))
+    np.testing.assert_allclose(drops.time[0, :3], [0, 0.025, 0.05])
+    assert drops.outcome.dtype == np.int32
+    np.testing.assert_array_equal(drops.gravity, np.broadcast_to(np.float32([0, 0, -G]), drops.gravity.shape))
+
+
+def test_frame_0_is_at_rest_in_the_air_at_the_stated_height(
+    bodies: list[objects.Body], drops: physics.Trajectory
+) -> None:
+    for row in range(4 * NUM):
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, drops.pose[row, 0, 3:].astype(np.float64))
+        lowest = np.min(np.asarray(bodies[drops.body[row]].hull) @ matrix.reshape(3, 3)[2]) + drops.pose[row, 0, 2]
+        np.testing.assert_allclose(lowest, SCENARIO.height, atol=2e-6)
+    np.testing.assert_allclose(drops.velocity[:, 0], 0, atol=1e-5)
+    assert not drops.contact[:, 0].any()
+    assert not drops.wrench[:, 0].any()
+    assert np.all(np.linalg.norm(drops.pose[:, 0, :2], axis=1) <= SCENARIO.spread + 1e-6)
+
+
+def test_free_flight_is_the_parabola(drops: physics.Trajectory) -> None:
+    fall = 0.5 * G * drops.time[0, :3] * (drops.time[0, :3] + SCENARIO.contact.timestep)
+    np.testing.assert_allclose(drops.pose[:, :3, 2] - drops.pose[:, :1, 2], np.tile(-fall, (4 * NUM, 1)), atol=5e-6)
+
+
+def test_hidden_values_and_outcomes_are_in_range(drops: physics.Trajectory) -> None:
+    for name in ("fill", "shell_scale", "friction"):
+        low, high = getattr(SCENARIO, name)
+        assert np.all((getattr(drops.hidden, name) >= low) & (getattr(drops.hidden, name) <= high))
+    np.testing.assert_array_equal(drops.outcome, jax.vmap(physics.outcome)(drops.pose[:, 0], drops.pose[:, -1]))
+    assert np.mean(drops.touches >= 2) >= 0.75
+    assert np.mean(drops.settled) >= 0.8
+    assert np.all(drops.sunk < 0.003)
+    assert not drops.resampled.any()
+
+
+def test_quaternions_are_unit_with_positive_w(drops: physics.Trajectory) -> None:
+    np.testing.assert_allclose(np.linalg.norm(drops.pose[..., 3:], axis=-1), 1, atol=1e-6)
+    assert np.all(drops.pose[..., 3] >= 0)
+
+
+def test_the_wrench_at_rest_carries_the_weight(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+    rows = np.flatnonzero(drops.settled & (drops.outcome == physics.Outcome.RESTS))
+    assert len(rows) >= 12
+    for row in rows:
+        mass, com, _ = rigid(bodies, drops, row)
+        matrix = np.empty(9)
+        mujoco.mju_quat2Mat(matrix, drops.pose[row, -1, 3:].astype(np.float64))
+        centre = drops.pose[row, -1, :3] + matrix.reshape(3, 3) @ com
+        wrench = drops.wrench[row, -1]
+        np.testing.assert_allclose(wrench[2], mass * G, rtol=0.02)
+        # Moments of the weight about the sensor's origin, to 2 % of it times half the pad.
+        np.testing.assert_allclose(
+            wrench[3:5], mass * G * np.array([centre[1], -centre[0]]), atol=0.02 * mass * G * 0.075
+        )
+
+
+def test_energy_out_of_contact_never_exceeds_the_start_s(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+    for row in range(4 * NUM):
+        mass, com, inertia = rigid(bodies, drops, row)
+        matrix = np.empty((SCENARIO.frames, 9))
+        for own, quat in zip(matrix, drops.pose[row, :, 3:].astype(np.float64), strict=True):
+            mujoco.mju_quat2Mat(own, quat)
+        matrix = matrix.reshape(-1, 3, 3)
+        linear, turn = drops.velocity[row, :, :3], drops.velocity[row, :, 3:]
+        v = linear + np.cross(turn, matrix @ com)
+        w = np.einsum("fji,fj->fi", matrix, turn)
+        energy = 0.5 * mass * np.sum(v**2, 1) + 0.5 * np.einsum("fi,ij,fj->f", w, inertia, w)
+        energy += mass * G * (drops.pose[row, :, 2] + (matrix @ com)[:, 2])
+        free = ~drops.contact[row] & (drops.pose[row, :, 2] > 0)
+        assert np.all(energy[free] <= energy[0] * 1.005)
+
+
+def test_states_are_c_mujoco_s_before_and_shortly_after_the_first_touch(
+    bodies: list[objects.Body], drops: physics.Trajectory
+) -> None:
+    steps = round(1 / SCENARIO.rate / SCENARIO.contact.timestep)
+    before, after = [], []
+    for row in range(4 * NUM):
+        model, data = c_model(bodies, drops, row)
+        data.qpos[:] = drops.pose[row, 0]
+        for frame in range(1, SCENARIO.frames):
+            touched = False
+            for _ in range(steps):
+                mujoco.mj_step(model, data)
+                touched |= data.ncon > 0
+            (after if touched else before).append(np.linalg.norm(data.qpos[:3] - drops.pose[row, frame, :3]))
+            if touched:
+                break
+    assert len(after) == 4 * NUM
+    assert np.max(before) < 2e-5
+    # Within 25 ms of a touch at 1 m/s: nearly all drops strike with a single point.
+    assert np.median(after) < 1e-4
+    assert np.mean(np.array(after) < 1e-3) >= 0.8
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_a_draw_is_a_freshly_compiled_model(scale: float) -> None:
+    constants = physics.Contact()
+    model, like, _ = scene.template(PAD, constants)
+    model = copy.copy(model)
+    mass, com = 0.2 * scale, np.array([0.003, -0.002, 0.01])
+    inertia = scale * (np.diag([2e-4, 3e-4, 1e-4]) + 2e-5)
+    scene.set_rigid(model, mujoco.MjData(model), mass, com, inertia, 0.7)
+    drawn = like.tree_replace(scene.drawn(model, like))
+
+    spec = mujoco.MjSpec.from_string(scene._xml(PAD, constants, ['type="box" size=".01 .01 .01"'] * 2))
+    body = spec.body("object")
+    body.mass, body.ipos = mass, com
+    body.fullinertia = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    for geom in body.geoms:
+        geom.friction[0] = 0.7
+    fresh = scene.mjx.put_model(spec.compile())
+    axes = {"body_iquat", "body_inertia"}  # the same tensor may come with its axes in another order
+    for (path, a), b in zip(jax.tree_util.tree_flatten_with_path(drawn)[0], jax.tree.leaves(fresh), strict=True):
+        name = jax.tree_util.keystr(path, simple=True)
+        if name not in axes and "stat" not in name:
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(np.sort(drawn.body_inertia[1]), np.sort(fresh.body_inertia[1]), rtol=1e-5)
+
+
+def block(mass: float) -> tuple[scene.mjx.Model, scene.mjx.Data, contact.Hull]:
+    grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
+    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])))
+    model, like, data = scene.template(PAD, physics.Contact())
+    model = copy.copy(model)
+    scene.set_rigid(model, mujoco.MjData(model), mass, np.zeros(3), mass * np.diag([1e-4, 2e-4, 3e-4]), 0.5)
+    return like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like))), data, hull
+
+
+def released(height: float) -> roll.State:
+    return roll.initial(jnp.array([0, 0, height, 1, 0, 0, 0]), jnp.zeros(6))
+
+
+CALM = jnp.tile(jnp.array([0, 0, -G]), (3, 100, 1))
+
+
+def test_contact_stiffness_does_not_depend_on_mass() -> None:
+    light, heavy = (0.01 - float(ROLL(*block(mass), released(0.01), CALM)[0].qpos[2]) for mass in (0.01, 1.0))
+    assert 0 < light < 1e-4
+    np.testing.assert_allclose(light, heavy, rtol=0.05)
+
+
+def test_a_step_returns_the_structure_it_received() -> None:
+    state = released(0.01)
+    after = jax.eval_shape(roll.step, *block(0.1), state, jnp.zeros(3))
+    assert jax.tree.structure(after) == jax.tree.structure(state)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
+
+
+def test_what_comes_later_leaves_frame_0_bit_identical() -> None:
+    shaken = CALM.at[1:, :, 0].set(5.0)
+    (_, a), (_, b) = (ROLL(*block(0.1), released(0.01), gravity) for gravity in (CALM, shaken))
+    assert bool(a.contact[0])
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y[0]), a, b)
+    assert not np.array_equal(a.pose[2], b.pose[2])
+
+
+def test_gravity_may_change_with_time() -> None:
+    gravity = jnp.zeros((3, 100, 3)).at[0, :10, 1].set(3.0)
+    _, record = ROLL(*block(0.1), released(1.0), gravity)
+    np.testing.assert_allclose(record.velocity[:, :3], [[0, 0.03, 0]] * 3, atol=1e-6)
+
+
+def test_same_key_same_bytes_and_independent_of_number(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+    again = physics.simulate(jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24)
+    for name in ("pose", "velocity", "wrench", "settled", "touches"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[:3])
+
+
+def test_hidden_rolls_the_same_start_again(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+    hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
+    same = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, hidden=hidden, chunk=24)
+    np.testing.assert_array_equal(same.pose, drops.pose[:NUM])
+    heavy = hidden._replace(fill=np.ones(NUM, np.float32))
+    other = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, hidden=heavy, chunk=24)
+    np.testing.assert_array_equal(other.pose[:, 0], drops.pose[:NUM, 0])
+    assert not np.array_equal(other.pose[:, -1], drops.pose[:NUM, -1])
+
+
+def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body]) -> None:
+    scenario = dataclasses.replace(SCENARIO, spread=0.15)
+    drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24)
+    fell = np.asarray(drops.outcome) == physics.Outcome.FELL_OFF
+    assert 0.1 < fell.mean() < 1
+    gone = fell & np.asarray(drops.settled)
+    np.testing.assert_array_equal(drops.velocity[gone, -1], 0)
+    np.testing.assert_array_equal(drops.wrench[gone, -1], 0)
+    np.testing.assert_array_equal(drops.pose[gone, -1], drops.pose[gone, -2])
+    assert np.all(drops.pose[gone, -1, 2] < -0.01)
+
+
+def test_objects_compile_once(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+    from sts_jax.physics.simulate import _roll
+
+    before = _roll._cache_size()
+    more = [objects.make(jax.random.key(20), "spoon"), objects.make(jax.random.key(21), "mouse")]
+    physics.simulate(jax.random.key(0), more, Sensor(), SCENARIO, 1, chunk=24)
+    assert _roll._cache_size() == before
+
+
+def test_progress_and_resampling(bodies: list[objects.Body], monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    module = sys.modules["sts_jax.physics.simulate"]
+    drops = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24)
+    limit = float(np.sort(drops.sunk)[-2] + np.sort(drops.sunk)[-1]) / 2
+    monkeypatch.setattr(module, "SUNK_LIMIT", limit)
+    done: list[int] = []
+    again = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24, progress=done.append)
+    worst = int(np.argmax(drops.sunk))
+    assert again.resampled[worst] >= 1
+    assert np.all(again.sunk <= limit)
+    np.testing.assert_array_equal(np.delete(again.pose, worst, 0), np.delete(drops.pose, worst, 0))
+    assert done[-1] == NUM
+    monkeypatch.setattr(module, "SUNK_LIMIT", 0.0)
+    monkeypatch.setattr(module, "ATTEMPTS", 1)
+    with pytest.raises(ValueError, match=r"body 0, trajectory 0: .* in 1 draws"):
+        physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24)
+
+
+def test_the_outcome_is_read_from_the_last_pose() -> None:
+    first = jnp.array([0, 0, 0.1, 1, 0, 0, 0])
+    assert int(physics.outcome(first, first.at[2].set(0.001))) == physics.Outcome.RESTS
+    assert int(physics.outcome(first, first.at[2].set(-0.02))) == physics.Outcome.FELL_OFF
+
+
+@pytest.mark.parametrize(
+    ("change", "num", "match"),
+    [
+        ({}, 0, "num is 0"),
+        ({"friction": (-0.1, 0.5)}, 1, r"scenario.friction"),
+        ({"friction": (0.0, 0.5)}, 1, r"scenario.friction"),
+        ({"shell_scale": (1.1, 0.9)}, 1, r"scenario.shell_scale"),
+        ({"fill": (0.0, 1.5)}, 1, r"scenario.fill"),
+        ({"height": float("nan")}, 1, r"scenario.height"),
+        ({"rate": 30.0}, 1, "rate 30"),
+        ({"frames": 0}, 1, r"scenario.frames"),
+    ],
+)
+def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        physics.simulate(jax.random.key(0), bodies[0], Sensor(), dataclasses.replace(SCENARIO, **change), num)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"shell_mass": jnp.float32(-0.1)}, "body 1: shell_mass is -0.1"),
+        ({"shell_mass": jnp.float32(jnp.nan)}, "body 1: shell_mass is nan"),
+        ({"hull": jnp.full((64, 3), jnp.nan)}, "body 1: hull has a non-finite"),
+        ({"hull": jnp.zeros((64, 3))}, "no volume"),
+        ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
+    ],
+)
+def test_bad_bodies_are_named(bodies: list[objects.Body], change: dict, match: str) -> None:
+    bad = dataclasses.replace(bodies[1], **change)
+    with pytest.raises(ValueError, match=match):
+        physics.simulate(jax.random.key(0), [bodies[0], bad], Sensor(), SCENARIO)
+
+
+def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:
+    good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2))
+    with pytest.raises(ValueError, match=r"hidden.fill has shape \(2,\)"):
+        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 3, hidden=good)
+    with pytest.raises(ValueError, match=r"hidden.friction has values outside"):
+        physics.simulate(
+            jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(friction=-np.ones(2))
+        )
+    with pytest.raises(ValueError, match="no body"):
+        physics.simulate(jax.random.key(0), [], Sensor(), SCENARIO)
