@@ -50,12 +50,12 @@ class Contact:
 
     timestep: float = 0.001  # s
     time_constant: float = 0.003  # s, solref; stiff: less than 0.1 mm deep at rest, about 1 mm at impact
-    damping_ratio: float = 0.5  # solref; below 1 the object bounces
+    damping_ratio: float = 0.8  # solref; a gel bounces little: most drops still touch, part and touch again
     soft: float = 0.5  # solimp at first touch; a low one rests deeper than g dt^2 and does not chatter there
     hard: float = 0.99  # solimp at `width`
     width: float = 0.001  # m, solimp
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
-    rolling: float = 0.001  # m, rolling friction: lathed objects come to rest
+    rolling: float = 0.001  # m, rolling friction: a gel brakes what rolls on it, lathed objects come to rest
     impratio: float = 10.0  # stiffness of friction against the normal force: what holds does not creep
     iterations: int = 8  # Newton iterations of one step
     ls_iterations: int = 8  # line-search iterations of one Newton iteration

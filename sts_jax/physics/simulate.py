@@ -181,7 +181,8 @@ def simulate(
         num: trajectories of each body.
         hidden: (bodies * num,) each, body-major: rolls the starts of `key` with these instead of drawn ones.
         progress: called with the number of trajectories done so far, after each chunk.
-        chunk: trajectories that MJX steps at once; another number compiles anew. Larger ones suit a GPU.
+        chunk: trajectories that MJX steps at once; another number compiles anew and rounds
+            differently. Larger ones suit a GPU.
 
     Returns:
         bodies * num trajectories, body-major.
