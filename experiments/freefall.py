@@ -21,8 +21,8 @@ from sts_jax import dataset, physics, training
 
 DEFAULT = stages.Config(
     collection=dataset.Collection(physics.Freefall(), num_objects=240, num_per_object=4, num_full=20),
-    training=training.TrainConfig(batch_size=32, learning_rate=1e-3, schedule="cosine", clip=1000.0),
-    steps=(400, 400, 300, 100),
+    training=training.TrainConfig(batch_size=16, learning_rate=3e-3, schedule="cosine"),
+    steps=(1000, 450, 450, 120),
 )
 SMOKE = dataclasses.replace(
     DEFAULT,

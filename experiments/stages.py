@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -97,6 +96,10 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
         folder = model_folder(workdir, name, config, split)
         training.save_blank(folder, blank.visual, blank.tactile)
         with Bar() as bar:
+
+            def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = folder.name) -> None:
+                bar(f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else "")
+
             training.train(
                 schedule,
                 model_config(modalities, config.collection.resolution),
@@ -105,9 +108,7 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
                 absent=preprocessing.absent,
                 targets=config.targets,
                 preprocessing=dataclasses.asdict(preprocessing),
-                progress=lambda done, total, record, bar=bar, name=folder.name: bar(
-                    f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else ""
-                ),
+                progress=show,
             )
 
 
@@ -229,24 +230,28 @@ def predict(
 ) -> evaluation.Predicted:
     """What a model says of the held-out trajectories; its outcome from the pose, or from whether its image is empty."""
 
-    def run(pairs: dataset.Pairs) -> sts.Prediction:
-        first = {"visual": pairs.visual[:, 0] / 255, "tactile": pairs.tactile[:, 0] / 255, "pose": pairs.pose[:, 0]}
-        if names:
-            out = predictor(**{name: first[name] for name in names})
-        else:
-            out = predictor.prior((len(pairs.object),))
-        return jax.tree.map(np.asarray, out)
+    def run(pairs: dataset.Pairs) -> evaluation.Predicted:
+        out = (
+            predictor(
+                visual=pairs.visual[:, 0] / 255 if "visual" in names else None,
+                tactile=pairs.tactile[:, 0] / 255 if "tactile" in names else None,
+                pose=pairs.pose[:, 0] if "pose" in names else None,
+            )
+            if names
+            else predictor.prior((len(pairs.object),))
+        )
+        return evaluation.Predicted(
+            *(None if leaf is None else np.asarray(leaf) for leaf in (out.visual, out.tactile, out.pose))
+        )
 
-    out = run(test)
+    out, outcome = run(test), None
     if out.pose is not None:
         outcome = evaluation.outcome_of_pose(test.pose[:, 0], out.pose)
     elif out.visual is not None:
-        score = evaluation.emptiness(run(validation).visual, blank)
+        score = evaluation.emptiness(np.asarray(run(validation).visual), blank)
         threshold = evaluation.metrics.best_threshold(score, validation.outcome != int(sts.physics.Outcome.FELL_OFF))
         outcome = evaluation.outcome_of_image(out.visual, blank, threshold)
-    else:
-        outcome = None
-    return evaluation.Predicted(out.visual, out.tactile, out.pose, outcome)
+    return out._replace(outcome=outcome)
 
 
 def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:

@@ -85,7 +85,7 @@ def predict(
         )
 
     result = decode(posterior.mean, lead)
-    if num_samples:
+    if num_samples and key is not None:
         noise = jax.random.normal(key, (num_samples, *posterior.mean.shape))
         z = posterior.mean[None] + jnp.exp(0.5 * posterior.log_var)[None] * noise
         result = result._replace(samples=decode(z, (num_samples, *lead)))

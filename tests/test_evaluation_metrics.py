@@ -27,7 +27,7 @@ def test_excess_is_the_divergence_summed_pixel_by_pixel():
                     count += 1
         assert error.bce[i] == pytest.approx(bce, rel=1e-9)
         assert error.excess[i] == pytest.approx(excess, rel=1e-9)
-        assert error.count[i] == count
+        assert error.pixels[i] == count
 
 
 def test_a_perfect_prediction_has_no_excess_and_full_skill():

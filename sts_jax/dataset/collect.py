@@ -226,7 +226,10 @@ def _render(
     report: Callable[[int], None],
 ) -> Iterator[records.Images]:
     """Render `frames` in order, a fixed number a call; one thread a core, since a call keeps one core busy."""
-    turned = [(np.asarray(turn(trajectory.pose, q)), np.asarray(turn_wrench(trajectory.wrench, q))) for q in range(4)]
+    turned = [
+        tuple(np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench)))
+        for q in range(4)
+    ]
 
     def batches() -> Iterator[tuple[objects.Body, np.ndarray, np.ndarray, int]]:
         owner = trajectory.body[frames[:, 0]]

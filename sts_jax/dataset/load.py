@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from sts_jax.dataset import records
@@ -87,13 +88,15 @@ class Dataset:
         row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
         wanted = [(int(t), quarter) for t in trajectories for quarter in quarters]
         rows = np.array([[row_of[t, 0, q], row_of[t, last, q]] for t, q in wanted], np.int64).reshape(-1, 2)
-        images = self.images(rows.ravel())
+        images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(rows.ravel())]
         index = np.array([t for t, _ in wanted], np.int64)
-        ends = self.trajectory["pose"][:, [0, last]]
+        ends = jnp.asarray(self.trajectory["pose"][:, [0, last]])
         turned = np.stack([np.asarray(turn(ends, quarter)) for quarter in quarters])
         quarter_of = np.array([q for _, q in wanted], np.int64)
         return Pairs(
-            *(leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in images),
+            visual=images[0],
+            tactile=images[1],
+            segmentation=images[2],
             pose=turned[quarter_of, index].astype(np.float32),
             contact=self.trajectory["contact"][:, [0, last]][index],
             outcome=self.trajectory["outcome"][index],

@@ -142,7 +142,8 @@ def line_up(
         num: How many rows.
         seed: Of sides and other candidates.
     """
-    assert predicted.visual is not None and predicted.tactile is not None
+    if predicted.visual is None or predicted.tactile is None:
+        raise ValueError("a line-up needs a prediction of both streams; give one of a model that has both.")
     rng = np.random.default_rng(seed)
     num = min(num, len(test.visual))
     figure, axes = plt.subplots(num, 6, figsize=(9.5, 1.5 * num + 0.6), squeeze=False)

@@ -19,7 +19,7 @@ class ImageError(NamedTuple):
 
     bce: np.ndarray  # (n,) nats, summed over pixels and channels
     excess: np.ndarray  # (n,)
-    count: np.ndarray  # (n,) how many pixels times channels
+    pixels: np.ndarray  # (n,) how many pixels times channels
 
 
 def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> ImageError:

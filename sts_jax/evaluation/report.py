@@ -159,12 +159,10 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
 
 # The figures of a predictor: per stream BCE and excess (nats a pixel and channel), skill over all pixels and over the
 # target's object pixels; position (m) and angle (rad) over all items and over those that stayed on the pad.
-FIGURES = tuple(
-    f"{stream}_{figure}{pixels}"
-    for stream in ("visual", "tactile")
-    for figure in ("bce", "excess", "skill")
-    for pixels in ("", "_object")
-) + ("position", "position_on_pad", "angle", "angle_on_pad", "outcome_balanced_accuracy")
+FIGURES = (
+    *(f"{s}_{f}{p}" for s in ("visual", "tactile") for f in ("bce", "excess", "skill") for p in ("", "_object")),
+    *("position", "position_on_pad", "angle", "angle_on_pad", "outcome_balanced_accuracy"),
+)
 
 
 def _figures(s: Scores, constant: Scores, test: Pairs, stayed: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -174,7 +172,8 @@ def _figures(s: Scores, constant: Scores, test: Pairs, stayed: np.ndarray, weigh
         references = [getattr(constant, stream), getattr(constant, f"{stream}_object")]
         for kind in ("bce", "excess"):
             out += [
-                float("nan") if e is None else metrics.mean_per_pixel(getattr(e, kind), e.count, weight) for e in errors
+                float("nan") if e is None else metrics.mean_per_pixel(getattr(e, kind), e.pixels, weight)
+                for e in errors
             ]
         out += [
             float("nan") if e is None else metrics.skill(e, r, weight) for e, r in zip(errors, references, strict=True)
@@ -212,7 +211,7 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
         "intervals, bootstrapped over objects. BCE and excess are nats a pixel and channel; skill is 1 - excess / "
         "excess of the constant.",
         "",
-        "| predictor | " + " | ".join(h[0] for h in heads) + " |",
+        f"| predictor | {' | '.join(h[0] for h in heads)} |",
         "|---" * (len(heads) + 1) + "|",
     ]
     for name, row in summary["predictors"].items():

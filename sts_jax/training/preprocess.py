@@ -41,9 +41,13 @@ class Preprocessing:
 
 
 def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
-    """Store what the sensor shows with nothing on it, `uint8 (height, width, 3)` each."""
-    folder.mkdir(parents=True, exist_ok=True)
-    np.savez(folder / "blank.npz", visual=visual, tactile=tactile)
+    """Store what the sensor shows with nothing on it, `uint8 (height, width, 3)` each; once, a second time not."""
+    path = folder / "blank.npz"
+    if not path.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name("blank.partial.npz")
+        np.savez(temporary, visual=visual, tactile=tactile)
+        temporary.replace(path)
 
 
 def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +62,9 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         with np.load(path, allow_pickle=False) as arrays:
             return arrays["visual"], arrays["tactile"]
     except (zipfile.BadZipFile, KeyError, ValueError, EOFError) as error:
-        raise ValueError(f"{path} is torn ({error}); start the training again, it writes the file anew.") from error
+        raise ValueError(
+            f"{path} is torn ({error}); delete it and start the training again: it writes it anew."
+        ) from error
 
 
 def preprocessing_from_json(content: dict) -> Preprocessing:
