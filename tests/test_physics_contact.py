@@ -11,6 +11,7 @@ from sts_jax.physics import contact, scene
 
 PAD = (0.15, 0.15)
 HALF = jnp.array([0.075, 0.075])
+COLLIDE = jax.jit(jax.vmap(contact.collide, in_axes=(None, 0, None)))
 
 
 def points(name: str) -> np.ndarray:
@@ -39,7 +40,7 @@ def in_c(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> tuple[
 
 
 def deepest_in_ours(hull: contact.Hull, poses: np.ndarray) -> tuple[np.ndarray, ...]:
-    found = jax.jit(jax.vmap(contact.collide, in_axes=(None, 0, None)))(hull, poses, HALF)
+    found = COLLIDE(hull, poses, HALF)
     index = jnp.argmin(found.dist, axis=1)
     rows = jnp.arange(len(poses))
     return tuple(np.asarray(x) for x in (found.dist[rows, index], found.frame[rows, index, 0], found.pos[rows, index]))
@@ -105,7 +106,7 @@ def test_a_flat_base_is_supported_all_round() -> None:
 
 def test_frames_are_right_handed_and_start_with_the_normal() -> None:
     poses = touching(points("ball"), "rim", 0.0005, count=10)
-    found = jax.vmap(contact.collide, in_axes=(None, 0, None))(contact.hull(points("ball")), poses, HALF)
+    found = COLLIDE(contact.hull(points("ball")), poses, HALF)
     frames = np.asarray(found.frame).reshape(-1, 3, 3)
     np.testing.assert_allclose(frames @ frames.transpose(0, 2, 1), np.tile(np.eye(3), (len(frames), 1, 1)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(frames), 1, atol=1e-5)

@@ -51,9 +51,7 @@ class Contact:
     timestep: float = 0.001  # s
     time_constant: float = 0.003  # s, solref; stiff: less than 0.1 mm deep at rest, about 1 mm at impact
     damping_ratio: float = 0.8  # solref; a gel bounces little: most drops still touch, part and touch again
-    soft: float = (
-        0.9  # solimp at first touch; objects with a bump rock at 0.5, flat ones chatter at 0.95 if they bounce more
-    )
+    soft: float = 0.9  # solimp at first touch; at 0.5 objects with a bump rock on, at 0.95 flat ones can chatter
     hard: float = 0.99  # solimp at `width`
     width: float = 0.001  # m, solimp
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
