@@ -1,0 +1,67 @@
+"""What a touch tells: the mass of held-out objects read from their uint8 tactile frames at rest.
+
+    python -m benchmarks.touch [runs/freefall/dataset]
+
+Ridge regression of log mass on simple image features (sums, sizes, depths), fitted on training objects; the share of
+imprint pixels at 0 or 255; both over the last frames of settled objects on the pad.
+"""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sts_jax import dataset, objects, physics
+
+
+def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
+    """Simple numbers of tactile images `uint8 (n, h, w, 3)`: how much, how wide and how deep the imprint is."""
+    ratio = np.clip(tactile.astype(np.float64), 1, 255) / blank.astype(np.float64)
+    darkness = np.clip(-np.log(ratio).min(-1), 0, None)
+    signed = -np.log(ratio).mean(-1)
+    touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
+    size = touched.sum((1, 2))
+    sums = [(darkness * touched).sum((1, 2)), np.clip((signed * touched).sum((1, 2)), 0.05, None), size + 1.0]
+    sums += [(np.clip(signed, 0, None) * touched).sum((1, 2)) + 0.05]
+    columns = [np.log(np.clip(s, 0.05, None)) for s in sums] + [darkness.max((1, 2)), signed.max((1, 2))]
+    x = np.stack(columns, 1)
+    return np.concatenate([x, x[:, :4] ** 2, x[:, :1] * x[:, 2:3]], 1)
+
+
+def main(folder: str) -> None:
+    """Print the share of variance explained and the share of saturated pixels."""
+    data = dataset.load(folder)
+    names = {f: data.collection[f] for f in ("num_objects", "seed")}
+    collection = dataset.Collection(num_objects=names["num_objects"], seed=names["seed"])
+    bodies = dataset.make_bodies(collection, np.arange(collection.num_objects))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *bodies)
+    owner = data.trajectory["body"]
+    mass, _, _ = jax.vmap(objects.rigid)(
+        jax.tree.map(lambda x: x[owner], stacked), data.hidden["fill"], data.hidden["shell_scale"]
+    )
+    log_mass = np.log(np.asarray(mass))
+    last = data.trajectory["pose"].shape[1] - 1
+    rests = (data.trajectory["outcome"] == int(physics.Outcome.RESTS)) & data.trajectory["settled"]
+    rests &= data.trajectory["contact"][:, last]
+    x, y = {}, {}
+    imprints = []
+    for part in ("train", "test"):
+        pairs = data.pairs(np.array([i for i in data.members(part) if rests[i]]))
+        tactile = pairs.tactile[:, 1]
+        blank = np.median(pairs.tactile[:, 0].reshape(-1, *tactile.shape[1:]), axis=0).astype(np.uint8)
+        x[part], y[part] = features(tactile, blank), log_mass[pairs.trajectory]
+        touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
+        imprints.append(np.any((tactile == 0) | (tactile == 255), -1)[touched])
+    centre, scale = x["train"].mean(0), x["train"].std(0)
+    a, b = (x["train"] - centre) / scale, (x["test"] - centre) / scale
+    level = y["train"].mean()
+    weights = np.linalg.solve(a.T @ a + 1.0 * np.eye(a.shape[1]), a.T @ (y["train"] - level))
+    error = y["test"] - level - b @ weights
+    explained = 1 - (error**2).sum() / ((y["test"] - y["test"].mean()) ** 2).sum()
+    print(f"log mass from uint8 touch, {len(error)} held-out rests: R2 {explained:.3f}, rmse {error.std():.3f}")
+    print(f"imprint pixels at 0 or 255 in a channel: {100 * np.concatenate(imprints).mean():.2f} %")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1] if len(sys.argv) > 1 else "runs/freefall/dataset")
