@@ -347,8 +347,10 @@ def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Se
     index = int(stays[0] if len(stays) else full[0])
     images = data.strip(index)
     body = dataset.make_bodies(config.collection, data.trajectory["body"][[index]])[0]
-    size = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
-    view = np.stack([np.asarray(evaluation.outside(body, pose, size)) for pose in data.trajectory["pose"][index]])
+    size = jnp.array(sensor.gel.size)
+    view = np.stack(
+        [np.asarray(evaluation.outside(body, jnp.asarray(pose), size)) for pose in data.trajectory["pose"][index]]
+    )
     category = sts.objects.CATEGORIES[int(body.category)]
     evaluation.figures.strip(
         path,

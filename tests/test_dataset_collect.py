@@ -9,7 +9,7 @@ import pytest
 
 import sts_jax as sts
 from sts_jax import _math, dataset
-from sts_jax.dataset import collect as rooms
+from sts_jax.dataset.collect import turn, turn_wrench
 
 SMALL = dataset.Collection(
     sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2
@@ -40,7 +40,7 @@ def test_frames_are_those_that_sense_draws(folder):
     body = dataset.make_bodies(SMALL, np.array([2]))[0]
     for quarter in range(4):
         pose = pairs.pose[quarter, 1]
-        wrench = rooms.turn_wrench(jnp.asarray(data.trajectory["wrench"][5, -1]), quarter)
+        wrench = turn_wrench(jnp.asarray(data.trajectory["wrench"][5, -1]), quarter)
         frame = jax.jit(lambda p, w: sts.sense(sts.Sensor(), body, p, w))(jnp.asarray(pose), wrench)
         for stored, drawn in ((pairs.visual, frame.visual), (pairs.tactile, frame.tactile)):
             difference = np.abs(stored[quarter, 1].astype(int) - np.round(np.asarray(drawn) * 255))
@@ -61,10 +61,10 @@ def test_a_turn_turns_position_orientation_and_wrench():
     pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), _math.random_quat(key)])
     point = jnp.array([0.005, -0.01, 0.02])
     x, y, z = np.asarray(_math.transform(pose, point))
-    turned = rooms.turn(pose, 1)
+    turned = turn(pose, 1)
     np.testing.assert_allclose(_math.transform(turned, point), [-y, x, z], atol=1e-7)
     wrench = jnp.array([1.0, 2, 3, 4, 5, 6])
-    np.testing.assert_allclose(rooms.turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
+    np.testing.assert_allclose(turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
 
 
 def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):

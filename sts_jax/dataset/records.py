@@ -80,7 +80,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         TornFileError: The file is not a whole `.npz`; delete it and collect again.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             return dict(arrays)
     except FileNotFoundError:
         raise
@@ -103,16 +103,16 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path} is missing; delete {path.with_suffix('.npz').name} and collect again.")
-    reader = ArrayRecordReader(str(path))
+    torn = f"{path} is torn; delete it and {path.with_suffix('.npz').name} and start the collection again"
     try:
-        if reader.num_records() != total:
-            raise TornFileError(
-                f"{path} holds {reader.num_records()} frames instead of {total}; "
-                f"delete it and {path.with_suffix('.npz').name} and start the collection again."
-            )
-        records = reader.read([int(i) for i in indices]) if len(indices) else []
-    finally:
+        reader = ArrayRecordReader(str(path))
+        count = reader.num_records()
+        records = reader.read([int(i) for i in indices]) if count == total and len(indices) else []
         reader.close()
+    except (RuntimeError, ValueError, IndexError) as error:
+        raise TornFileError(f"{torn}: {error}.") from error
+    if count != total:
+        raise TornFileError(f"{torn}: it holds {count} frames instead of {total}.")
     height, width = resolution
     size = height * width * 3
     data = np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)

@@ -17,20 +17,20 @@ _HOUSING = jnp.array([0.05, 0.05, 0.055])
 
 @functools.partial(jax.jit, static_argnames=("resolution",))
 def outside(
-    body: Body, pose: Float[Array, "7"], size: tuple[float, float], *, resolution: tuple[int, int] = (160, 160)
+    body: Body, pose: Float[Array, "7"], size: Float[Array, "2"], *, resolution: tuple[int, int] = (160, 160)
 ) -> Float[Array, "h w 3"]:
     """A picture of the object and the pad from outside, three-quarter view.
 
     Args:
         body: The object.
         pose: Mesh frame in the sensor frame.
-        size: Of the pad along x and y (m).
+        size: Of the pad along x and y (m), `(2,)`.
         resolution: (height, width), pixels.
 
     Returns:
         Image, sRGB in [0, 1].
     """
-    half = jnp.array([size[0], size[1], _THICKNESS]) / 2
+    half = jnp.stack([size[0], size[1], jnp.float32(_THICKNESS)]) / 2
     corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)], jnp.float32)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     box = jnp.asarray(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), jnp.int32)

@@ -1,6 +1,7 @@
 """What happens to a measurement before a network sees it: stored with every checkpoint."""
 
 import dataclasses
+import io
 import json
 import zipfile
 from pathlib import Path
@@ -59,7 +60,7 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     path = folder / "blank.npz"
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             return arrays["visual"], arrays["tactile"]
     except (zipfile.BadZipFile, KeyError, ValueError, EOFError) as error:
         raise ValueError(
