@@ -20,14 +20,14 @@ from experiments import stages
 from sts_jax import dataset, physics, training
 
 DEFAULT = stages.Config(
-    collection=dataset.Collection(physics.Freefall(), num_objects=240, num_per_object=4, num_full=20),
-    training=training.TrainConfig(batch_size=16, learning_rate=3e-3, schedule="cosine"),
-    steps=(1000, 450, 450, 120),
+    collection=dataset.Collection(physics.Freefall(), num_objects=320, num_per_object=4, num_full=20, seed=1),
+    training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
+    steps=(1150, 350, 450, 100),
 )
 SMOKE = dataclasses.replace(
     DEFAULT,
     collection=dataset.Collection(
-        physics.Freefall(), num_objects=16, num_per_object=2, num_full=1, objects_per_shard=8, quarter_turns=False
+        physics.Freefall(), num_objects=16, num_per_object=2, num_full=1, objects_per_shard=8, symmetries=False
     ),
     training=dataclasses.replace(DEFAULT.training, batch_size=8, log_every=2, checkpoint_every=4),
     steps=(8, 8, 8, 8),
@@ -38,7 +38,7 @@ PAPER = stages.Config(
         num_objects=340,
         num_per_object=5,  # 1,700 trajectories
         num_full=1700,  # of about 60 frames of both streams
-        quarter_turns=False,
+        symmetries=False,
         crop=True,
         objects_per_shard=20,
     ),

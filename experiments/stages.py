@@ -86,7 +86,7 @@ def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
 
 def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
     """Train the models of the paper's Table 1 on one split."""
-    pairs = data.pairs(parts(data, split)["train"], turns=True)
+    pairs = data.pairs(parts(data, split)["train"], symmetries=True)
     blank = empty_frame(sensor, config.collection)
     for number, (name, modalities) in enumerate(MODELS.items()):
         arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
@@ -161,7 +161,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         return done.read_text()
     part = parts(data, split)
     train_pairs, validation, test = (
-        data.pairs(part["train"], turns=True),
+        data.pairs(part["train"], symmetries=True),
         data.pairs(part["validation"]),
         data.pairs(part["test"]),
     )
@@ -259,7 +259,7 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
 
     Args:
         config: The experiment.
-        drops: Trajectories to simulate; each has its first and last frame and their quarter turns rendered.
+        drops: Trajectories to simulate; each has its first and last frame rendered in all symmetries.
         steps: Gradient steps of each model.
 
     Returns:
@@ -272,7 +272,7 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
         spent: dict[str, list[float]] = {"drops": [], "frames": []}
         for seed in (0, 1):
             little = dataclasses.replace(
-                collection, num_objects=kinds, num_per_object=drops // kinds, num_full=0, quarter_turns=True, seed=seed
+                collection, num_objects=kinds, num_per_object=drops // kinds, num_full=0, symmetries=True, seed=seed
             )
             stamps = {"start": time.perf_counter()}
 
@@ -284,11 +284,11 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
             spent["drops"].append(stamps["drops"] - stamps["start"])
             spent["frames"].append(stamps["frames"] - stamps["drops"])
         last = collection.scenario.frames
-        ends = collection.num_trajectories * (8 if collection.quarter_turns else 2)
+        ends = collection.num_trajectories * 2 * (dataset.SYMMETRIES if collection.symmetries else 1)
         frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
         for stage, total, measured in (
             ("drops", collection.num_trajectories, drops),
-            ("frames", frames, 8 * drops),
+            ("frames", frames, 2 * dataset.SYMMETRIES * drops),
         ):
             first, again = spent[stage]
             rate = measured / again
@@ -301,10 +301,10 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
         tiny = dataclasses.replace(
             config, collection=dataclasses.replace(collection, num_objects=kinds), splits=("trajectory",)
         )
-        pairs = data.pairs(np.arange(drops), turns=True)
+        pairs = data.pairs(np.arange(drops), symmetries=True)
         blank = empty_frame(sensor, collection)
         share = 0.7 if config.splits[0] == "object" else 0.8
-        samples = round(share * collection.num_trajectories) * (4 if collection.quarter_turns else 1)
+        samples = round(share * collection.num_trajectories) * (dataset.SYMMETRIES if collection.symmetries else 1)
         for number, (model, modalities) in enumerate(MODELS.items()):
             arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
             stamps_of_steps = [time.perf_counter()]

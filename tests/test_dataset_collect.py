@@ -35,17 +35,18 @@ def test_every_object_is_in_one_part_and_shares_are_kept():
 def test_frames_are_those_that_sense_draws(folder):
     data = dataset.load(folder)
     assert data.trajectory["pose"].shape == (8, 12, 7)
-    pairs = data.pairs(np.array([5, 0]), turns=True)
-    assert pairs.visual.shape == (8, 2, 64, 64, 3)
+    pairs = data.pairs(np.array([5, 0]), symmetries=True)
+    assert pairs.visual.shape == (16, 2, 64, 64, 3)
     body = dataset.make_bodies(SMALL, np.array([2]))[0]
-    for quarter in range(4):
-        pose = pairs.pose[quarter, 1]
-        wrench = turn_wrench(jnp.asarray(data.trajectory["wrench"][5, -1]), quarter)
-        frame = jax.jit(lambda p, w: sts.sense(sts.Sensor(), body, p, w))(jnp.asarray(pose), wrench)
+    sense = jax.jit(lambda body, pose, wrench: sts.sense(sts.Sensor(), body, pose, wrench))
+    for symmetry in range(8):
+        pose = pairs.pose[symmetry, 1]
+        wrench = turn_wrench(jnp.asarray(data.trajectory["wrench"][5, -1]), symmetry)
+        frame = sense(sts.objects.mirror(body) if symmetry >= 4 else body, jnp.asarray(pose), wrench)
         for stored, drawn in ((pairs.visual, frame.visual), (pairs.tactile, frame.tactile)):
-            difference = np.abs(stored[quarter, 1].astype(int) - np.round(np.asarray(drawn) * 255))
+            difference = np.abs(stored[symmetry, 1].astype(int) - np.round(np.asarray(drawn) * 255))
             assert np.mean(difference > 1) < 0.01
-    np.testing.assert_array_equal(pairs.trajectory, [5] * 4 + [0] * 4)
+    np.testing.assert_array_equal(pairs.trajectory, [5] * 8 + [0] * 8)
     np.testing.assert_array_equal(pairs.object, data.trajectory["body"][pairs.trajectory])
 
 
@@ -53,7 +54,7 @@ def test_all_frames_of_the_full_ones_and_two_of_the_others(folder):
     data = dataset.load(folder)
     np.testing.assert_array_equal(data.full_trajectories(), [0])
     assert data.strip(0).visual.shape == (12, 64, 64, 3)
-    assert len(data.frames) == 12 + 7 * 2 + 8 * 6
+    assert len(data.frames) == 12 + 7 * 2 + 8 * 14
 
 
 def test_a_turn_turns_position_orientation_and_wrench():
@@ -65,6 +66,18 @@ def test_a_turn_turns_position_orientation_and_wrench():
     np.testing.assert_allclose(_math.transform(turned, point), [-y, x, z], atol=1e-7)
     wrench = jnp.array([1.0, 2, 3, 4, 5, 6])
     np.testing.assert_allclose(turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
+
+
+def test_a_mirrored_pose_and_body_are_the_mirror_image_in_the_sensor_frame():
+    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), _math.random_quat(jax.random.key(4))])
+    point, arm, force = jnp.array([0.005, -0.01, 0.02]), jnp.array([0.3, -0.2, 0.1]), jnp.array([1.0, 2, 3])
+    flip = jnp.array([1.0, -1, 1])
+    np.testing.assert_allclose(
+        _math.transform(turn(pose, 4), point * flip), _math.transform(pose, point) * flip, atol=1e-7
+    )
+    wrench = jnp.concatenate([force, jnp.cross(arm, force)])
+    image = jnp.concatenate([force * flip, jnp.cross(arm * flip, force * flip)])
+    np.testing.assert_allclose(turn_wrench(wrench, 4), image, atol=1e-6)
 
 
 def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):

@@ -105,3 +105,23 @@ def test_stack_refuses_two_classes(tmp_path):
     trimesh.creation.box((0.06, 0.04, 0.1)).export(path)
     with pytest.raises(ValueError, match="body 1 is of another class"):
         objects.stack([objects.make(jax.random.key(0), "bottle"), objects.load(path)])
+
+
+def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):
+    body, solid = jar
+    other = solid.copy()
+    other.vertices *= [1, -1, 1]
+    other.invert()  # counter-clockwise from outside again
+    other.export(tmp_path / "other.stl")
+    got, truth = objects.mirror(body), objects.load(tmp_path / "other.stl")
+    faces = np.asarray(got.faces)
+    assert trimesh.Trimesh(np.asarray(got.vertices, float), faces[faces.any(1)]).volume == pytest.approx(solid.volume)
+    for a, b in zip(objects.rigid(got, 0.4, 1.1), objects.rigid(truth, 0.4, 1.1), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(np.ptp(got.hull, 0), np.ptp(truth.hull, 0), rtol=1e-5)
+    corner = np.asarray(got.vertices)[faces[faces.any(1)]]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    assert (np.einsum("fi,fci->fc", normal, np.asarray(got.normals)[faces.any(1)]) > 0).all()
+    again = objects.mirror(got)
+    for a, b in zip(jax.tree.leaves(body), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)

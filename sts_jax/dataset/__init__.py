@@ -1,5 +1,6 @@
 """Collections on disk: made shard by shard, read as arrays."""
 
+from sts_jax.dataset.collect import SYMMETRIES as SYMMETRIES
 from sts_jax.dataset.collect import Collection as Collection
 from sts_jax.dataset.collect import Progress as Progress
 from sts_jax.dataset.collect import claim as claim
@@ -16,6 +17,7 @@ from sts_jax.dataset.records import write_arrays as write_arrays
 from sts_jax.dataset.records import write_whole as write_whole
 
 __all__ = [
+    "SYMMETRIES",
     "Collection",
     "Dataset",
     "Images",

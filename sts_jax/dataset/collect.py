@@ -22,6 +22,9 @@ from sts_jax.sensor import Sensor
 
 # Frames rendered by one compiled call.
 RENDER_BATCH = 32
+# The pad is square and gravity vertical: a fall turned by quarter turns, or mirrored, is a fall. Number s is turned by
+# s % 4 x 90 degrees about z, after having been mirrored (y becomes -y) if s >= 4.
+SYMMETRIES = 8
 SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
 
 
@@ -33,7 +36,7 @@ class Collection:
     num_objects: int = 160  # procedural objects; the eight categories in turn
     num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
     num_full: int = 20  # trajectories with every frame rendered; of the others the first and the last
-    quarter_turns: bool = True  # see also each trajectory turned by 90, 180, 270 degrees: the pad is square
+    symmetries: bool = True  # see each trajectory in all SYMMETRIES of the square pad, or only as it is
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
     objects_per_shard: int = 40
@@ -79,19 +82,23 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     return {name: np.sort(part).astype(np.int64) for name, part in zip(SPLITS, parts, strict=True)}
 
 
-def turn(pose: Float[Array, "*n 7"], quarter: int) -> Float[Array, "*n 7"]:
-    """A pose turned about the sensor's z axis by `quarter` x 90 degrees."""
-    spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, quarter * math.pi / 2]))
+def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
+    """A pose under a symmetry of the pad; that of a mirrored one belongs to `objects.mirror` of the body."""
+    if symmetry >= 4:
+        pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
+    spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
     position = _math.transform(jnp.concatenate([jnp.zeros(3), spin]), pose[..., :3])
     spin = jnp.broadcast_to(spin, (*pose.shape[:-1], 4))
     return jnp.concatenate([position, _math.quat_canonical(_math.quat_multiply(spin, pose[..., 3:]))], -1)
 
 
-def turn_wrench(wrench: Float[Array, "*n 6"], quarter: int) -> Float[Array, "*n 6"]:
-    """A wrench about the sensor's origin, turned like `turn`."""
-    spin = jnp.concatenate([jnp.zeros(3), _math.quat_from_rotvec(jnp.array([0.0, 0.0, quarter * math.pi / 2]))])
+def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n 6"]:
+    """A wrench about the sensor's origin under a symmetry of the pad."""
+    if symmetry >= 4:
+        wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
+    spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
     pair = wrench.reshape(*wrench.shape[:-1], 2, 3)
-    return _math.transform(spin, pair).reshape(wrench.shape)
+    return _math.transform(jnp.concatenate([jnp.zeros(3), spin]), pair).reshape(wrench.shape)
 
 
 def collect(
@@ -203,7 +210,7 @@ def _make_shard(
 
 
 def _frames_of(collection: Collection, first_object: int, trajectory: physics.Trajectory) -> np.ndarray:
-    """Which frames are rendered: rows of (trajectory, frame, quarter turns), trajectory counted in the shard."""
+    """Which frames are rendered: rows of (trajectory, frame, symmetry), trajectory counted in the shard."""
     num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
     rows = []
     for i in range(num):
@@ -212,9 +219,11 @@ def _frames_of(collection: Collection, first_object: int, trajectory: physics.Tr
         rank = repeat * collection.num_objects + first_object + object_index
         full = rank < collection.num_full
         rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
-        if collection.quarter_turns:
-            rows += [(i, t, quarter) for quarter in (1, 2, 3) for t in (0, last)]
-    return np.array(rows, np.int32)
+        if collection.symmetries:
+            rows += [(i, t, symmetry) for symmetry in range(1, SYMMETRIES) for t in (0, last)]
+    frames = np.array(rows, np.int32)
+    # Object by object, its mirror image after it: what is drawn in one call.
+    return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
 
 
 def _render(
@@ -228,19 +237,20 @@ def _render(
     """Render `frames` in order, a fixed number a call; one thread a core, since a call keeps one core busy."""
     turned = [
         tuple(np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench)))
-        for q in range(4)
+        for q in range(SYMMETRIES)
     ]
+    mirrored = [objects.mirror(body) for body in bodies] if collection.symmetries else bodies
 
     def batches() -> Iterator[tuple[objects.Body, np.ndarray, np.ndarray, int]]:
-        owner = trajectory.body[frames[:, 0]]
-        for body_index in np.unique(owner):
-            rows = frames[owner == body_index]
+        owner = np.stack([trajectory.body[frames[:, 0]], frames[:, 2] >= 4], 1)
+        for body_index, flip in np.unique(owner, axis=0):
+            rows = frames[(owner == [body_index, flip]).all(1)]
             for start in range(0, len(rows), RENDER_BATCH):
                 part = rows[start : start + RENDER_BATCH]
                 padded = np.concatenate([part, np.repeat(part[-1:], RENDER_BATCH - len(part), 0)])
                 pose = np.stack([turned[q][0][i, t] for i, t, q in padded])
                 wrench = np.stack([turned[q][1][i, t] for i, t, q in padded])
-                yield bodies[body_index], pose, wrench, len(part)
+                yield (mirrored if flip else bodies)[body_index], pose, wrench, len(part)
 
     def work(job: tuple[objects.Body, np.ndarray, np.ndarray, int]) -> records.Images:
         body, pose, wrench, count = job
@@ -266,9 +276,14 @@ def render_uint8(
     crop: bool,
 ) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
     """Frames of one object as they are stored: visual and tactile in `uint8`, segmentation in bool."""
-    frame = jax.vmap(lambda p, w: sense(sensor, body, p, w, resolution=resolution, crop=crop))(pose, wrench)
-    to_uint8 = lambda image: jnp.round(image * 255).astype(jnp.uint8)  # noqa: E731
-    return to_uint8(frame.visual), to_uint8(frame.tactile), frame.segmentation
+
+    def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        frame = sense(sensor, body, *item, resolution=resolution, crop=crop)
+        visual, tactile = (jnp.round(image * 255).astype(jnp.uint8) for image in (frame.visual, frame.tactile))
+        return visual, tactile, frame.segmentation
+
+    # On a CPU, one frame after the other is twice as quick as all at once.
+    return jax.lax.map(one, (pose, wrench), batch_size=1 if jax.default_backend() == "cpu" else len(pose))
 
 
 def _report(progress: Callable[[Progress], None] | None, before: int, total: int, stage: str) -> Callable[[int], None]:

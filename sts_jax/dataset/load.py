@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax.dataset import records
-from sts_jax.dataset.collect import turn
+from sts_jax.dataset.collect import SYMMETRIES, turn
 
 
 class Pairs(NamedTuple):
-    """First and last moment of some trajectories, in memory; `n` is trajectories times quarter turns."""
+    """First and last moment of some trajectories, in memory; `n` is trajectories times symmetries."""
 
     visual: np.ndarray  # uint8 (n, 2, height, width, 3): first, last
     tactile: np.ndarray  # uint8 (n, 2, height, width, 3)
@@ -34,7 +34,7 @@ class Dataset:
     split: dict[str, np.ndarray]  # name -> object indices
     trajectory: dict[str, np.ndarray]  # physics.Trajectory's leaves, all shards: (num, ...)
     hidden: dict[str, np.ndarray]  # physics.Hidden's leaves, (num,)
-    frames: np.ndarray  # int (m, 3): trajectory, frame, quarter turns of every stored image, in order of the shards
+    frames: np.ndarray  # int (m, 3): trajectory, frame, symmetry of every stored image, in order of the shards
     shards: tuple[Path, ...]
     shard_of: np.ndarray  # int (m,): which shard holds it
     record_of: np.ndarray  # int (m,): where in it
@@ -76,28 +76,28 @@ class Dataset:
             raise ValueError(f"unknown part {part!r} of the dataset: one of {', '.join(self.split)}.")
         return np.flatnonzero(np.isin(self.trajectory["body"], self.split[part]))
 
-    def pairs(self, trajectories: np.ndarray, *, turns: bool = False) -> Pairs:
+    def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
         """First and last frame of some trajectories.
 
         Args:
             trajectories: Their indices.
-            turns: Each also turned by 90, 180 and 270 degrees, where the collection rendered that.
+            symmetries: Each also turned and mirrored as the square pad allows, where the collection rendered that.
         """
         last = self.trajectory["pose"].shape[1] - 1
-        quarters = range(4) if turns and self.collection["quarter_turns"] else range(1)
+        kinds = range(SYMMETRIES) if symmetries and self.collection["symmetries"] else range(1)
         row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
-        wanted = [(int(t), quarter) for t in trajectories for quarter in quarters]
+        wanted = [(int(t), kind) for t in trajectories for kind in kinds]
         rows = np.array([[row_of[t, 0, q], row_of[t, last, q]] for t, q in wanted], np.int64).reshape(-1, 2)
         images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(rows.ravel())]
         index = np.array([t for t, _ in wanted], np.int64)
         ends = jnp.asarray(self.trajectory["pose"][:, [0, last]])
-        turned = np.stack([np.asarray(turn(ends, quarter)) for quarter in quarters])
-        quarter_of = np.array([q for _, q in wanted], np.int64)
+        turned = np.stack([np.asarray(turn(ends, kind)) for kind in kinds])
+        kind_of = np.array([q for _, q in wanted], np.int64)
         return Pairs(
             visual=images[0],
             tactile=images[1],
             segmentation=images[2],
-            pose=turned[quarter_of, index].astype(np.float32),
+            pose=turned[kind_of, index].astype(np.float32),
             contact=self.trajectory["contact"][:, [0, last]][index],
             outcome=self.trajectory["outcome"][index],
             object=self.trajectory["body"][index],

@@ -27,7 +27,12 @@ _SIZE = 4  # side of every kernel
 _LAYERS = ((2, 1), (2, 1), (2, 1), (1, 0))  # stride and padding of the encoder; the decoder's backwards
 _EPSILON = 1e-5  # added to a variance
 _LOG_VAR_LIMIT = 8.0  # an encoder's variances lie within exp(-8) .. exp(8)
-_FIRST_LOG_VAR = -4.0  # of an untrained encoder: noise as wide as the prior's teaches the decoder to ignore the latent
+# An untrained model uses a few of its latents only, with little noise; the others start near the prior and can grow.
+# With all of them in use the divergence (hundreds of nats) outweighs what an image can tell, and with noise as wide as
+# the prior's a decoder learns to ignore the latent: either way the posterior collapses before anything is learnt.
+_ACTIVE = 16  # latents in use at first
+_QUIET = 0.03  # kernels of the others, of an active one's
+_FIRST_LOG_VAR = -4.0  # of an active one
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,28 @@ class _Linear(nnx.Module):
         return x @ self.kernel[...] + self.bias[...][None]
 
 
+class _ToLatent(_Linear):
+    """An encoder's last layer: mean and log variance of each latent."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(config.hidden, 2 * config.latent)
+        active = jnp.arange(config.latent) < _ACTIVE
+        self.kernel[...] *= jnp.tile(jnp.where(active, 1.0, _QUIET), 2)
+        self.bias[config.latent :] = jnp.where(active, _FIRST_LOG_VAR, 0.0)
+
+
+class _FromLatent(_Linear):
+    """A decoder's first layer, from the latent with the condition behind it."""
+
+    def __init__(self, config: Config, size: int) -> None:
+        super().__init__(config.latent + config.condition, size)
+        rows = jnp.arange(config.latent + config.condition)
+        heard = (rows < _ACTIVE) | (rows >= config.latent)
+        self.kernel[...] = jnp.where(heard, 1.0, _QUIET)[:, None] * _spread(
+            self.kernel.shape, min(_ACTIVE, config.latent) + config.condition
+        )
+
+
 class BatchNorm(nnx.Module):
     """Batch normalisation with a weight per sample.
 
@@ -142,7 +169,7 @@ class _ImageEncoder(nnx.Module):
         )
         self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in config.widths])
         self.first = _Linear(math.prod(_core(modality)) * config.widths[-1], config.hidden)
-        self.second = _Linear(config.hidden, 2 * config.latent)
+        self.second = _ToLatent(config)
 
     def __call__(self, x: Array, weights: Array | None) -> Gaussian:
         for kernel, norm, (stride, padding) in zip(self.kernels, self.norms, _LAYERS, strict=True):
@@ -156,7 +183,7 @@ class _ImageDecoder(nnx.Module):
     def __init__(self, modality: Modality, config: Config) -> None:
         channels = (*config.widths[::-1], modality.shape[2])
         self.core = (*_core(modality), channels[0])
-        self.first = _Linear(config.latent + config.condition, math.prod(self.core))
+        self.first = _FromLatent(config, math.prod(self.core))
         self.kernels = nnx.List(
             [
                 nnx.Param(_spread((_SIZE, _SIZE, a, b), (_SIZE // stride) ** 2 * a))
@@ -182,7 +209,7 @@ class _VectorEncoder(nnx.Module):
 
     def __init__(self, modality: Modality, config: Config) -> None:
         self.first = _Linear(modality.shape[0], config.hidden)
-        self.second = _Linear(config.hidden, 2 * config.latent)
+        self.second = _ToLatent(config)
 
     def __call__(self, x: Array, weights: Array | None) -> Gaussian:
         del weights
@@ -193,7 +220,7 @@ class _VectorDecoder(nnx.Module):
     """Two fully connected layers."""
 
     def __init__(self, modality: Modality, config: Config) -> None:
-        self.first = _Linear(config.latent + config.condition, config.hidden)
+        self.first = _FromLatent(config, config.hidden)
         self.second = _Linear(config.hidden, modality.shape[0])
 
     def __call__(self, z: Array, weights: Array | None) -> Array:
@@ -253,4 +280,4 @@ def _spread(shape: tuple[int, ...], fan_in: int) -> Array:
 
 def _gaussian(x: Array) -> Gaussian:
     mean, log_var = jnp.split(x, 2, axis=-1)
-    return Gaussian(mean, _LOG_VAR_LIMIT * jnp.tanh((_FIRST_LOG_VAR + log_var) / _LOG_VAR_LIMIT))
+    return Gaussian(mean, _LOG_VAR_LIMIT * jnp.tanh(log_var / _LOG_VAR_LIMIT))

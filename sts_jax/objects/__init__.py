@@ -1,6 +1,16 @@
 """Objects: what falls on the sensor, made from a key or loaded from a mesh file."""
 
-from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, HULL_CLASSES, NUM_FILLS, TEXTURE_CLASSES, Body, rigid, stack
+from sts_jax.objects.body import (
+    CATEGORIES,
+    FACE_CLASSES,
+    HULL_CLASSES,
+    NUM_FILLS,
+    TEXTURE_CLASSES,
+    Body,
+    mirror,
+    rigid,
+    stack,
+)
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
 from sts_jax.objects.solids import fill_moments, hull_gap
@@ -16,6 +26,7 @@ __all__ = [
     "hull_gap",
     "load",
     "make",
+    "mirror",
     "rigid",
     "stack",
 ]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 # Padding classes. Two bodies of one class have leaves of equal shape, so whatever is compiled for one serves the
 # other. A padding face is (0, 0, 0): it has no area and covers no pixel. A padding vertex (of `vertices`, which are
 # as many as the faces, or of `hull`) repeats the last one, so that extents need no mask.
-FACE_CLASSES = (2048, 8192, 32768, 131072)
+FACE_CLASSES = (1024, 4096, 16384, 131072)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
 # Fill levels at which the contents' moments are tabulated: 0, 1/32, ... 1 of the interior's volume.
@@ -71,6 +71,26 @@ def stack(bodies: Sequence[Body]) -> Body:
                 f"{len(bodies[0].faces)}, {len(bodies[0].hull)}, {len(bodies[0].texture)}): stack each class by itself"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
+
+
+def mirror(body: Body) -> Body:
+    """The body's mirror image: y becomes -y in the mesh frame, for one body or with leading axes."""
+    flip = jnp.array([1.0, -1, 1])
+    corners = jnp.array([0, 2, 1])  # so that faces stay counter-clockwise from outside
+    # V, Vx, Vy, Vz, Vxx, Vyy, Vzz, Vxy, Vxz, Vyz
+    moments = jnp.array([1.0, 1, -1, 1, 1, 1, 1, -1, 1, -1])
+    return dataclasses.replace(
+        body,
+        vertices=body.vertices * flip,
+        faces=body.faces[..., corners],
+        normals=body.normals[..., corners, :] * flip,
+        colors=body.colors[..., corners, :],
+        uv=body.uv[..., corners, :],
+        hull=body.hull * flip,
+        shell_com=body.shell_com * flip,
+        shell_inertia=body.shell_inertia * flip[:, None] * flip,
+        contents=body.contents * moments,
+    )
 
 
 def rigid(

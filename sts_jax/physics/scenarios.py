@@ -46,7 +46,7 @@ class Freefall:
     """
 
     height: float = 0.05  # m, lowest point of the object above the pad in frame 0
-    spread: float = 0.03  # m, radius of the disc from which the object's origin is drawn
+    spread: float = 0.05  # m, radius of the disc from which the object's origin is drawn
     rate: float = 31.25  # frames/s: 32 steps of 1 ms; 60 frames are 1.9 s, after which few objects still move
     frames: int = 60
     fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume

@@ -55,7 +55,7 @@ class Contact:
     hard: float = 0.99  # solimp at `width`
     width: float = 0.001  # m, solimp
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
-    rolling: float = 0.001  # m, rolling friction: a gel brakes what rolls on it, lathed objects come to rest
+    rolling: float = 0.002  # m, rolling friction: a gel brakes what rolls on it, lathed objects come to rest
     impratio: float = 10.0  # stiffness of friction against the normal force: what holds does not creep
     iterations: int = 8  # Newton iterations of one step
     ls_iterations: int = 8  # line-search iterations of one Newton iteration

@@ -33,6 +33,9 @@ class TrainConfig:
     b1: float = 0.9  # Adam
     b2: float = 0.999
     epsilon: float = 1e-8
+    # Of the encoders' parameters, in nats: Adam makes steps of full length of any gradient, however small beta makes
+    # the divergence's, so that encoders collapse during the warm-up; gradients far below this one move them little.
+    encoder_epsilon: float = 1.0
     clip: float | None = None  # largest global norm of the gradient
     beta_warmup: float = 0.25  # share of the steps over which beta goes from 0 to 1 (paper: 50 of 200 epochs)
     seed: int = 0
@@ -99,7 +102,9 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
         rate = optax.cosine_decay_schedule(config.learning_rate, total)
-    adam = optax.adam(rate, b1=config.b1, b2=config.b2, eps=config.epsilon)
+    rates = {"encoders": config.encoder_epsilon, "decoders": config.epsilon}
+    parts = {name: optax.adam(rate, b1=config.b1, b2=config.b2, eps=epsilon) for name, epsilon in rates.items()}
+    adam = optax.partition(parts, lambda params: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, params))
     return adam if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adam)
 
 
