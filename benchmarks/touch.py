@@ -9,7 +9,6 @@ imprint pixels at 0 or 255; both over the last frames of settled objects on the 
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sts_jax import dataset, objects, physics
@@ -29,36 +28,40 @@ def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
     return np.concatenate([x, x[:, :4] ** 2, x[:, :1] * x[:, 2:3]], 1)
 
 
+def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0) -> np.ndarray:
+    """What a ridge regression of y on the standardised x says of x_new."""
+    centre, scale, level = x.mean(0), x.std(0), y.mean()
+    a, b = (x - centre) / scale, (x_new - centre) / scale
+    return level + b @ np.linalg.solve(a.T @ a + penalty * np.eye(a.shape[1]), a.T @ (y - level))
+
+
+def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
+    """Of every imprint pixel of images `uint8 (n, h, w, 3)`, whether a channel is at 0 or 255."""
+    touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
+    return np.any((tactile == 0) | (tactile == 255), -1)[touched]
+
+
 def main(folder: str) -> None:
     """Print the share of variance explained and the share of saturated pixels."""
     data = dataset.load(folder)
-    names = {f: data.collection[f] for f in ("num_objects", "seed")}
-    collection = dataset.Collection(num_objects=names["num_objects"], seed=names["seed"])
+    collection = dataset.Collection(num_objects=data.collection["num_objects"], seed=data.collection["seed"])
     bodies = dataset.make_bodies(collection, np.arange(collection.num_objects))
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *bodies)
     owner = data.trajectory["body"]
     mass, _, _ = jax.vmap(objects.rigid)(
-        jax.tree.map(lambda x: x[owner], stacked), data.hidden["fill"], data.hidden["shell_scale"]
+        jax.tree.map(lambda x: x[owner], objects.stack(bodies)), data.hidden["fill"], data.hidden["shell_scale"]
     )
     log_mass = np.log(np.asarray(mass))
-    last = data.trajectory["pose"].shape[1] - 1
     rests = (data.trajectory["outcome"] == int(physics.Outcome.RESTS)) & data.trajectory["settled"]
-    rests &= data.trajectory["contact"][:, last]
-    x, y = {}, {}
-    imprints = []
+    rests &= data.trajectory["contact"][:, -1]
+    x, y, imprints = {}, {}, []
     for part in ("train", "test"):
         pairs = data.pairs(np.array([i for i in data.members(part) if rests[i]]))
         tactile = pairs.tactile[:, 1]
-        blank = np.median(pairs.tactile[:, 0].reshape(-1, *tactile.shape[1:]), axis=0).astype(np.uint8)
+        blank = np.median(pairs.tactile[:, 0], axis=0).astype(np.uint8)
         x[part], y[part] = features(tactile, blank), log_mass[pairs.trajectory]
-        touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
-        imprints.append(np.any((tactile == 0) | (tactile == 255), -1)[touched])
-    centre, scale = x["train"].mean(0), x["train"].std(0)
-    a, b = (x["train"] - centre) / scale, (x["test"] - centre) / scale
-    level = y["train"].mean()
-    weights = np.linalg.solve(a.T @ a + 1.0 * np.eye(a.shape[1]), a.T @ (y["train"] - level))
-    error = y["test"] - level - b @ weights
-    explained = 1 - (error**2).sum() / ((y["test"] - y["test"].mean()) ** 2).sum()
+        imprints.append(saturated(tactile, blank))
+    error = y["test"] - ridge(x["train"], y["train"], x["test"])
+    explained = 1 - np.mean(error**2) / y["test"].var()
     print(f"log mass from uint8 touch, {len(error)} held-out rests: R2 {explained:.3f}, rmse {error.std():.3f}")
     print(f"imprint pixels at 0 or 255 in a channel: {100 * np.concatenate(imprints).mean():.2f} %")
 

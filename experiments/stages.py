@@ -185,7 +185,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     evaluation.figures.predictions(figures / "predictions.png", test, shown, num=config.num_shown, title=title)
     category = np.array([int(i) % len(sts.objects.CATEGORIES) for i in test.object])
     best = rows[both] if both in rows else rows[single]
-    evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category)
+    evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category, blank)
     logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
     evaluation.figures.training_curves(figures / "training.png", logs)
     if split == config.splits[0]:

@@ -124,6 +124,7 @@ def line_up(
     test: Pairs,
     predicted: Predicted,
     category: np.ndarray,
+    blank: np.ndarray,
     *,
     num: int = 10,
     seed: int = 0,
@@ -139,6 +140,8 @@ def line_up(
         test: Held-out trajectories.
         predicted: Predictions of the same.
         category: The category of each, `(n,)`.
+        blank: The visual image of the empty sensor, in [0, 1]; the prediction is also shown with four times its
+            difference from it, since a blurred one is faint.
         num: How many rows.
         seed: Of sides and other candidates.
     """
@@ -146,7 +149,7 @@ def line_up(
         raise ValueError("a line-up needs a prediction of both streams; give one of a model that has both.")
     rng = np.random.default_rng(seed)
     num = min(num, len(test.visual))
-    figure, axes = plt.subplots(num, 6, figsize=(9.5, 1.5 * num + 0.6), squeeze=False)
+    figure, axes = plt.subplots(num, 7, figsize=(11, 1.5 * num + 0.6), squeeze=False)
     answers = []
     for row in range(num):
         same = np.flatnonzero((category == category[row]) & (np.arange(len(category)) != row))
@@ -158,10 +161,11 @@ def line_up(
         a, b = sides if right == 0 else sides[::-1]
         images = [
             predicted.visual[row],
+            blank + 4 * (predicted.visual[row] - blank),
             predicted.tactile[row],
             *(stream[i, 1] / 255 for i in (a, b) for stream in (test.visual, test.tactile)),
         ]
-        heads = ["prediction", "(touch)", "A", "(touch)", "B", "(touch)"]
+        heads = ["prediction", "contrast x 4", "(touch)", "A", "(touch)", "B", "(touch)"]
         for axis, image, head in zip(axes[row], images, heads, strict=True):
             _show(axis, image)
             if row == 0:

@@ -35,8 +35,8 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
     weight = np.ones(x.shape[:3]) if mask is None else mask.astype(np.float64)
     bce = -(x * np.log(p) + (1 - x) * np.log1p(-p))
     entropy = -(_xlogx(x) + _xlogx(1 - x))
-    total = lambda values: (values.sum(-1) * weight).sum((1, 2))  # noqa: E731
-    return ImageError(total(bce), total(bce - entropy), 3 * weight.sum((1, 2)))
+    total, excess = ((values.sum(-1) * weight).sum((1, 2)) for values in (bce, bce - entropy))
+    return ImageError(total, excess, 3 * weight.sum((1, 2)))
 
 
 def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = None) -> float:

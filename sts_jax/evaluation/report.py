@@ -217,13 +217,19 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     for name, row in summary["predictors"].items():
         cells = [_cell(row[key], scale, digits, "skill" in key) for _, key, scale, digits in heads]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    shown = [h for h in heads if h[1] in ("visual_skill", "visual_skill_object", "tactile_skill", "position", "angle")]
-    shown += [("tactile on object", "tactile_skill_object", 1, 3)]
+    shown = [
+        ("visual skill", "visual_skill", 1, 3),
+        ("visual on object", "visual_skill_object", 1, 3),
+        ("tactile skill", "tactile_skill", 1, 3),
+        ("tactile on object", "tactile_skill_object", 1, 3),
+        ("position (mm)", "position", 1e3, 1),
+        ("angle (deg)", "angle", 180 / np.pi, 0),
+    ]
     lines += [
         "",
         "Differences from the baselines (skill: positive is better; errors: negative is better):",
         "",
-        "| predictor | against | " + " | ".join(h[0].replace("on object", "visual on object") for h in shown) + " |",
+        f"| predictor | against | {' | '.join(h[0] for h in shown)} |",
         "|---" * (len(shown) + 2) + "|",
     ]
     for name, against in summary["differences"].items():
@@ -236,5 +242,5 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
 def _cell(figure: dict | None, scale: float, digits: int, with_interval: bool) -> str:
     if figure is None:
         return "-"
-    show = lambda key: f"{figure[key] * scale:.{digits}f}"  # noqa: E731
-    return f"{show('value')} [{show('low')}, {show('high')}]" if with_interval else show("value")
+    value, low, high = (f"{figure[key] * scale:.{digits}f}" for key in ("value", "low", "high"))
+    return f"{value} [{low}, {high}]" if with_interval else value
