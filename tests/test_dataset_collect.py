@@ -104,5 +104,5 @@ def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):
 
 def test_another_collection_in_the_same_folder_is_refused(folder):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
-    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.03, asked for now is 0\.02"):
+    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, asked for now is 0\.02"):
         dataset.collect(other, sts.Sensor(), folder)
