@@ -65,7 +65,7 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
         axis.set_xlabel("gradient step")
         axis.set_ylabel(units.get(key, "nats an item"))
         axis.set_title(key, fontsize=9)
-        if key != "kl":
+        if key in ("loss", "pose"):
             axis.set_yscale("log")
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=7)
@@ -107,7 +107,7 @@ def strip(
                 axes[row, column].set_ylabel(name, fontsize=8)
         axes[0, column].set_title(f"{time[t]:.2f} s", fontsize=8)
         axes[3, column].remove()
-    force = figure.add_subplot(4, 1, 4)
+    force = figure.add_subplot(axes[0, 0].get_gridspec()[3, :])
     for k, name in enumerate(("$F_x$", "$F_y$", "$F_z$")):
         force.plot(time, wrench[:, k], label=name, linewidth=1)
     force.set_xlabel("time (s)")

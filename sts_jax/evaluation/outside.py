@@ -47,9 +47,9 @@ def outside(
         faces,
         normals,
         albedo,
-        eye=jnp.array([0.16, 0.34, 0.24]),
-        target=jnp.array([0.0, 0.0, 0.012]),
-        fov=0.46,
+        eye=jnp.array([0.25, 0.53, 0.38]),
+        target=jnp.array([0.0, 0.0, 0.03]),
+        fov=0.44,
         resolution=resolution,
         two_sided=body.two_sided,
     )
