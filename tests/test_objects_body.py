@@ -108,12 +108,14 @@ def test_stack_refuses_two_classes(tmp_path):
 
 
 def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):
-    body, solid = jar
+    _, solid = jar
     other = solid.copy()
     other.vertices *= [1, -1, 1]
     other.invert()  # counter-clockwise from outside again
-    other.export(tmp_path / "other.stl")
-    got, truth = objects.mirror(body), objects.load(tmp_path / "other.stl")
+    for name, mesh in (("one", solid), ("other", other)):
+        mesh.export(tmp_path / f"{name}.stl")
+    body, truth = (objects.load(tmp_path / f"{name}.stl") for name in ("one", "other"))
+    got = objects.mirror(body)
     faces = np.asarray(got.faces)
     assert trimesh.Trimesh(np.asarray(got.vertices, float), faces[faces.any(1)]).volume == pytest.approx(solid.volume)
     for a, b in zip(objects.rigid(got, 0.4, 1.1), objects.rigid(truth, 0.4, 1.1), strict=True):

@@ -106,7 +106,7 @@ class _ToLatent(_Linear):
     def __init__(self, config: Config) -> None:
         super().__init__(config.hidden, 2 * config.latent)
         active = jnp.arange(config.latent) < _ACTIVE
-        self.kernel[...] *= jnp.tile(jnp.where(active, 1.0, _QUIET), 2)
+        self.kernel[...] *= jnp.tile(jnp.where(active, 1.0, _QUIET), 2)[None]
         self.bias[config.latent :] = jnp.where(active, _FIRST_LOG_VAR, 0.0)
 
 

@@ -88,7 +88,7 @@ def mirror(body: Body) -> Body:
         uv=body.uv[..., corners, :],
         hull=body.hull * flip,
         shell_com=body.shell_com * flip,
-        shell_inertia=body.shell_inertia * flip[:, None] * flip,
+        shell_inertia=body.shell_inertia * jnp.outer(flip, flip),
         contents=body.contents * moments,
     )
 
