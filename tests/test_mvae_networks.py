@@ -82,3 +82,21 @@ def test_batch_norm_without_a_present_sample_changes_nothing():
     assert np.isfinite(norm(x, jnp.zeros(2))).all()
     np.testing.assert_array_equal(norm.mean[...], 0)
     np.testing.assert_array_equal(norm.var[...], 1)
+
+
+def test_an_untrained_model_uses_a_few_quiet_latents_and_leaves_the_others_at_the_prior():
+    graphdef, params, stats = mvae.init(jax.random.key(1), PAPER)
+    images = jax.random.uniform(jax.random.key(2), (8, 64, 64, 3))
+    posterior = mvae.infer(graphdef, nnx.merge_state(params, stats), {"visual": images})
+    variance = np.exp(posterior.log_var)
+    assert (variance[:, :16] < 0.2).all()
+    # The prior's own precision and an expert's of variance 1 make one half.
+    np.testing.assert_allclose(variance[:, 16:], 0.5, atol=0.02)
+    assert np.abs(posterior.mean[:, 16:]).max() < 0.05
+    decoded = [
+        mvae.decode(graphdef, nnx.merge_state(params, stats), jnp.zeros((1, 256)).at[0, k].set(1.0))["pose"]
+        for k in (3, 100)
+    ]
+    nothing = mvae.decode(graphdef, nnx.merge_state(params, stats), jnp.zeros((1, 256)))["pose"]
+    heard, quiet = (float(np.linalg.norm(d - nothing)) for d in decoded)
+    assert heard > 10 * quiet > 0
