@@ -1,5 +1,8 @@
 """Bodies for the tests of optics, tactile and frame, straight from trimesh's primitives."""
 
+import importlib.util
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -70,3 +73,11 @@ def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
     padded = np.pad(np.where(np.isfinite(depth), depth, 1e9), 1, constant_values=1e9)
     around = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
     return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
+
+
+def public_meshes() -> Path:
+    """miniworld's folder of meshes (Farama Foundation, Apache 2.0); its code wants a display and is not run."""
+    found = importlib.util.find_spec("miniworld")
+    assert found is not None, "the test extra is not installed: pip install -e .[test]"
+    assert found.origin is not None
+    return Path(found.origin).parent / "meshes"

@@ -1,14 +1,13 @@
 """The whole line at the smallest size: from drops to a table, resumed, refused, and called as the README calls it."""
 
 import dataclasses
-import importlib.util
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from optics_bodies import public_meshes
 
 import sts_jax as sts
 from experiments import freefall, stages
@@ -82,10 +81,7 @@ def test_what_is_promised_to_callers_runs(workdir):
 
 
 def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
-    spec = importlib.util.find_spec("miniworld")
-    assert spec is not None
-    assert spec.origin is not None
-    meshes = Path(spec.origin).parent / "meshes"
+    meshes = public_meshes()
     body = sts.objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
     sensor = sts.Sensor()
     traj = sts.physics.simulate(jax.random.key(2), body, sensor, physics.Freefall(), num=4)

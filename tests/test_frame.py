@@ -253,9 +253,11 @@ def test_gradients_through_the_load_are_the_finite_differences():
         return jnp.mean(frame.tactile)
 
     both = jax.jit(jax.value_and_grad(dark, argnums=(0, 1)))
-    value = lambda stiffness, force: both(jnp.float32(stiffness), jnp.float32(force))[0]  # noqa: E731
-    gradient = both(jnp.float32(2e6), jnp.float32(1.0))[1]
-    by_stiffness = (value(2.04e6, 1.0) - value(1.96e6, 1.0)) / 0.08e6
-    by_force = (value(2e6, 1.02) - value(2e6, 0.98)) / 0.04
+    cases = {"here": (2e6, 1.0), "stiffer": (2.04e6, 1.0), "softer": (1.96e6, 1.0)}
+    cases |= {"heavier": (2e6, 1.02), "lighter": (2e6, 0.98)}
+    found = {name: both(jnp.float32(k), jnp.float32(force)) for name, (k, force) in cases.items()}
+    value, gradient = {name: v for name, (v, _) in found.items()}, found["here"][1]
+    by_stiffness = (value["stiffer"] - value["softer"]) / 0.08e6
+    by_force = (value["heavier"] - value["lighter"]) / 0.04
     assert float(gradient[0]) == pytest.approx(float(by_stiffness), rel=0.1)
     assert float(gradient[1]) == pytest.approx(float(by_force), rel=0.1)

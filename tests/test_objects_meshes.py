@@ -1,10 +1,10 @@
-import importlib.util
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from optics_bodies import public_meshes
 from PIL import Image
 
 from sts_jax import objects
@@ -292,9 +292,7 @@ def test_too_many_faces(tmp_path, monkeypatch):
 
 def test_public_textured_mesh():
     # miniworld's potion bottle (Farama Foundation): made by nobody here, and its OBJ names a material nobody has.
-    found = importlib.util.find_spec("miniworld")
-    assert found is not None, "the test extra is not installed: pip install -e .[test]"
-    folder = Path(found.origin).parent / "meshes"
+    folder = public_meshes()
     body = objects.load(folder / "potion.obj", longest_side=0.08, up="y", texture=folder / "potion.png", strict=True)
     assert body.texture.shape == (256, 256, 3)
     assert np.asarray(body.texture).std() > 0.05

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from optics_bodies import body_mesh, embree, from_trimesh, interior
+from optics_bodies import body_mesh, embree, from_trimesh, interior, public_meshes
 
 from sts_jax import _math, objects, optics
 
@@ -44,6 +44,8 @@ def bodies():
     yield "slivers", from_trimesh(slivers)
     yield "ring", from_trimesh(ring)
     yield "box", from_trimesh(trimesh.creation.box((0.05, 0.02, 0.09)))
+    meshes = public_meshes()
+    yield "potion", objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
     for category in ("bottle", "fork", "watch"):
         yield category, objects.make(jax.random.key(int(rng.integers(100))), category)
 

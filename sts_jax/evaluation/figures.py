@@ -65,8 +65,8 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
         axis.set_xlabel("gradient step")
         axis.set_ylabel(units.get(key, "nats an item"))
         axis.set_title(key, fontsize=9)
-        if key in ("loss", "pose"):
-            axis.set_yscale("log")
+        if key == "loss":
+            axis.set_yscale("log")  # the models differ by the number of their subsets
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=7)
     _save(figure, path)
@@ -111,7 +111,7 @@ def strip(
     for k, name in enumerate(("$F_x$", "$F_y$", "$F_z$")):
         force.plot(time, wrench[:, k], label=name, linewidth=1)
     force.set_xlabel("time (s)")
-    force.set_ylabel("force of the pad (N)")
+    force.set_ylabel("force (N)")
     force.legend(fontsize=7, ncols=3)
     force.grid(alpha=0.3)
     figure.suptitle(title, fontsize=9)
@@ -183,6 +183,6 @@ def _show(axis: Axes, image: np.ndarray) -> None:
 
 def _save(figure: plt.Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.tight_layout()
+    figure.set_layout_engine("constrained")
     figure.savefig(path, dpi=130)
     plt.close(figure)

@@ -192,11 +192,11 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
         ("visual BCE", "visual_bce", 1, 4),
         ("visual excess x1e-4", "visual_excess", 1e4, 1),
         ("visual skill", "visual_skill", 1, 3),
-        ("on object", "visual_skill_object", 1, 3),
+        ("visual on object", "visual_skill_object", 1, 3),
         ("tactile BCE", "tactile_bce", 1, 4),
         ("tactile excess x1e-4", "tactile_excess", 1e4, 1),
         ("tactile skill", "tactile_skill", 1, 3),
-        ("on object", "tactile_skill_object", 1, 3),
+        ("tactile on object", "tactile_skill_object", 1, 3),
         ("position (mm)", "position", 1e3, 1),
         ("on pad", "position_on_pad", 1e3, 1),
         ("angle (deg)", "angle", 180 / np.pi, 0),
@@ -217,14 +217,7 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     for name, row in summary["predictors"].items():
         cells = [_cell(row[key], scale, digits, "skill" in key) for _, key, scale, digits in heads]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    shown = [
-        ("visual skill", "visual_skill", 1, 3),
-        ("visual on object", "visual_skill_object", 1, 3),
-        ("tactile skill", "tactile_skill", 1, 3),
-        ("tactile on object", "tactile_skill_object", 1, 3),
-        ("position (mm)", "position", 1e3, 1),
-        ("angle (deg)", "angle", 180 / np.pi, 0),
-    ]
+    shown = [h for h in heads if "_skill" in h[1] or h[1] in ("position", "angle")]
     lines += [
         "",
         "Differences from the baselines (skill: positive is better; errors: negative is better):",

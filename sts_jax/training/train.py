@@ -98,7 +98,7 @@ class Model(NamedTuple):
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
-    """Adam as configured."""
+    """Adam as configured, with an epsilon of its own for each of the parameters' `encoders` and `decoders`."""
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
         rate = optax.cosine_decay_schedule(config.learning_rate, total)
