@@ -20,9 +20,9 @@ from experiments import stages
 from sts_jax import dataset, physics, training
 
 DEFAULT = stages.Config(
-    collection=dataset.Collection(physics.Freefall(), num_objects=320, num_per_object=4, num_full=20, seed=1),
+    collection=dataset.Collection(physics.Freefall(), num_objects=320, num_per_object=4, num_full=20, seed=2),
     training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
-    steps=(1150, 350, 450, 100),
+    steps=(1500, 600, 600, 100),
 )
 SMOKE = dataclasses.replace(
     DEFAULT,
@@ -44,6 +44,7 @@ PAPER = stages.Config(
     ),
     training=training.TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
     targets="own",
+    rotation="quaternion",
     mask_blank_touch=False,
     splits=("trajectory", "object"),
 )

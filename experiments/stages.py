@@ -41,6 +41,7 @@ class Config:
     targets: Literal["all", "own"] = (
         "all"  # a subset of modalities is asked for "all" targets, or for its "own" (paper)
     )
+    rotation: Literal["matrix", "quaternion"] = "matrix"  # as the networks see it
     mask_blank_touch: bool = True  # a touch without contact is no input; False: the blank image is fed (paper)
     # Held out: whole "object"s (70/10/20), or a fifth of the shuffled "trajectory"s, which shows each object on both
     # sides (paper). With several, each has its own models and table.
@@ -102,7 +103,7 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
 
             training.train(
                 schedule,
-                model_config(modalities, config.collection.resolution),
+                model_config(modalities, preprocessing),
                 arrays,
                 workdir=folder,
                 absent=preprocessing.absent,
@@ -115,13 +116,16 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
 def preprocessing_of(config: Config) -> training.Preprocessing:
     """How an experiment's measurements are made ready for the networks."""
     collection = config.collection
-    return training.Preprocessing(collection.resolution, collection.crop, mask_blank_touch=config.mask_blank_touch)
+    return training.Preprocessing(
+        collection.resolution, collection.crop, rotation=config.rotation, mask_blank_touch=config.mask_blank_touch
+    )
 
 
-def model_config(modalities: tuple[str, ...], resolution: tuple[int, int]) -> mvae.Config:
+def model_config(modalities: tuple[str, ...], preprocessing: training.Preprocessing) -> mvae.Config:
     """The paper's networks for some modalities; lambda is 1 for images and 1000 for the pose."""
-    pose = mvae.Modality("pose", "vector", (7,), weight=1000.0)
-    images = {name: mvae.Modality(name, "image", (*resolution, 3), start=0.7) for name in ("visual", "tactile")}
+    pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
+    shape = (*preprocessing.resolution, 3)
+    images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
     return mvae.Config(tuple({**images, "pose": pose}[name] for name in modalities))
 
 
@@ -185,7 +189,9 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     evaluation.figures.predictions(figures / "predictions.png", test, shown, num=config.num_shown, title=title)
     category = np.array([int(i) % len(sts.objects.CATEGORIES) for i in test.object])
     best = rows[both] if both in rows else rows[single]
-    evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category, blank)
+    assert best.pose is not None  # "mvae" of MODELS has one
+    stands = evaluation.stand_ins(sensor, category[:10], best.pose[:10], config.collection.resolution)
+    evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category, blank, stands)
     logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
     evaluation.figures.training_curves(figures / "training.png", logs)
     if split == config.splits[0]:
@@ -315,7 +321,7 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
 
             training.train(
                 dataclasses.replace(config.training, steps=steps, log_every=1, checkpoint_every=steps),
-                model_config(modalities, collection.resolution),
+                model_config(modalities, preprocessing),
                 arrays,
                 workdir=model_folder(Path(name), model, tiny, "trajectory"),
                 absent=preprocessing.absent,

@@ -66,6 +66,21 @@ def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     return jnp.stack(rows, -2)
 
 
+def nearest_quat(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
+    """Quaternion, `w >= 0`, of the rotation R with the largest `sum(R * matrix)`: the nearest to any 3x3 matrix.
+
+    The eigenvector of the largest eigenvalue of Davenport's K (Markley and Mortari 2000, "Quaternion attitude
+    estimation using vector observations").
+    """
+    m = matrix
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    z = jnp.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1)
+    corner = m + m.swapaxes(-1, -2) - jnp.tensordot(trace, jnp.eye(3), 0)
+    top = jnp.concatenate([trace[..., None], z], axis=-1)[..., None, :]
+    k = jnp.concatenate([top, jnp.concatenate([z[..., :, None], corner], axis=-1)], axis=-2)
+    return quat_canonical(jnp.linalg.eigh(k)[1][..., :, -1])
+
+
 def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
     """Quaternion of the rotation by `|v|` radians about `v`; differentiable at zero."""
     half = 0.5 * norm(v)[..., None]

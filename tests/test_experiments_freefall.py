@@ -111,9 +111,9 @@ def test_the_paper_preset_has_the_papers_counts():
     assert (paper.training.epochs, paper.training.batch_size) == (200, 64)
     assert paper.training.beta_warmup == 50 / 200
     assert (paper.targets, paper.splits[0], paper.mask_blank_touch) == ("own", "trajectory", False)
-    assert {name: m.weight for name in ("mvae",) for m in stages.model_config(stages.MODELS[name], (64, 64)).modalities}
-    weights = [m.weight for m in stages.model_config(stages.MODELS["mvae"], (64, 64)).modalities]
-    assert weights == [1, 1, 1000]
+    model = stages.model_config(stages.MODELS["mvae"], stages.preprocessing_of(paper))
+    assert [m.weight for m in model.modalities] == [1, 1, 1000]
+    assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 
 
 def test_the_papers_split_is_a_fifth_of_shuffled_trajectories(workdir):

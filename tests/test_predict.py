@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,17 +19,18 @@ def train(folder, *, absent=()):
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (2, 6, SIDE, SIDE, 3), dtype=np.uint8)
     pose = np.concatenate([rng.normal(size=(6, 3)), np.tile([1.0, 0, 0, 0], (6, 1))], 1).astype(np.float32)
-    moments = {"visual": images[0], "tactile": images[1], "pose": pose}
+    preprocessing = training.Preprocessing(resolution=(SIDE, SIDE), absent=absent)
+    code = np.asarray(preprocessing.encode_pose(jnp.asarray(pose)))
+    moments = {"visual": images[0], "tactile": images[1], "pose": code}
     config = mvae.Config(
         tuple(
-            mvae.Modality(name, "vector", (7,)) if name == "pose" else mvae.Modality(name, "image", (SIDE, SIDE, 3))
-            for name in moments
+            mvae.Modality(name, "vector" if name == "pose" else "image", value.shape[1:])
+            for name, value in moments.items()
         ),
         latent=8,
         hidden=16,
         widths=(4, 4, 4, 4),
     )
-    preprocessing = training.Preprocessing(resolution=(SIDE, SIDE), absent=absent)
     training.save_blank(folder, images[0, 0], np.full((SIDE, SIDE, 3), 178, np.uint8))
     training.train(
         training.TrainConfig(steps=2, batch_size=4, log_every=1, checkpoint_every=2),

@@ -1,7 +1,6 @@
 """How good a prediction is: metrics per item, tables with intervals, figures."""
 
 from sts_jax.evaluation import figures, metrics
-from sts_jax.evaluation.outside import outside
 from sts_jax.evaluation.report import (
     Predicted,
     Scores,
@@ -13,6 +12,7 @@ from sts_jax.evaluation.report import (
     summarise,
     table,
 )
+from sts_jax.evaluation.views import outside, stand_ins
 
 __all__ = [
     "Predicted",
@@ -25,6 +25,7 @@ __all__ = [
     "outcome_of_pose",
     "outside",
     "score",
+    "stand_ins",
     "summarise",
     "table",
 ]

@@ -125,14 +125,14 @@ def line_up(
     predicted: Predicted,
     category: np.ndarray,
     blank: np.ndarray,
+    stand_ins: np.ndarray,
     *,
-    num: int = 10,
     seed: int = 0,
 ) -> None:
     """A test for fresh eyes: a prediction, and two last moments of which one is its own.
 
-    The first `num` held-out trajectories; the other candidate is the target of another held-out trajectory of the
-    same category. Which side is right is written to `key_path` only.
+    One row for each of the first held-out trajectories, as many as there are `stand_ins`; the other candidate is the
+    target of another held-out trajectory of the same category. Which side is right is written to `key_path` only.
 
     Args:
         path: The PNG to write.
@@ -142,14 +142,15 @@ def line_up(
         category: The category of each, `(n,)`.
         blank: The visual image of the empty sensor, in [0, 1]; the prediction is also shown with four times its
             difference from it, since a blurred one is faint.
-        num: How many rows.
+        stand_ins: The predicted poses as pictures in [0, 1], `(rows, h, w, 3)`: some object of the category at each,
+            the same one whatever the trajectory's own looks like, so that they tell the pose alone.
         seed: Of sides and other candidates.
     """
     if predicted.visual is None or predicted.tactile is None:
         raise ValueError("a line-up needs a prediction of both streams; give one of a model that has both.")
     rng = np.random.default_rng(seed)
-    num = min(num, len(test.visual))
-    figure, axes = plt.subplots(num, 7, figsize=(11, 1.5 * num + 0.6), squeeze=False)
+    num = min(len(stand_ins), len(test.visual))
+    figure, axes = plt.subplots(num, 8, figsize=(12.5, 1.5 * num + 0.6), squeeze=False)
     answers = []
     for row in range(num):
         same = np.flatnonzero((category == category[row]) & (np.arange(len(category)) != row))
@@ -163,9 +164,10 @@ def line_up(
             predicted.visual[row],
             blank + 4 * (predicted.visual[row] - blank),
             predicted.tactile[row],
+            stand_ins[row],
             *(stream[i, 1] / 255 for i in (a, b) for stream in (test.visual, test.tactile)),
         ]
-        heads = ["prediction", "contrast x 4", "(touch)", "A", "(touch)", "B", "(touch)"]
+        heads = ["prediction", "contrast x 4", "(touch)", "(pose)", "A", "(touch)", "B", "(touch)"]
         for axis, image, head in zip(axes[row], images, heads, strict=True):
             _show(axis, image)
             if row == 0:

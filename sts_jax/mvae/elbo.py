@@ -4,6 +4,11 @@
 over the non-empty subsets `X` (paper, "Learning Intuitive Physics with MVAEs"), to be minimised. `E_m` is the
 binary cross-entropy with logits of an image, summed over pixels and channels, or the mean squared error of a
 vector's components. The batch is averaged, subsets are summed, the expectation is one draw of `z`.
+
+Non-empty is meant of what a sample has: a subset of which nothing is present has no posterior of its own and is left
+out for this sample. (Its posterior would be the prior, and decoders asked for the target from a random `z` learn to
+answer every `z` with a share of the mean target.) A sample of which nothing at all is present keeps them: there the
+mean target is what is to be learnt.
 """
 
 from typing import Literal, NamedTuple
@@ -43,7 +48,7 @@ def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...
         groups[old.members] = _Group(
             old.members, old.subsets + 1, tuple(a + b for a, b in zip(old.asked, more, strict=True))
         )
-    return list(groups.values())
+    return [g for g in groups.values() if g.members or not kept]
 
 
 def loss(
@@ -64,10 +69,10 @@ def loss(
     """The negative bound of one batch (module docstring), in training mode.
 
     Each modality is encoded once. Subsets that are equal without the `absent` modalities are computed once and
-    weighted by their number, the empty one (posterior = prior) with them, so `absent` changes the time and not
-    the loss. A subset falls back, sample by sample, to those of its modalities that are present. All subsets are
-    decoded in one stacked call: its batch statistics are shared, weighted like the subsets. The noise of a sample
-    belongs to the modalities that are left of a subset, so that equal subsets draw the same `z`.
+    weighted by their number, so `absent` changes the time and not the loss. A subset falls back, sample by sample,
+    to those of its modalities that are present. All subsets are decoded in one stacked call: its batch statistics
+    are shared, weighted like the subsets. The noise of a sample belongs to the modalities that are left of a
+    subset, so that equal subsets draw the same `z`.
 
     Args:
         graphdef: definition of the model.
@@ -98,21 +103,22 @@ def loss(
     groups = _groups(config, asked, absent)
     members = jnp.array([[bool(g.members >> i & 1) for i in range(len(config.names))] for g in groups])
     left = members[:, :, None] & mask[None]
+    counts = jnp.any(left, axis=1) | ~jnp.any(mask, axis=0)[None]  # (group, batch)
     posterior = jax.vmap(lambda p: product_of_experts(experts, p))(left)
     divergence = kl_standard_normal(posterior)
-    subsets = jnp.array([g.subsets for g in groups], jnp.float32)
-    kl = jnp.sum(subsets[:, None] * divergence) / batch
+    subsets = jnp.array([g.subsets for g in groups], jnp.float32)[:, None] * counts
+    kl = jnp.sum(subsets * divergence)
     z = posterior.mean + jnp.exp(0.5 * posterior.log_var) * _noise(key, groups, left, posterior.mean.shape)
     z = _with_condition(config, z, condition)
 
-    total = beta * kl
+    total = beta * kl / batch
     reconstruction = {}
     for i, modality in enumerate(config.modalities):
         rows = [j for j, g in enumerate(groups) if g.asked[i]]
         times = jnp.array([groups[j].asked[i] for j in rows], jnp.float32)
         target = targets[modality.name]
         known = (target_present or {}).get(modality.name, jnp.ones(batch, bool))
-        weights = (times[:, None] * known[None]).reshape(-1)
+        weights = (times[:, None] * counts[jnp.array(rows)] * known[None]).reshape(-1)
         output = model.decode(modality.name, z[jnp.array(rows)].reshape(-1, z.shape[-1]), weights)
         target = jnp.where(_over(known, target), target, 0)
         error = _error(modality, output.reshape(len(rows), *target.shape), target[None])

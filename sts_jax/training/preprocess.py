@@ -5,6 +5,7 @@ import io
 import json
 import zipfile
 from pathlib import Path
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,19 +20,38 @@ class Preprocessing:
 
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object instead of the whole pad
-    position_scale: float = 0.1  # m; positions are divided by it, so that they are of the size of a quaternion's parts
+    position_scale: float = 0.05  # m; positions are divided by it, so that they are of the size of a rotation's parts
+    # A matrix is a continuous function of the rotation, and what falls, a linear one of the matrix; a quaternion jumps
+    # where its sign does (Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks").
+    rotation: Literal["matrix", "quaternion"] = "matrix"
     mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is fed, as the paper)
     touch_threshold: float = 3 / 255  # a touch is one where a pixel differs from the blank gel by more than this
     absent: tuple[str, ...] = ()  # modalities that no training input ever had
 
-    def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-        """A pose (m, quaternion) as the networks see it."""
-        return jnp.concatenate([pose[..., :3] / self.position_scale, _math.quat_canonical(pose[..., 3:])], axis=-1)
+    @property
+    def pose_size(self) -> int:
+        """Numbers in the code of a pose."""
+        return 3 + {"matrix": 9, "quaternion": 4}[self.rotation]
 
-    def decode_pose(self, code: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-        """What a network says as a pose: metres and a unit quaternion with `w >= 0` (identity if it says 0)."""
-        quat = _math.quat_canonical(code[..., 3:])
-        quat = jnp.where(jnp.any(quat != 0, -1, keepdims=True), quat, jnp.array([1.0, 0, 0, 0]))
+    def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n code"]:
+        """A pose (m, quaternion) as the networks see it: `pose_size` numbers."""
+        position, quat = pose[..., :3] / self.position_scale, _math.quat_canonical(pose[..., 3:])
+        if self.rotation == "matrix":
+            quat = _math.quat_matrix(quat).reshape(*quat.shape[:-1], 9)
+        return jnp.concatenate([position, quat], axis=-1)
+
+    def decode_pose(self, code: Float[Array, "*n code"]) -> Float[Array, "*n 7"]:
+        """What a network says as a pose: metres and a unit quaternion with `w >= 0` (identity if it says 0).
+
+        Nine numbers that are no rotation matrix are taken for the nearest one.
+        """
+        quat = code[..., 3:]
+        if self.rotation == "matrix":
+            quat = _math.nearest_quat(quat.reshape(*quat.shape[:-1], 3, 3))
+        else:
+            quat = _math.quat_canonical(quat)
+        said = jnp.any(code[..., 3:] != 0, -1, keepdims=True)
+        quat = jnp.where(said, quat, jnp.array([1.0, 0, 0, 0]))
         return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
 
     def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:

@@ -1,5 +1,6 @@
-"""The object on its pad as a bystander sees it."""
+"""Pictures of an object at a pose: by a bystander, and of a stand-in at a predicted pose."""
 
+import dataclasses
 import functools
 
 import jax
@@ -7,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sts_jax import _math, optics
+from sts_jax import _math, objects, optics, physics
+from sts_jax.frame import sense
 from sts_jax.objects import Body
+from sts_jax.sensor import Sensor
 
 _THICKNESS = 0.012  # m, how much of the sensor's housing is drawn
 _PAD = optics.to_linear(jnp.array([178.0, 178.0, 204.0]) / 255)
 _HOUSING = jnp.array([0.05, 0.05, 0.055])
+_STAND_IN = 0.1  # albedo
 
 
 @functools.partial(jax.jit, static_argnames=("resolution",))
@@ -53,3 +57,33 @@ def outside(
         resolution=resolution,
         two_sided=body.two_sided,
     )
+
+
+def stand_ins(
+    sensor: Sensor, category: np.ndarray, pose: np.ndarray, resolution: tuple[int, int]
+) -> Float[np.ndarray, "n h w 3"]:
+    """What the sensor would see of a grey sample of a category at predicted poses.
+
+    The sample is the same for all objects of a category, so the picture tells a pose and nothing else of an object. A
+    predicted pose lies a little in the gel or over it: the sample is drawn with its lowest point on the gel, and not
+    at all where the pose is one that fell off.
+
+    Args:
+        sensor: The sensor.
+        category: Indices into `objects.CATEGORIES`, `(n,)`.
+        pose: Predicted, `(n, 7)`.
+        resolution: (height, width), pixels.
+
+    Returns:
+        Images in [0, 1].
+    """
+    images = []
+    for index, where in zip(category, jnp.asarray(pose, jnp.float32), strict=True):
+        body = objects.make(jax.random.key(0), objects.CATEGORIES[index])
+        body = dataclasses.replace(body, colors=jnp.full_like(body.colors, _STAND_IN))
+        lowest = jnp.min(_math.transform(where, body.vertices)[:, 2])
+        fell = physics.outcome(where, where) == int(physics.Outcome.FELL_OFF)
+        height = jnp.where(fell, -1.0, where[2] - lowest)
+        frame = sense(sensor, body, where.at[2].set(height), jnp.zeros(6), resolution=resolution)
+        images.append(np.asarray(frame.visual))
+    return np.stack(images)
