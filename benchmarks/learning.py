@@ -25,7 +25,7 @@ MODEL = mvae.Config(
     (
         mvae.Modality("visual", "image", (64, 64, 3)),
         mvae.Modality("tactile", "image", (64, 64, 3)),
-        mvae.Modality("pose", "vector", (7,), 1000.0),
+        mvae.Modality("pose", "vector", (12,), 1000.0),
     )
 )
 VISUAL = mvae.Config(MODEL.modalities[:1])

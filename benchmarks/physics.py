@@ -2,9 +2,11 @@
 
     python -m benchmarks.physics             # about 2 minutes
     python -m benchmarks.physics --soak 3000 # about 10 minutes on two cores
+    python -m benchmarks.physics --reroll 6  # about 2 minutes
 
 The first steps the same objects from the same starts for a whole trajectory, in both engines. The second drops
-objects of all categories (a new one every eight drops) and counts.
+objects of all categories (a new one every eight drops) and counts. The third rolls the same starts again with other
+hidden values: how far the end is decided by what cannot be seen.
 """
 
 import argparse
@@ -132,12 +134,35 @@ def soak(count: int) -> None:
     print(f"energy out of contact above the start's: largest {100 * excess.max():.3f} %")
 
 
+def reroll(times: int, *, num_objects: int = 48, num: int = 4) -> None:
+    """Drops the same starts several times with fresh hidden values and prints how the ends differ."""
+    sensor, scenario, items = Sensor(), physics.Freefall(), bodies(num_objects)
+    ends, rests = [], []
+    for key in jax.random.split(jax.random.key(2), times):
+        hidden = jax.vmap(scenario.hidden)(jax.random.split(key, num_objects * num))
+        traj = physics.simulate(jax.random.key(1), items, sensor, scenario, num, hidden=hidden)
+        ends.append(1e3 * np.asarray(traj.pose[:, -1, :2]))
+        rests.append(np.asarray(traj.outcome) == physics.Outcome.RESTS)
+    place, stay = np.array(ends), np.array(rests)
+    start = 1e3 * np.asarray(traj.pose[:, 0, :2])
+    own = np.linalg.norm(place - place.mean(0), axis=-1).mean(0) * np.sqrt(times / (times - 1))
+    moved = np.linalg.norm(place - start, axis=-1)
+    changed = np.mean(stay.any(0) & ~stay.all(0))
+    print(f"{place.shape[1]} starts of {num_objects} objects, {times} fills and frictions each")
+    print(f"the end lies from the start                  {np.mean(moved[stay]):5.1f} mm (mean, of those that stay)")
+    print(f"the ends of one start from their own mean    {np.mean(own):5.1f} mm (mean), {np.median(own):.1f} (median)")
+    print(f"starts of which some ends stay and some fall {100 * changed:5.1f} %")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--soak", type=int, default=0, metavar="N", help="drop N objects and count")
+    parser.add_argument("--reroll", type=int, default=0, metavar="N", help="roll the same starts N times (N > 1)")
     parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
     arguments = parser.parse_args()
     if arguments.soak:
         soak(arguments.soak)
+    elif arguments.reroll > 1:
+        reroll(arguments.reroll)
     else:
         speed(arguments.num)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sts_jax import _math, objects, optics, physics
-from sts_jax.frame import sense
+from sts_jax.dataset import render_uint8
 from sts_jax.objects import Body
 from sts_jax.sensor import Sensor
 
@@ -60,7 +60,7 @@ def outside(
 
 
 def stand_ins(
-    sensor: Sensor, category: np.ndarray, pose: np.ndarray, resolution: tuple[int, int]
+    sensor: Sensor, category: np.ndarray, poses: np.ndarray, resolution: tuple[int, int]
 ) -> Float[np.ndarray, "n h w 3"]:
     """What the sensor would see of a grey sample of a category at predicted poses.
 
@@ -71,19 +71,20 @@ def stand_ins(
     Args:
         sensor: The sensor.
         category: Indices into `objects.CATEGORIES`, `(n,)`.
-        pose: Predicted, `(n, 7)`.
+        poses: Predicted, `(n, 7)`.
         resolution: (height, width), pixels.
 
     Returns:
         Images in [0, 1].
     """
     images = []
-    for index, where in zip(category, jnp.asarray(pose, jnp.float32), strict=True):
+    for index, where in zip(category, jnp.asarray(poses, jnp.float32), strict=True):
         body = objects.make(jax.random.key(0), objects.CATEGORIES[index])
         body = dataclasses.replace(body, colors=jnp.full_like(body.colors, _STAND_IN))
         lowest = jnp.min(_math.transform(where, body.vertices)[:, 2])
         fell = physics.outcome(where, where) == int(physics.Outcome.FELL_OFF)
         height = jnp.where(fell, -1.0, where[2] - lowest)
-        frame = sense(sensor, body, where.at[2].set(height), jnp.zeros(6), resolution=resolution)
-        images.append(np.asarray(frame.visual))
+        pose = where.at[2].set(height)[None]
+        visual, _, _ = render_uint8(sensor, body, pose, jnp.zeros((1, 6)), resolution=resolution, crop=False)
+        images.append(np.asarray(visual[0]) / 255)
     return np.stack(images)
