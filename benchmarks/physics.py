@@ -135,12 +135,14 @@ def soak(count: int) -> None:
 
 
 def reroll(times: int, *, num_objects: int = 48, num: int = 4) -> None:
-    """Drops the same starts several times with fresh hidden values and prints how the ends differ."""
+    """Drops the same starts several times with fresh fill, shell and friction and prints how the ends differ."""
     sensor, scenario, items = Sensor(), physics.Freefall(), bodies(num_objects)
     ends, rests = [], []
     for key in jax.random.split(jax.random.key(2), times):
         hidden = jax.vmap(scenario.hidden)(jax.random.split(key, num_objects * num))
         traj = physics.simulate(jax.random.key(1), items, sensor, scenario, num, hidden=hidden)
+        if traj.resampled.sum():
+            raise RuntimeError("a drop was drawn again from another start; give another key")
         ends.append(1e3 * np.asarray(traj.pose[:, -1, :2]))
         rests.append(np.asarray(traj.outcome) == physics.Outcome.RESTS)
     place, stay = np.array(ends), np.array(rests)
@@ -148,7 +150,7 @@ def reroll(times: int, *, num_objects: int = 48, num: int = 4) -> None:
     own = np.linalg.norm(place - place.mean(0), axis=-1).mean(0) * np.sqrt(times / (times - 1))
     moved = np.linalg.norm(place - start, axis=-1)
     changed = np.mean(stay.any(0) & ~stay.all(0))
-    print(f"{place.shape[1]} starts of {num_objects} objects, {times} fills and frictions each")
+    print(f"{place.shape[1]} starts of {num_objects} objects, {times} fills, shells and frictions each")
     print(f"the end lies from the start                  {np.mean(moved[stay]):5.1f} mm (mean, of those that stay)")
     print(f"the ends of one start from their own mean    {np.mean(own):5.1f} mm (mean), {np.median(own):.1f} (median)")
     print(f"starts of which some ends stay and some fall {100 * changed:5.1f} %")
@@ -162,7 +164,9 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     if arguments.soak:
         soak(arguments.soak)
-    elif arguments.reroll > 1:
+    elif arguments.reroll:
+        if arguments.reroll < 2:
+            parser.error(f"--reroll {arguments.reroll}: ends are compared, roll at least twice")
         reroll(arguments.reroll)
     else:
         speed(arguments.num)

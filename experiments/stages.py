@@ -190,8 +190,10 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     category = np.array([int(i) % len(sts.objects.CATEGORIES) for i in test.object])
     best = rows[both] if both in rows else rows[single]
     assert best.pose is not None  # "mvae" of MODELS has one
-    stands = evaluation.stand_ins(sensor, category[:10], best.pose[:10], config.collection.resolution)
-    evaluation.figures.line_up(figures / "line_up.png", figures / "line_up.json", test, best, category, blank, stands)
+    first = np.sort(np.unique(test.object, return_index=True)[1])[:10]  # the first fall of each of the first objects
+    stands = evaluation.stand_ins(sensor, category[first], best.pose[first], config.collection.resolution)
+    line_up = figures / "line_up.png"
+    evaluation.figures.line_up(line_up, line_up.with_suffix(".json"), test, best, category, blank, stands, first)
     logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
     evaluation.figures.training_curves(figures / "training.png", logs)
     if split == config.splits[0]:

@@ -9,12 +9,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 
-def safe_divide(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """`a / b` with 0 (and zero gradient) where `b` is 0."""
-    ok = b != 0
-    return jnp.where(ok, a / jnp.where(ok, b, 1), 0)
-
-
 def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
     """Euclidean norm over the last axis, with zero gradient at zero."""
     square = jnp.sum(x * x, axis=-1)
@@ -85,12 +79,6 @@ def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
     """Quaternion of the rotation by `|v|` radians about `v`; differentiable at zero."""
     half = 0.5 * norm(v)[..., None]
     return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
-
-
-def quat_angle(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n"]:
-    """Geodesic angle between two rotations, radians in [0, pi]."""
-    d = quat_multiply(quat_conjugate(a), b)
-    return 2 * jnp.arctan2(norm(d[..., 1:]), jnp.abs(d[..., 0]))
 
 
 def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:

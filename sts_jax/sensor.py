@@ -90,6 +90,11 @@ def _typed(default: Any, value: Any, name: str, path: str) -> Any:
         for unknown in set(value) - set(known):
             raise ValueError(f"{path}: field {prefix}{unknown} is not known; known are {', '.join(known)}.")
         fields = {k: _typed(getattr(default, k), value[k], prefix + k, path) for k in known}
+        if name == "lights" and len(fields["directions"]) != len(fields["colors"]):
+            rows = len(fields["directions"]), len(fields["colors"])
+            raise ValueError(
+                f"{path}: fields lights.directions, lights.colors have {rows} rows; a light has one of both."
+            )
         return dataclasses.replace(default, **fields)
     try:
         array = np.asarray(value, np.float64)
@@ -104,6 +109,9 @@ def _typed(default: Any, value: Any, name: str, path: str) -> Any:
         raise ValueError(f"{path}: field {name} is {value!r}; it must be above 0.")
     if name == "camera.fov" and array >= math.pi:
         raise ValueError(f"{path}: field {name} is {value!r}; it must be below pi.")
+    whole = all(isinstance(d, int) for d in default) if isinstance(default, tuple) else isinstance(default, int)
+    if whole and np.any(array != np.round(array)):
+        raise ValueError(f"{path}: field {name} is {value!r}; it takes whole numbers.")
     if isinstance(default, tuple):
         return tuple(type(d)(v) for d, v in zip(default, value, strict=True))
     if isinstance(default, (int, float)):

@@ -102,6 +102,14 @@ def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):
     assert stamps == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
 
 
+def test_symmetries_of_a_pad_that_is_not_square_are_refused(tmp_path):
+    sensor = sts.Sensor()
+    sensor = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, size=(0.15, 0.1)))
+    with pytest.raises(ValueError, match=r"gel\.size=\[0\.15"):
+        dataset.collect(dataclasses.replace(SMALL, symmetries=True), sensor, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
 def test_another_collection_in_the_same_folder_is_refused(folder):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
     with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, asked for now is 0\.02"):

@@ -87,6 +87,15 @@ def test_equal_subsets_once_are_the_plain_enumeration(config, asked, absent):
     close(plain, quick)
 
 
+def test_a_sample_that_has_nothing_else_keeps_its_empty_subsets():
+    inputs, targets = batch(VECTORS), batch(VECTORS, 1)
+    nothing = jnp.arange(BATCH) < 2
+    masks = {"a": ~nothing, "b": jnp.zeros(BATCH, bool), "c": ~nothing}
+    plain = gradient(VECTORS, inputs, targets, present=masks)
+    quick = gradient(VECTORS, inputs, targets, present={"a": ~nothing, "c": ~nothing}, absent=("b",))
+    close(plain, quick)
+
+
 def test_an_input_that_is_not_given_is_absent():
     inputs, targets = batch(VECTORS), batch(VECTORS, 1)
     a = gradient(VECTORS, inputs, targets, absent=("b",))
@@ -192,7 +201,12 @@ def test_a_condition_reaches_the_decoders():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"absent": ("sound",)}, "sound"), ({"condition": jnp.ones((BATCH, 2))}, "width 2")],
+    [
+        ({"absent": ("sound",)}, "sound"),
+        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "masks named"),
+        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "masks named"),
+        ({"condition": jnp.ones((BATCH, 2))}, "width 2"),
+    ],
 )
 def test_bad_options_are_named(options, message):
     inputs = batch(VECTORS)
@@ -208,3 +222,7 @@ def test_nothing_given_and_unknown_names_are_errors():
             mvae.predict(graphdef, state, inputs)
     with pytest.raises(ValueError, match="targets named"):
         gradient(VECTORS, batch(VECTORS), {})
+    with pytest.raises(ValueError, match="sound"):
+        gradient(VECTORS, batch(VECTORS) | {"sound": jnp.ones((BATCH, 3))}, batch(VECTORS))
+    with pytest.raises(ValueError, match="masks"):
+        mvae.infer(graphdef, state, batch(VECTORS), present={"sound": jnp.ones(BATCH, bool)})

@@ -1,11 +1,10 @@
 """The product of experts and the divergence against numerical integration."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts, sample
+from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 
 GRID = np.linspace(-30, 30, 200_001)
 
@@ -38,13 +37,6 @@ def test_divergence_is_the_integral(mean, log_var):
     expected = np.trapezoid(integrand, GRID)
     got = kl_standard_normal(Gaussian(jnp.array([mean]), jnp.array([log_var])))
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_sample_has_the_moments():
-    g = Gaussian(jnp.full((100_000, 1), 2.0), jnp.full((100_000, 1), -1.0))
-    z = sample(jax.random.key(0), g)
-    np.testing.assert_allclose(jnp.mean(z), 2, atol=0.01)
-    np.testing.assert_allclose(jnp.var(z), np.exp(-1), rtol=0.02)
 
 
 @pytest.mark.parametrize("subset", [(), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])

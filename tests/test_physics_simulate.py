@@ -298,6 +298,8 @@ def test_the_outcome_is_read_from_the_last_pose() -> None:
         ({"shell_scale": (1.1, 0.9)}, 1, r"scenario.shell_scale"),
         ({"fill": (0.0, 1.5)}, 1, r"scenario.fill"),
         ({"height": float("nan")}, 1, r"scenario.height"),
+        ({"height": 0.004}, 1, r"scenario.height is 0.004 m"),
+        ({"rate": 8.0}, 1, r"scenario.height .* raise height or rate"),
         ({"rate": 30.0}, 1, "rate 30"),
         ({"frames": 0}, 1, r"scenario.frames"),
     ],

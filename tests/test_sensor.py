@@ -56,6 +56,8 @@ def change(values, path, value):
         ("camera", 3),
         ("lights.directions", [[0, 1]]),
         ("lights.directions", [[0, 0, float("nan")]]),
+        ("lights.directions", [[0, 0, 1.0]] * 3),
+        ("gel.cells", [0.5, 150]),
         ("phong.ambient_color", [1, 1, 1, 1]),
     ],
 )

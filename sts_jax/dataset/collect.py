@@ -120,9 +120,13 @@ def collect(
         How many trajectories were drawn again because they went non-finite or sank, in the shards made now.
 
     Raises:
-        ValueError: The folder holds another collection; the message names the field.
+        ValueError: The folder holds another collection, the message names the field; or symmetries are asked for of a
+            pad that is not square.
         OSError: The disk is full.
     """
+    sides = [float(side) for side in sensor.gel.size]
+    if collection.symmetries and sides[0] != sides[1]:
+        raise ValueError(f"symmetries=True with gel.size={sides}: only on a square pad is a turned fall a fall")
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "collection.json", _as_json(collection))
     claim(folder / "sensor.json", jax.tree.map(lambda x: np.asarray(x).tolist(), dataclasses.asdict(sensor)))

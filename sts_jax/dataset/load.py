@@ -29,7 +29,6 @@ class Pairs(NamedTuple):
 class Dataset:
     """Everything small in memory, images read when asked for."""
 
-    folder: Path
     collection: dict  # as collection.json has it
     split: dict[str, np.ndarray]  # name -> object indices
     trajectory: dict[str, np.ndarray]  # physics.Trajectory's leaves, all shards: (num, ...)
@@ -129,7 +128,6 @@ def load(folder: str | Path) -> Dataset:
     leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
     sizes = [len(part["frames"]) for part in parts]
     return Dataset(
-        folder=folder,
         collection=collection,
         split=split,
         trajectory={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("trajectory/")},

@@ -126,13 +126,15 @@ def line_up(
     category: np.ndarray,
     blank: np.ndarray,
     stand_ins: np.ndarray,
+    rows: np.ndarray,
     *,
     seed: int = 0,
 ) -> None:
     """A test for fresh eyes: a prediction, and two last moments of which one is its own.
 
-    One row for each of the first held-out trajectories, as many as there are `stand_ins`; the other candidate is the
-    target of another held-out trajectory of the same category. Which side is right is written to `key_path` only.
+    The other candidate is the target of a held-out trajectory of another object of the same category. Where there is
+    one, its object has no row of its own: rows must not tell of one another. Which side is right is written to
+    `key_path` only.
 
     Args:
         path: The PNG to write.
@@ -142,37 +144,38 @@ def line_up(
         category: The category of each, `(n,)`.
         blank: The visual image of the empty sensor, in [0, 1]; the prediction is also shown with four times its
             difference from it, since a blurred one is faint.
-        stand_ins: The predicted poses as pictures in [0, 1], `(rows, h, w, 3)`: some object of the category at each,
-            the same one whatever the trajectory's own looks like, so that they tell the pose alone.
+        stand_ins: The predicted poses of the rows as pictures in [0, 1], `(rows, h, w, 3)`: some object of the category
+            at each, the same one whatever the trajectory's own looks like, so that they tell the pose alone.
+        rows: Which held-out trajectories are shown, of different objects, `(rows,)`.
         seed: Of sides and other candidates.
     """
     if predicted.visual is None or predicted.tactile is None:
         raise ValueError("a line-up needs a prediction of both streams; give one of a model that has both.")
     rng = np.random.default_rng(seed)
-    num = min(len(stand_ins), len(test.visual))
-    figure, axes = plt.subplots(num, 8, figsize=(12.5, 1.5 * num + 0.6), squeeze=False)
+    figure, axes = plt.subplots(len(rows), 8, figsize=(12.5, 1.5 * len(rows) + 0.6), squeeze=False)
+    shown = np.isin(test.object, test.object[rows])
     answers = []
-    for row in range(num):
-        same = np.flatnonzero((category == category[row]) & (np.arange(len(category)) != row))
-        if len(same) == 0:
-            same = np.flatnonzero(np.arange(len(category)) != row)
-        sides = [row, int(rng.choice(same))]
+    for place, own in enumerate(rows):
+        others = test.object != test.object[own]
+        same = others & (category == category[own])
+        choices = [same & ~shown, same, others, np.arange(len(shown)) != own]
+        other = int(rng.choice(np.flatnonzero(next(c for c in choices if c.any()))))
         right = int(rng.integers(2))
         answers.append("AB"[right])
-        a, b = sides if right == 0 else sides[::-1]
+        a, b = (own, other) if right == 0 else (other, own)
         images = [
-            predicted.visual[row],
-            blank + 4 * (predicted.visual[row] - blank),
-            predicted.tactile[row],
-            stand_ins[row],
+            predicted.visual[own],
+            blank + 4 * (predicted.visual[own] - blank),
+            predicted.tactile[own],
+            stand_ins[place],
             *(stream[i, 1] / 255 for i in (a, b) for stream in (test.visual, test.tactile)),
         ]
         heads = ["prediction", "contrast x 4", "(touch)", "(pose)", "A", "(touch)", "B", "(touch)"]
-        for axis, image, head in zip(axes[row], images, heads, strict=True):
+        for axis, image, head in zip(axes[place], images, heads, strict=True):
             _show(axis, image)
-            if row == 0:
+            if place == 0:
                 axis.set_title(head, fontsize=9)
-        axes[row, 0].set_ylabel(str(row + 1), fontsize=9, rotation=0, labelpad=12)
+        axes[place, 0].set_ylabel(str(place + 1), fontsize=9, rotation=0, labelpad=12)
     _save(figure, path)
     key_path.write_text(json.dumps(answers) + "\n")
 

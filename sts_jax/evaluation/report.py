@@ -33,7 +33,6 @@ class Scores(NamedTuple):
     outcome: np.ndarray | None  # int (n,)
 
 
-IMAGE_SCORES = ("visual", "visual_object", "tactile", "tactile_object")
 CONSTANT, COPY, NEIGHBOUR = "constant (mean training target)", "copy of the input", "nearest neighbour"
 
 

@@ -77,6 +77,8 @@ def stand_ins(
     Returns:
         Images in [0, 1].
     """
+    if np.any((category < 0) | (category >= len(objects.CATEGORIES))):
+        raise ValueError(f"categories {category.tolist()}: a stand-in is one of the {len(objects.CATEGORIES)} classes")
     images = []
     for index, where in zip(category, jnp.asarray(poses, jnp.float32), strict=True):
         body = objects.make(jax.random.key(0), objects.CATEGORIES[index])

@@ -2,7 +2,7 @@
 
 from sts_jax.mvae.conv import conv, conv_transpose
 from sts_jax.mvae.elbo import Terms, decode, infer, loss, predict
-from sts_jax.mvae.gaussian import Gaussian, kl_standard_normal, product_of_experts, sample
+from sts_jax.mvae.gaussian import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.mvae.networks import MVAE, BatchNorm, Config, Modality, init
 
 __all__ = [
@@ -21,5 +21,4 @@ __all__ = [
     "loss",
     "predict",
     "product_of_experts",
-    "sample",
 ]

@@ -38,7 +38,7 @@ class _Group(NamedTuple):
     asked: tuple[int, ...]  # per modality, how many of the subsets are asked for it
 
 
-def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...]) -> list[_Group]:
+def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...], *, empty: bool) -> list[_Group]:
     count = len(config.modalities)
     kept = sum(1 << i for i, name in enumerate(config.names) if name not in absent)
     groups: dict[int, _Group] = {}
@@ -48,7 +48,7 @@ def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...
         groups[old.members] = _Group(
             old.members, old.subsets + 1, tuple(a + b for a, b in zip(old.asked, more, strict=True))
         )
-    return [g for g in groups.values() if g.members or not kept]
+    return [g for g in groups.values() if g.members or empty or not kept]
 
 
 def loss(
@@ -95,12 +95,12 @@ def loss(
     """
     model = nnx.merge(graphdef, params, stats, copy=True)
     config = model.config
-    _check(config, asked, absent, targets)
+    _check(config, asked, absent, targets, {**inputs, **(present or {}), **(target_present or {})})
     absent = tuple(name for name in config.names if name in absent or name not in inputs)
     batch = len(next(iter(targets.values())))
     experts, mask = _experts(model, inputs, present or {}, absent, batch, training=True)
 
-    groups = _groups(config, asked, absent)
+    groups = _groups(config, asked, absent, empty=bool(present))  # a sample may have nothing only where masks say so
     members = jnp.array([[bool(g.members >> i & 1) for i in range(len(config.names))] for g in groups])
     left = members[:, :, None] & mask[None]
     counts = jnp.any(left, axis=1) | ~jnp.any(mask, axis=0)[None]  # (group, batch)
@@ -150,9 +150,12 @@ def infer(
         ValueError: nothing is given, or a name is unknown.
     """
     model = nnx.merge(graphdef, state)
-    unknown = sorted(set(inputs) - set(model.config.names))
+    unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
-        raise ValueError(f"inputs named {list(inputs)}; give at least one of {list(model.config.names)} and no other")
+        raise ValueError(
+            f"inputs named {list(inputs)}, masks {list(present or {})}; give at least one of "
+            f"{list(model.config.names)} and no other"
+        )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
     return product_of_experts(*_experts(model, inputs, present or {}, absent, batch, training=False))
@@ -195,11 +198,16 @@ def predict(
     return decode(graphdef, state, posterior.mean, condition=condition), posterior
 
 
-def _check(config: Config, asked: str, absent: tuple[str, ...], targets: dict[str, Array]) -> None:
+def _check(
+    config: Config, asked: str, absent: tuple[str, ...], targets: dict[str, Array], given: dict[str, Array]
+) -> None:
     if asked not in ("all", "own"):
         raise ValueError(f"asked={asked!r}; known are 'all' and 'own'")
     if set(absent) - set(config.names):
         raise ValueError(f"absent={absent}; the model has {config.names}")
+    unknown = sorted(set(given) - set(config.names))
+    if unknown:
+        raise ValueError(f"inputs or masks named {unknown}; the model has {config.names}")
     if set(targets) != set(config.names):
         raise ValueError(f"targets named {sorted(targets)}; the model needs {sorted(config.names)}")
 

@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 
 class Gaussian(NamedTuple):
@@ -37,8 +36,3 @@ def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"
 def kl_standard_normal(g: Gaussian) -> Float[Array, "*batch"]:
     """Divergence from the prior in nats, `KL(g || N(0, I)) = sum(mean^2 + var - 1 - log var) / 2`."""
     return 0.5 * jnp.sum(g.mean**2 + jnp.exp(g.log_var) - 1 - g.log_var, axis=-1)
-
-
-def sample(key: PRNGKeyArray, g: Gaussian) -> Float[Array, "*batch latent"]:
-    """One draw, `mean + sqrt(var) eps` with `eps ~ N(0, I)`; consumes `key`."""
-    return g.mean + jnp.exp(0.5 * g.log_var) * jax.random.normal(key, g.mean.shape, g.mean.dtype)

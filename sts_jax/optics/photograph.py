@@ -23,10 +23,9 @@ def photograph(
     target: Float[Array, "3"],
     fov: float = 0.5,
     resolution: tuple[int, int] = (200, 200),
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     two_sided: Bool[Array, ""] | bool = False,
 ) -> Float[Array, "h w 3"]:
-    """A picture of triangles from a free viewpoint, z up, by daylight and a lamp.
+    """A picture of triangles from a free viewpoint, z up, by daylight and a lamp, on white.
 
     Args:
         vertices: World frame (m).
@@ -37,7 +36,6 @@ def photograph(
         target: What is in the middle of the picture (m).
         fov: Vertical field of view (rad).
         resolution: (height, width), pixels.
-        background: sRGB where there is nothing.
         two_sided: Whether faces are seen from behind too.
 
     Returns:
@@ -70,6 +68,6 @@ def photograph(
     up = 0.5 + 0.5 * normal[..., 2:]
     light = up * jnp.array(_SKY) + (1 - up) * jnp.array(_GROUND)
     light += jnp.maximum(normal @ lamp, 0)[..., None] * jnp.array(_LAMP)
-    image = jnp.where((winner >= 0)[..., None], to_srgb(values[..., 3:] * light), jnp.array(background))
+    image = jnp.where((winner >= 0)[..., None], to_srgb(values[..., 3:] * light), 1.0)
     image = image.reshape(resolution[0], _SAMPLES, resolution[1], _SAMPLES, 3).mean((1, 3))
     return jnp.clip(image, 0, 1)

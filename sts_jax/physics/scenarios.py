@@ -54,6 +54,12 @@ class Freefall:
     friction: tuple[float, float] = (0.4, 0.8)
     contact: Contact = dataclasses.field(default_factory=Contact)
 
+    @property
+    def rise(self) -> float:
+        """How far (m) an object rises in the interval before frame 0, by semi-implicit Euler's sum t (t - dt) / 2."""
+        time = 1 / self.rate
+        return G * time * (time - self.contact.timestep) / 2
+
     def hidden(self, key: PRNGKeyArray) -> Hidden:
         """Draws the hidden values of one trajectory; consumes `key`."""
         keys = jax.random.split(key, 3)
@@ -74,11 +80,8 @@ class Freefall:
         r = self.spread * jnp.sqrt(jax.random.uniform(radius))
         a = jax.random.uniform(angle, maxval=2 * jnp.pi)
         lowest = jnp.min(hull @ _math.quat_matrix(quat)[2])
-        time = 1 / self.rate
-        # Semi-implicit Euler from here ends at rest at `height`: its sum over n steps is t (t - dt) / 2.
-        rise = G * time * (time - self.contact.timestep) / 2
-        position = jnp.stack([r * jnp.cos(a), r * jnp.sin(a), self.height - rise - lowest])
-        velocity = jnp.zeros(6).at[2].set(G * time)
+        position = jnp.stack([r * jnp.cos(a), r * jnp.sin(a), self.height - self.rise - lowest])
+        velocity = jnp.zeros(6).at[2].set(G / self.rate)
         return Start(jnp.concatenate([position, quat]), velocity, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "c"]) -> Float[Array, "3"]:

@@ -32,7 +32,9 @@ class Trajectory(NamedTuple):
     time: Float[Array, "n f"]  # s, 0 at frame 0
     pose: Float[Array, "n f 7"]  # mesh frame in the sensor frame, w >= 0
     velocity: Float[Array, "n f 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
-    wrench: Float[Array, "n f 6"]  # N, N m about the sensor's origin: what the pad exerts, mean of (t - dt, t]
+    wrench: Float[
+        Array, "n f 6"
+    ]  # N, N m about the sensor's origin: the pad's; mean over the contact that ends (t - dt, t]
     contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
     gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
     settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
@@ -111,6 +113,11 @@ def _check(bodies: Sequence[Body], scenario: Freefall, num: int) -> None:
     for name in ("height", "spread"):
         if not (np.isfinite(getattr(scenario, name)) and getattr(scenario, name) >= 0):
             raise ValueError(f"scenario.{name} is {getattr(scenario, name)} m; it must be finite and not negative")
+    if scenario.height <= scenario.rise:
+        raise ValueError(
+            f"scenario.height is {scenario.height} m: one interval (1 / rate) before frame 0 an object is "
+            f"{scenario.rise:.4f} m lower, in the pad; raise height or rate"
+        )
     if scenario.fill[1] > 1:
         raise ValueError(f"scenario.fill is {scenario.fill}; a share is at most 1")
     if scenario.frames < 1:

@@ -28,6 +28,10 @@ class Preprocessing:
     touch_threshold: float = 3 / 255  # a touch is one where a pixel differs from the blank gel by more than this
     absent: tuple[str, ...] = ()  # modalities that no training input ever had
 
+    def __post_init__(self) -> None:
+        if self.rotation not in ("matrix", "quaternion"):
+            raise ValueError(f"rotation={self.rotation!r}; known are 'matrix' and 'quaternion'")
+
     @property
     def pose_size(self) -> int:
         """Numbers in the code of a pose."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array
 
 from sts_jax import mvae
 from sts_jax.training.checkpoint import TrainState, read_settings, restore, save, write_text
@@ -123,7 +123,6 @@ def step(
     *,
     targets: Literal["all", "own"] = "all",
     absent: tuple[str, ...] = (),
-    augment: Callable[[PRNGKeyArray, Batch], Batch] | None = None,
 ) -> tuple[TrainState, mvae.Terms]:
     """One gradient step; the state keeps its structure and dtypes.
 
@@ -135,15 +134,12 @@ def step(
         batch: `Arrays.take`; uint8 becomes float32 in [0, 1] here.
         targets: `mvae.loss`, `asked`.
         absent: `mvae.loss`.
-        augment: changes a batch of floats; its key is its own.
 
     Returns:
         The state after, and the parts of the loss before.
     """
     batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
-    noise, augmentation = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
-    if augment is not None:
-        batch = augment(augmentation, batch)
+    noise = jax.random.fold_in(jax.random.key(config.seed), state.step)
     warmup = max(config.beta_warmup * total, 1)
     beta = jnp.minimum(state.step.astype(jnp.float32) / warmup, 1)
 
@@ -178,9 +174,7 @@ def train(
     workdir: str | os.PathLike[str],
     absent: tuple[str, ...] = (),
     targets: Literal["all", "own"] = "all",
-    augment: Callable[[PRNGKeyArray, Batch], Batch] | None = None,
     preprocessing: dict[str, Any] | None = None,
-    validate: Callable[[nnx.GraphDef[mvae.MVAE], nnx.State], dict[str, float]] | None = None,
     progress: Callable[[int, int, dict[str, float]], None] | None = None,
 ) -> Model:
     """Train a model in `workdir`, or go on where an earlier call on it stopped.
@@ -191,13 +185,11 @@ def train(
     Args:
         config: how.
         model: what.
-        arrays: the training set; what `augment` does is not part of what is compared on resuming.
+        arrays: the training set.
         workdir: the model's folder: `config.json`, `metrics.jsonl`, `checkpoints/`.
         absent: modalities present in no sample; they may be missing from `arrays.inputs`.
         targets: `all` or `own`, see `mvae.loss`.
-        augment: pure and traceable, `(key, batch) -> batch` on floats.
         preprocessing: plain values for `config.json`: how images and vectors were made.
-        validate: called at every checkpoint with the definition and the state; its numbers join the record.
         progress: called after every step with the steps done, their total, and the latest record of
             `metrics.jsonl` (empty before the first).
 
@@ -228,9 +220,7 @@ def train(
         log = workdir / "metrics.jsonl"
         record = _truncate(log, start)
         compiled = jax.jit(
-            lambda state, batch: step(
-                graphdef, config, total, state, batch, targets=targets, absent=absent, augment=augment
-            ),
+            lambda state, batch: step(graphdef, config, total, state, batch, targets=targets, absent=absent),
             donate_argnums=0,
         )
         recent: list[mvae.Terms] = []
@@ -241,8 +231,6 @@ def train(
             if done % config.log_every == 0 or done == total:
                 record = _record(done, recent)
                 recent = []
-                if at_checkpoint and validate is not None:
-                    record |= validate(graphdef, nnx.merge_state(state.params, state.stats))
                 with log.open("a") as file:
                     file.write(json.dumps(record) + "\n")
                 if not np.isfinite(record["loss"]):
@@ -327,6 +315,9 @@ def _check(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())
         if not needed <= set(values) <= set(model.names):
             raise ValueError(f"{kind} named {sorted(values)}; the model {sorted(model.names)} needs {sorted(needed)}")
+    for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
+        if not set(masks) <= set(model.names):
+            raise ValueError(f"{kind} named {sorted(masks)}; the model has {sorted(model.names)}")
     for modality in model.modalities:
         for values in (arrays.inputs, arrays.targets):
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
