@@ -170,12 +170,12 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         data.pairs(part["test"]),
     )
     blank = training.load_blank(model_folder(workdir, "mvae", config, split))[0] / 255
-    rows = evaluation.baselines(train_pairs, test)
+    rows = evaluation.baselines(config.collection.scenario, train_pairs, test)
     with Bar() as bar:
         jobs = list(queries(config, workdir, split))
         for number, (title, predictor, names) in enumerate(jobs):
             bar("evaluate", number, len(jobs), title)
-            rows[title] = predict(predictor, names, validation, test, blank)
+            rows[title] = predict(config.collection.scenario, predictor, names, validation, test, blank)
         scores = {title: evaluation.score(row, test) for title, row in rows.items()}
         summary = evaluation.summarise(scores, test)
         bar("evaluate", len(jobs), len(jobs), "intervals done")
@@ -230,6 +230,7 @@ def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, st
 
 
 def predict(
+    scenario: sts.physics.Scenario,
     predictor: sts.Predictor,
     names: tuple[str, ...],
     validation: dataset.Pairs,
@@ -254,7 +255,7 @@ def predict(
 
     out, outcome = run(test), None
     if out.pose is not None:
-        outcome = evaluation.outcome_of_pose(test.pose[:, 0], out.pose)
+        outcome = evaluation.outcome_of_pose(scenario, test.pose[:, 0], out.pose)
     elif out.visual is not None:
         score = evaluation.emptiness(np.asarray(run(validation).visual), blank)
         threshold = evaluation.metrics.best_threshold(score, validation.outcome != int(sts.physics.Outcome.FELL_OFF))

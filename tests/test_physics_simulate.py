@@ -78,7 +78,7 @@ def test_hidden_values_and_outcomes_are_in_range(drops: physics.Trajectory) -> N
     for name in ("fill", "shell_scale", "friction"):
         low, high = getattr(SCENARIO, name)
         assert np.all((getattr(drops.hidden, name) >= low) & (getattr(drops.hidden, name) <= high))
-    np.testing.assert_array_equal(drops.outcome, jax.vmap(physics.outcome)(drops.pose[:, 0], drops.pose[:, -1]))
+    np.testing.assert_array_equal(drops.outcome, jax.vmap(SCENARIO.outcome)(drops.pose[:, 0], drops.pose[:, -1]))
     assert np.mean(drops.touches >= 2) >= 0.75
     assert np.mean(drops.settled) >= 0.8
     assert np.all(drops.sunk < 0.003)
@@ -285,8 +285,8 @@ def test_progress_and_resampling(
 
 def test_the_outcome_is_read_from_the_last_pose() -> None:
     first = jnp.array([0, 0, 0.1, 1, 0, 0, 0])
-    assert int(physics.outcome(first, first.at[2].set(0.001))) == physics.Outcome.RESTS
-    assert int(physics.outcome(first, first.at[2].set(-0.02))) == physics.Outcome.FELL_OFF
+    assert int(SCENARIO.outcome(first, first.at[2].set(0.001))) == physics.Outcome.RESTS
+    assert int(SCENARIO.outcome(first, first.at[2].set(-0.02))) == physics.Outcome.FELL_OFF
 
 
 @pytest.mark.parametrize(

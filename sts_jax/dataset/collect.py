@@ -32,7 +32,7 @@ SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
 class Collection:
     """What a dataset is made of. Together with a `Sensor` it determines every byte."""
 
-    scenario: physics.Freefall = dataclasses.field(default_factory=physics.Freefall)
+    scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
     num_objects: int = 160  # procedural objects; the eight categories in turn
     num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
     num_full: int = 20  # trajectories with every frame rendered; of the others the first and the last
@@ -124,6 +124,8 @@ def collect(
             pad that is not square.
         OSError: The disk is full.
     """
+    if collection.symmetries and not isinstance(collection.scenario, physics.Freefall):
+        raise ValueError(f"symmetries=True with {type(collection.scenario).__name__}: its condition is not turned yet")
     sides = [float(side) for side in sensor.gel.size]
     if collection.symmetries and sides[0] != sides[1]:
         raise ValueError(f"symmetries=True with gel.size={sides}: only on a square pad is a turned fall a fall")

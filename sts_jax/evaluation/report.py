@@ -36,9 +36,9 @@ class Scores(NamedTuple):
 CONSTANT, COPY, NEIGHBOUR = "constant (mean training target)", "copy of the input", "nearest neighbour"
 
 
-def outcome_of_pose(first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """`physics.outcome` on poses `(n, 7)`, true or predicted."""
-    return np.asarray(jax.vmap(physics.outcome)(jnp.asarray(first), jnp.asarray(last)))
+def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """`scenario.outcome` of poses `(n, 7)`, true or predicted."""
+    return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
 
 
 def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
@@ -52,7 +52,7 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
     return np.abs(visual - blank).mean((1, 2, 3))
 
 
-def baselines(train: Pairs, test: Pairs) -> dict[str, Predicted]:
+def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
     """What can be said without learning: the mean target, the input itself, the target of the nearest input.
 
     The neighbour is the training item whose first visual image is nearest in squared distance.
@@ -80,7 +80,7 @@ def baselines(train: Pairs, test: Pairs) -> dict[str, Predicted]:
             test.visual[:, 0] / 255,
             test.tactile[:, 0] / 255,
             test.pose[:, 0],
-            outcome_of_pose(test.pose[:, 0], test.pose[:, 0]),
+            outcome_of_pose(scenario, test.pose[:, 0], test.pose[:, 0]),
         ),
         NEIGHBOUR: Predicted(
             train.visual[nearest, 1] / 255,

@@ -84,8 +84,7 @@ def stand_ins(
         body = objects.make(jax.random.key(0), objects.CATEGORIES[index])
         body = dataclasses.replace(body, colors=jnp.full_like(body.colors, _STAND_IN))
         lowest = jnp.min(_math.transform(where, body.vertices)[:, 2])
-        fell = physics.outcome(where, where) == int(physics.Outcome.FELL_OFF)
-        height = jnp.where(fell, -1.0, where[2] - lowest)
+        height = jnp.where(physics.fell_off(where), -1.0, where[2] - lowest)
         pose = where.at[2].set(height)[None]
         visual, _, _ = render_uint8(sensor, body, pose, jnp.zeros((1, 6)), resolution=resolution, crop=False)
         images.append(np.asarray(visual[0]) / 255)

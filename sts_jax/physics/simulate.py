@@ -17,7 +17,7 @@ from sts_jax.objects import Body
 from sts_jax.physics import contact, scene
 from sts_jax.physics.contact import Hull
 from sts_jax.physics.roll import SLOW_TIME, Record, State, initial, roll
-from sts_jax.physics.scenarios import Freefall, Hidden, Start, outcome
+from sts_jax.physics.scenarios import Hidden, Scenario, Start
 from sts_jax.physics.scene import Contact, mjx
 from sts_jax.sensor import Sensor
 
@@ -63,7 +63,7 @@ def _draw(
     draw: Int[Array, "n"],
     attempt: Int[Array, "n"],
     hulls: Float[Array, "b h 3"],
-    scenario: Freefall,
+    scenario: Scenario,
 ) -> tuple[Start, Hidden]:
     def one(body: Int[Array, ""], draw: Int[Array, ""], attempt: Int[Array, ""]) -> tuple[Start, Hidden]:
         own = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), draw), attempt)
@@ -74,7 +74,7 @@ def _draw(
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
-def _gravity(condition: Float[Array, "n c"], time: Float[Array, "f s"], scenario: Freefall) -> Float[Array, "n f s 3"]:
+def _gravity(condition: Float[Array, "n c"], time: Float[Array, "f s"], scenario: Scenario) -> Float[Array, "n f s 3"]:
     return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
 
 
@@ -90,38 +90,12 @@ def _roll(worlds: _Worlds, model: mjx.Model, data: mjx.Data) -> tuple[State, Rec
 _rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))
 
 
-def _steps(scenario: Freefall) -> int:
-    steps = 1 / (scenario.rate * scenario.contact.timestep)
-    if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
-        raise ValueError(
-            f"rate {scenario.rate}/s times timestep {scenario.contact.timestep} s must divide 1: "
-            f"{steps:.3f} steps per frame; choose another rate"
-        )
-    return round(steps)
-
-
-def _check(bodies: Sequence[Body], scenario: Freefall, num: int) -> None:
+def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
     if num < 1:
         raise ValueError(f"num is {num}; at least one trajectory of each body is needed")
     if not bodies:
         raise ValueError("no body was given; pass one Body or a sequence of them")
-    _steps(scenario)
-    for name in ("fill", "shell_scale", "friction"):
-        low, high = getattr(scenario, name)
-        if not (np.isfinite([low, high]).all() and low <= high and low >= 0 and (name == "fill" or low > 0)):
-            raise ValueError(f"scenario.{name} is {(low, high)}; it must be (low, high), positive and finite")
-    for name in ("height", "spread"):
-        if not (np.isfinite(getattr(scenario, name)) and getattr(scenario, name) >= 0):
-            raise ValueError(f"scenario.{name} is {getattr(scenario, name)} m; it must be finite and not negative")
-    if scenario.height <= scenario.rise:
-        raise ValueError(
-            f"scenario.height is {scenario.height} m: one interval (1 / rate) before frame 0 an object is "
-            f"{scenario.rise:.4f} m lower, in the pad; raise height or rate"
-        )
-    if scenario.fill[1] > 1:
-        raise ValueError(f"scenario.fill is {scenario.fill}; a share is at most 1")
-    if scenario.frames < 1:
-        raise ValueError(f"scenario.frames is {scenario.frames}; at least one is needed")
+    scenario.check()
     for i, body in enumerate(bodies):
         if body.hull.ndim != 2 or body.hull.shape[0] not in objects.HULL_CLASSES:
             raise ValueError(
@@ -168,7 +142,7 @@ def simulate(
     key: PRNGKeyArray,
     body: Body | Sequence[Body],
     sensor: Sensor,
-    scenario: Freefall,
+    scenario: Scenario,
     num: int = 1,
     *,
     hidden: Hidden | None = None,
@@ -184,7 +158,7 @@ def simulate(
         key: of the whole set.
         body: one, or a sequence of different ones.
         sensor: `sensor.gel.size` is the pad.
-        scenario: `Freefall()`.
+        scenario: `Freefall()` or `Perturbed()`.
         num: trajectories of each body.
         hidden: (bodies * num,) each, body-major: rolls the starts of `key` with these instead of drawn ones.
         progress: called with the number of trajectories done so far, after each chunk.
@@ -208,7 +182,7 @@ def simulate(
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
     _, model, data = scene.template(pad, scenario.contact)
     frame = np.arange(scenario.frames)[:, None] / scenario.rate
-    time = jnp.asarray(frame - np.arange(_steps(scenario), 0, -1) * scenario.contact.timestep)  # of each step
+    time = jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep)  # of each step
 
     def run(starts: Start, fields: dict[str, np.ndarray], indices: np.ndarray) -> tuple[State, Record]:
         padded = np.pad(indices, (0, chunk - len(indices)), "edge")
@@ -257,7 +231,7 @@ def simulate(
         contact=records.contact,
         gravity=_gravity(starts.condition, time[:, -1:], scenario=scenario)[:, :, 0],
         settled=frozen_or_slow,
-        outcome=jax.vmap(outcome)(records.pose[:, 0], records.pose[:, -1]),
+        outcome=jax.vmap(scenario.outcome)(records.pose[:, 0], records.pose[:, -1]),
         touches=last.touches,
         sunk=last.sunk,
         condition=starts.condition,
