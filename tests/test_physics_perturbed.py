@@ -39,14 +39,15 @@ def test_it_stands_and_is_felt_in_the_first_frame(bottles: list[objects.Body], s
     up = jax.vmap(upright)(jnp.asarray(shaken.pose[:, 0, 3:]))
     np.testing.assert_allclose(up, 1, atol=1e-4)
     assert np.all(np.linalg.norm(shaken.pose[:, 0, :2], axis=1) < SCENARIO.spread + 1e-4)
-    assert np.abs(shaken.velocity[:, 0]).max() < 5e-3
+    assert np.abs(shaken.velocity[:, 0, :3]).max() < 2e-3
+    assert np.abs(shaken.velocity[:, 0, 3:]).max() < 0.05
     weight = np.array([rigid(bottles, shaken, row)[0] * G for row in range(2 * NUM)])
     np.testing.assert_allclose(shaken.wrench[:, 0, 2], weight, rtol=0.02)
     assert shaken.contact[:, 0].all()
 
 
 def upright(quat: jax.Array) -> jax.Array:
-    """Cosine of the lean."""
+    """Cosine of the lean of quaternions, components first."""
     return 1 - 2 * (quat[1] ** 2 + quat[2] ** 2)
 
 
@@ -90,30 +91,40 @@ def driven(body: objects.Body, mass: float, com: np.ndarray, inertia: np.ndarray
     return model
 
 
-def test_a_pad_that_moves_does_the_same(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
-    held, apart, same = [], [], []
+def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
+    # Compared to the end of the jerk, while it stands or slides: afterwards small things decide, in one engine too.
+    told, ours, same = [], [], []
     for row in range(2 * NUM):
-        mass, com, inertia = rigid(bottles, shaken, row)
-        model = driven(bottles[shaken.body[row]], mass, com, inertia, float(shaken.hidden.friction[row]))
-        data = mujoco.MjData(model)
-        data.qpos[2:] = shaken.pose[row, 0]
-        *push, lasts = shaken.condition[row].astype(np.float64)
-        touching = True
-        for step in range(SCENARIO.steps * (SCENARIO.frames - 1)):
-            share = np.clip((lasts - step * 1e-3) / 1e-3, 0, 1)
-            data.qfrc_applied[:2] = 1e6 * mass * np.array(push) * share
-            mujoco.mj_step(model, data)
-            touching &= data.ncon > 0
-            frame, rest = divmod(step + 1, SCENARIO.steps)
-            if touching and rest == 0:
-                apart.append(np.linalg.norm(data.qpos[2:5] - [*data.qpos[:2], 0] - shaken.pose[row, frame, :3]))
-        held.append(touching)
-        last = jnp.asarray(data.qpos[2:] - [*data.qpos[:2], 0, 0, 0, 0, 0], jnp.float32)
+        body, friction = bottles[shaken.body[row]], float(shaken.hidden.friction[row])
+        moving = driven(body, *rigid(bottles, shaken, row), friction)
+        fixed = scene.compile_scene(np.asarray(body.hull), PAD, SCENARIO.contact)
+        scene.set_rigid(fixed, mujoco.MjData(fixed), *rigid(bottles, shaken, row), friction)
+        for model in (moving, fixed):
+            model.opt.iterations, model.opt.tolerance = 100, 0  # masses this far apart converge slowly
+        a, b = mujoco.MjData(moving), mujoco.MjData(fixed)
+        a.qpos[2:] = b.qpos[:] = shaken.pose[row, 0]
+        condition = jnp.asarray(shaken.condition[row])
+        times = jnp.arange(SCENARIO.steps * (SCENARIO.frames - 1)) * SCENARIO.contact.timestep
+        gravity = np.asarray(jax.vmap(lambda t, c=condition: SCENARIO.gravity(t, c))(times), np.float64)
+        touching, rocks, leans = True, False, np.max(np.arccos(np.minimum(upright(shaken.pose[row, :, 3:].T), 1)))
+        for time, own in zip(np.asarray(times), gravity, strict=True):
+            a.qfrc_applied[:2] = -moving.body("carriage").mass * own[:2]
+            fixed.opt.gravity[:] = own
+            mujoco.mj_step(moving, a)
+            mujoco.mj_step(fixed, b)
+            touching &= a.ncon > 0
+            rocks |= upright(b.qpos[3:]) < np.cos(np.radians(1))
+            if touching and not rocks and time < condition[2]:
+                told.append(np.linalg.norm(a.qpos[2:5] - [*a.qpos[:2], 0] - b.qpos[:3]))
+        last = jnp.asarray(a.qpos[2:] - [*a.qpos[:2], 0, 0, 0, 0, 0], jnp.float32)
         same.append(int(SCENARIO.outcome(jnp.asarray(shaken.pose[row, 0]), last)) == shaken.outcome[row])
-    # Until contact is lost for the first time, even for a millisecond: 0.1 mm, but for a bottle that rocks.
-    assert sum(held) >= 4
-    assert np.quantile(apart, 0.95) < 1e-4
-    assert np.max(apart) < 2e-3
+        if leans < np.radians(1):
+            ours.append(np.linalg.norm(last[:2] - shaken.pose[row, -1, :2]))
+    assert len(told) > 2 * NUM * 40
+    assert np.quantile(told, 0.95) < 1e-4
+    assert np.max(told) < 3e-4
+    assert len(ours) >= 5
+    assert np.median(ours) < 3e-4
     assert np.mean(same) >= 0.8
 
 
@@ -152,6 +163,7 @@ def test_a_tall_prism_topples_at_g_b_over_h(shape: str) -> None:
         gravity = np.stack([size * np.cos(ANGLES), size * np.sin(ANGLES), np.full(8, -G)], axis=-1)
         still = np.tile([0, 0, -G], (8, 1, 50, 1))
         pulled = np.tile(gravity[:, None, None], (1, 14, 50, 1))
+        pulled[:, :2, :, :2] *= np.linspace(0, 1, 100).reshape(2, 50, 1)  # sustained, not a blow
         last, _ = ROLL(own, data, hull, state, jnp.asarray(np.concatenate([still, pulled], axis=1), jnp.float32))
         lean = np.degrees(np.arccos(np.asarray(jax.vmap(upright)(last.qpos[:, 3:]))))
         assert np.all((lean > 20) == falls), (factor, lean)
