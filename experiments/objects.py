@@ -2,7 +2,7 @@
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-About 20 seconds on two CPU cores for 8 x 10 objects. `--view below` is what the sensor faces, `--shuffle` deals the
+About 20 seconds on two CPU cores for 8 x 10 objects. `--view side` is what a person sees, `--view below` what the sensor faces, `--shuffle` deals the
 objects out without rows or names, for someone else to tell apart.
 """
 
@@ -23,6 +23,7 @@ DISTANCE = 0.42  # m, from the photographer to the object
 FIELD = 0.36  # rad, so that 150 mm fill the frame
 EYES = {  # direction to the photographer: x right, y back, z up
     "quarter": (-0.45, -0.75, 0.5),
+    "side": (-0.45, -0.85, 0.2),
     "above": (0.0, -0.05, 1.0),
     "below": (0.0, -0.05, -1.0),
 }
@@ -36,7 +37,7 @@ class Config:
     seed: int = 0
     num: int = 10  # objects of each family
     categories: tuple[str, ...] = sts.objects.CATEGORIES
-    view: Literal["quarter", "above", "below"] = "quarter"
+    view: Literal["quarter", "side", "above", "below"] = "quarter"
     size: int = 160  # pixels, side of one object's picture
     shuffle: bool = False  # in random order, numbered instead of named; the answers go to OUT with suffix .txt
 
