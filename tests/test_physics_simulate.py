@@ -297,8 +297,7 @@ def test_the_outcome_is_read_from_the_last_pose() -> None:
         ({"shell_scale": (1.1, 0.9)}, 1, r"scenario.shell_scale"),
         ({"fill": (0.0, 1.5)}, 1, r"scenario.fill"),
         ({"height": float("nan")}, 1, r"scenario.height"),
-        ({"height": 0.004}, 1, r"scenario.height is 0.004 m"),
-        ({"rate": 8.0}, 1, r"scenario.height .* raise height or rate"),
+        ({"tilt": -0.1}, 1, r"scenario.tilt"),
         ({"rate": 30.0}, 1, "rate 30"),
         ({"frames": 0}, 1, r"scenario.frames"),
     ],
@@ -313,8 +312,9 @@ def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: 
     [
         ({"shell_mass": jnp.float32(-0.1)}, "body 1: shell_mass is -0.1"),
         ({"shell_mass": jnp.float32(jnp.nan)}, "body 1: shell_mass is nan"),
-        ({"hull": jnp.full((64, 3), jnp.nan)}, "body 1: hull has a non-finite"),
-        ({"hull": jnp.zeros((64, 3))}, "no volume"),
+        ({"hulls": jnp.full((1, 64, 3), jnp.nan)}, "body 1: hulls has a non-finite"),
+        ({"hulls": jnp.zeros((1, 64, 3))}, "no volume"),
+        ({"hulls": jnp.zeros((3, 64, 3))}, "body 1: hulls has shape"),
         ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
     ],
 )
@@ -325,12 +325,14 @@ def test_bad_bodies_are_named(bodies: list[objects.Body], change: dict, match: s
 
 
 def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:
-    good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2))
+    good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2), np.tile(np.float32([0, 0, 1]), (2, 1)))
     with pytest.raises(ValueError, match=r"hidden.fill has shape \(2,\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 3, hidden=good)
     with pytest.raises(ValueError, match=r"hidden.friction has values outside"):
         physics.simulate(
             jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(friction=-np.ones(2))
         )
+    with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 3\)"):
+        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.ones((2, 3))))
     with pytest.raises(ValueError, match="no body"):
         physics.simulate(jax.random.key(0), [], Sensor(), SCENARIO)

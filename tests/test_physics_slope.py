@@ -74,7 +74,7 @@ def test_it_slides_as_in_c() -> None:
         for frame in range(frames + 2):
             model.opt.gravity[:] = G * np.array([*(np.sin(SLOPE) * down), -np.cos(SLOPE)]) if frame > 1 else [0, 0, -G]
             mujoco.mj_step(model, data, nstep=STEPS)
-        np.testing.assert_allclose(found.pose[row, -1, :3], data.qpos[:3], atol=2e-4)
+        np.testing.assert_allclose(found.pose[row, -1, :3], data.qpos[:3], atol=3e-4)  # of 30 mm
 
 
 def test_a_ball_rolls_with_five_sevenths_of_the_pull() -> None:
@@ -158,26 +158,32 @@ def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], 
 
 
 def test_pad_and_wall_together_are_all_that_pushes() -> None:
-    model, like, data = scene.template(PAD, SCENARIO.contact, SCENARIO.wall)
+    model, like, data = scene.template(PAD, SCENARIO.contact, 0.03)
     model = copy.copy(model)
     scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
     own = like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like)))
     hull = contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None])
     data = data.replace(qpos=jnp.array([0, 0.0552, 0.0098, 1, 0, 0, 0]))
-    step = jax.jit(lambda data: scene.step(own, data, roll._contacts(own, jax.tree.map(jnp.asarray, hull), data.qpos)))
-    new = step(data)
+    contacts = roll._contacts(own, jax.tree.map(jnp.asarray, hull), data.qpos)
+    new = jax.jit(lambda data: scene.step(own, data, contacts))(data)
     pad, wall = scene.push(new, slice(0, 8)), scene.push(new, slice(8, 12))
     np.testing.assert_allclose(pad + wall, new.qfrc_constraint, rtol=1e-4, atol=1e-5)
     assert wall[1] < -0.1
     assert pad[2] > 0.1
-    in_c = scene.compile_scene(CORNERS[None], PAD, SCENARIO.contact, SCENARIO.wall)
+
+    in_c = scene.compile_scene(CORNERS[None], PAD, SCENARIO.contact, 0.03)
     state = mujoco.MjData(in_c)
-    scene.set_rigid(in_c, state, 0.1, np.zeros(3), INERTIA, 0.3)
     state.qpos[:] = data.qpos
     mujoco.mj_forward(in_c, state)
-    names = {in_c.geom(int(i)).name for pair in state.contact.geom for i in pair}
-    assert {"pad", "wall"} <= names
-    np.testing.assert_allclose(new.qfrc_constraint[:3], state.qfrc_constraint[:3], rtol=0.02, atol=0.02)
+    for name, ours in (("pad", slice(0, 8)), ("wall", slice(8, 12))):
+        theirs = (state.contact.geom == in_c.geom(name).id).any(1)
+        np.testing.assert_allclose(contacts.dist[ours].min(), state.contact.dist[theirs].min(), atol=1e-6)
+        deepest = int(contacts.dist[ours].argmin()) + ours.start
+        sign = np.where(state.contact.geom[theirs, :1] == in_c.geom(name).id, 1, -1)
+        np.testing.assert_allclose(contacts.frame[deepest, 0], (sign * state.contact.frame[theirs, :3])[0], atol=1e-5)
+        there = np.asarray(contacts.dist[ours] < 0)
+        box = np.asarray(contacts.pos[ours])[there]
+        np.testing.assert_allclose(np.ptp(box, 0), np.ptp(state.contact.pos[theirs], 0), atol=5e-4)
 
 
 def test_outcomes_are_read_from_the_poses() -> None:

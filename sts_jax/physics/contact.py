@@ -111,12 +111,12 @@ def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Arra
     return depth, corners - depth[:, None] * normal, normal
 
 
-def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"], num: int) -> Int[Array, "k"]:
+def _spread(depth: Float[Array, "c"], across: Float[Array, "c 2"], num: int) -> Int[Array, "k"]:
     deepest = jnp.max(depth)
     candidate = jnp.where(depth > jnp.maximum(0, deepest - SKIN), 0.0, -1e3)
     # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
     angle = 0.4 + 2 * np.pi * np.arange(num - 1) / (num - 1)
-    reach = [x * points[:, 0] + y * points[:, 1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
+    reach = [x * across[:, 0] + y * across[:, 1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
     score = jnp.stack([depth, *(r + STEEP * depth for r in reach)]) + candidate
     # XLA's argmax is slow on CPU: the largest value, then the first place where it stands.
     places = jnp.where(score == jnp.max(score, axis=1, keepdims=True), jnp.arange(len(depth)), len(depth) - 1)
@@ -129,7 +129,13 @@ def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
 
 
-def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"], num: int = PAD_CONTACTS) -> Contacts:
+def collide(
+    body: Hull,
+    pose: Float[Array, "7"],
+    half: Float[Array, "2"],
+    num: int = PAD_CONTACTS,
+    plane: tuple[int, int] = (0, 1),
+) -> Contacts:
     """The contacts of an object with a box whose top is centred in the origin.
 
     The deepest point is always among them; the others, within SKIN of its depth, reach farthest in fixed directions.
@@ -139,6 +145,7 @@ def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"], num: i
         pose: (7,) mesh frame in the frame of the box's top.
         half: (2,) m, half the box's size; its top is z = 0, its depth has no end.
         num: how many contacts.
+        plane: the axes of the plane in which they are to reach far.
     """
     rotation = _math.quat_matrix(pose[3:])
     points = jnp.reshape(body.vertices, (-1, 3)) @ rotation.T + pose[:3]
@@ -149,7 +156,7 @@ def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"], num: i
     corners = [_corners(part, half) for part in planes]
     kinds = [_vertices(points, half), *rims, *corners]
     depth, points, normal = (jnp.concatenate(x) for x in zip(*kinds, strict=True))
-    chosen = _spread(depth, points, num)
+    chosen = _spread(depth, points[:, jnp.array(plane)], num)
     new = jnp.sum(jnp.tril(chosen == chosen[:, None]), axis=1) == 1
     depth, points, normal = depth[chosen], points[chosen], normal[chosen]
     dist = jnp.where(new & (depth > 0), -depth, 1.0)

@@ -74,8 +74,9 @@ def _fixed(model: mjx.Model) -> list[tuple[Array, Array]]:
 
 def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts:
     found = []
-    for (top, half), num in zip(_fixed(model), (PAD_CONTACTS, WALL_CONTACTS), strict=False):
-        own = collide(hull, pose.at[:3].add(-top), half, num)
+    kinds = ((PAD_CONTACTS, (0, 1)), (WALL_CONTACTS, (0, 2)))  # the pad lies in x y, the wall's face in x z
+    for (top, half), (num, plane) in zip(_fixed(model), kinds, strict=False):
+        own = collide(hull, pose.at[:3].add(-top), half, num, plane)
         found.append(own._replace(pos=own.pos + top))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 

@@ -296,12 +296,12 @@ class Inclined(_Common):
 Scenario = Freefall | Inclined | Perturbed
 
 
-def variant(scenario: Scenario, name: Variant) -> Scenario:
+def variant(scenario: Scenario, name: str) -> Scenario:
     """A scenario with other hidden values.
 
     Args:
         scenario: whose other fields stay.
-        name: `off`: nothing is hidden, every value is the middle of its range and contents have settled at the base;
+        name: one of `Variant`. `off`: nothing is hidden, every value is the middle of its range and contents have settled at the base;
             `wide-friction`: friction U(.3, .9); `off-centre`: contents frozen in any direction.
 
     Raises:

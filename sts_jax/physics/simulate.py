@@ -143,8 +143,6 @@ def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
 
 def _check_hidden(hidden: Hidden, count: int) -> Hidden:
     lengths = np.linalg.norm(hidden.up, axis=-1)
-    if lengths.shape != (count,) or not np.allclose(lengths, 1, atol=1e-3):
-        raise ValueError(f"hidden.up has shape {np.shape(hidden.up)}; expected ({count}, 3), unit vectors")
     for name, values in hidden._replace(up=lengths)._asdict().items():
         values = np.asarray(values)
         if values.shape != (count,):
@@ -152,6 +150,8 @@ def _check_hidden(hidden: Hidden, count: int) -> Hidden:
         low, high = (0, 1) if name == "fill" else (np.finfo(np.float32).tiny, np.finfo(np.float32).max)
         if not ((values >= low) & (values <= high)).all():
             raise ValueError(f"hidden.{name} has values outside [{low}, {high}]")
+    if not np.allclose(lengths, 1, atol=1e-3):
+        raise ValueError(f"hidden.up has shape {np.shape(hidden.up)}; expected ({count}, 3), unit vectors")
     return Hidden(*(jnp.asarray(x, jnp.float32) for x in hidden))
 
 
