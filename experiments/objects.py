@@ -2,8 +2,8 @@
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-About 20 seconds on two CPU cores for 8 x 10 objects. `--view side` is what a person sees, `--view below` what the sensor faces, `--shuffle` deals the
-objects out without rows or names, for someone else to tell apart.
+About 20 seconds on two CPU cores for 8 x 10 objects. `--view side` is what a person sees, `--view below` what the
+sensor faces; `--shuffle` deals the objects out without rows or names, for someone else to tell apart.
 """
 
 import dataclasses

@@ -68,9 +68,9 @@ def stack(bodies: Sequence[Body]) -> Body:
     for index, shape in enumerate(shapes):
         if shape != shapes[0]:
             raise ValueError(
-                f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, hulls of shape "
-                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}; body 0 has {len(bodies[0].faces)}, "
-                f"{bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class by itself"
+                f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, hulls "
+                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}; body 0 has "
+                f"{len(bodies[0].faces)}, {bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class by itself"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 

@@ -127,7 +127,8 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         loaded=jnp.where(contact, old.loaded + 1, 0),
         wall=wall,
     )
-    frozen = old._replace(qvel=jnp.zeros(6), impulse=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32), wall=False)
+    nothing = jax.tree.map(jnp.zeros_like, old)
+    frozen = old._replace(qvel=nothing.qvel, impulse=nothing.impulse, loaded=nothing.loaded, wall=nothing.wall)
     return jax.tree.map(lambda a, b: jnp.where(old.gone, a, b), frozen, now)
 
 

@@ -93,7 +93,7 @@ class _Common:
         z = jax.random.uniform(high, minval=math.cos(self.tilt), maxval=1.0)
         angle = jax.random.uniform(around, maxval=2 * jnp.pi)
         radius = jnp.sqrt(jnp.maximum(1 - z**2, 0))
-        return Hidden(*values, up=jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]))
+        return Hidden(*values, jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]))
 
     def check(self) -> None:
         """Insists on values that can be simulated.
@@ -285,7 +285,7 @@ class Inclined(_Common):
         return G * jnp.array([0.0, math.sin(self.slope), -math.cos(self.slope)])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """`FELL_OFF`, `ROLLS` (turned by more than 45 degrees about any axis), `SLIDES` (moved by 10 mm) or `STICKS`."""
+        """`FELL_OFF`, `ROLLS` (turned by 45 degrees or more, about any axis), `SLIDES` (moved by 10 mm) or `STICKS`."""
         same = jnp.abs(_math.normalize(first[3:]) @ _math.normalize(last[3:]))
         moved = _math.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STICKS)
@@ -301,8 +301,8 @@ def variant(scenario: Scenario, name: str) -> Scenario:
 
     Args:
         scenario: whose other fields stay.
-        name: one of `Variant`. `off`: nothing is hidden, every value is the middle of its range and contents have settled at the base;
-            `wide-friction`: friction U(.3, .9); `off-centre`: contents frozen in any direction.
+        name: one of `Variant`. `off`: nothing is hidden, every value is the middle of its range and contents have
+            settled at the base; `wide-friction`: friction U(.3, .9); `off-centre`: contents frozen in any direction.
 
     Raises:
         ValueError: unknown name.

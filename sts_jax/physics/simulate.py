@@ -135,7 +135,7 @@ def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
     def pad(arrays: Sequence[np.ndarray], mode: Literal["edge", "constant"]) -> np.ndarray:
         size = max(map(len, arrays))
         rest = ((0, 0),) * (arrays[0].ndim - 1)
-        return np.stack([np.pad(x, ((0, size - len(x)), *rest), mode) for x in arrays]).astype(np.float32)  # type: ignore[call-overload]
+        return np.stack([np.pad(x, ((0, size - len(x)), *rest), mode) for x in arrays]).astype(np.float32)
 
     points, rests, shares = zip(*found, strict=True)
     return Shape(pad(points, "edge"), pad(rests, "edge"), pad(shares, "constant"))
