@@ -4,13 +4,13 @@ Triangles are counter-clockwise seen from outside. A row of moments is `[1, x, y
 integrated over a solid or a surface.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, NUM_FILLS, Body
 
@@ -207,10 +207,129 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
     outside = (points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1)
     distance = np.zeros(len(points))
     triangles = hull[shape.simplices]
-    for index in np.nonzero(outside > 1e-9)[0]:
-        nearest = trimesh.triangles.closest_point(triangles, np.repeat(points[index][None], len(triangles), axis=0))
-        distance[index] = np.linalg.norm(nearest - points[index], axis=1).min()
+    rows = np.nonzero(outside > 1e-9)[0]
+    for some in np.array_split(rows, -(-len(rows) * len(triangles) // 200_000)) if len(rows) else []:
+        pairs = np.repeat(some, len(triangles))
+        nearest = trimesh.triangles.closest_point(np.tile(triangles, (len(some), 1, 1)), points[pairs])
+        distance[some] = np.linalg.norm(nearest - points[pairs], axis=1).reshape(len(some), -1).min(axis=1)
     return distance
+
+
+def surface_samples(
+    triangles: Float[np.ndarray, "f 3 3"], num: int
+) -> tuple[Int[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
+    """Places spread evenly by area over triangles, always the same: the face of each and its corners' weights."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    share = np.cumsum(np.linalg.norm(cross, axis=1))
+    face = np.searchsorted(share, (np.arange(num) + 0.5) / num * share[-1])
+    u, v = np.random.default_rng(0).random((2, num))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return face, np.stack([1 - u - v, u, v], axis=1)
+
+
+def _points(triangles: np.ndarray, num: int = 10_000) -> np.ndarray:
+    face, weight = surface_samples(triangles, num)
+    return np.einsum("nk,nkc->nc", weight, triangles[face])
+
+
+def convex_parts(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *,
+    limit: int = 8,
+    vertices_per_part: int = HULL_CLASSES[0],
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """A surface as several convex parts, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
+
+    The same mesh gives the same parts. Open surfaces are closed by the library first, which thickens them a little.
+
+    Args:
+        vertices: m.
+        faces: counter-clockwise from outside.
+        limit: most parts.
+        vertices_per_part: most vertices of each.
+
+    Returns:
+        The vertices of each part, m; one part where the surface is convex.
+
+    Raises:
+        ImportError: coacd is not installed.
+        ValueError: the surface cannot be decomposed.
+    """
+    try:
+        import coacd
+    except ImportError as error:
+        raise ImportError(
+            "convex parts need the package coacd, which is not installed: pip install 'sts_jax[meshes]'"
+        ) from error
+    coacd.set_log_level("off")
+    try:
+        pieces = coacd.run_coacd(
+            coacd.Mesh(np.asarray(vertices, float), np.asarray(faces, np.int32)),
+            max_convex_hull=limit,
+            resolution=1000,
+            mcts_nodes=10,
+            mcts_iterations=40,
+            seed=0,
+        )
+        parts = [convex_hull(np.asarray(corners, float), limit=vertices_per_part) for corners, _ in pieces]
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"no convex parts were found ({error}): keep the convex hull") from error
+    if not parts:
+        raise ValueError("no convex parts were found: keep the convex hull")
+    return sorted(parts, key=lambda part: (-ConvexHull(part).volume, *part[0]))
+
+
+def surface_gaps(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
+) -> tuple[float, float]:
+    """Largest distances (m) between the visible surface and what collides.
+
+    Both are taken over the vertices and 10,000 points of the one and exact to the other, so the first is exact for
+    one hull, and otherwise a peak between two points can be missed by about half their spacing.
+
+    Args:
+        vertices: m.
+        faces: of the visible surface.
+        hulls: the vertices of each convex part.
+
+    Returns:
+        How far the surface sticks out of every part: what is drawn sinks in by so much. How far the parts' common
+        outside stands off the surface: it collides by so much where nothing is seen, as in a bowl's hollow.
+    """
+    points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces])])
+    shapes = [ConvexHull(hull) for hull in hulls]
+    for shape in shapes:
+        points = points[(points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1) > 1e-9]
+    out = np.min([outside_hull(points, hull) for hull in hulls], axis=0).max(initial=0.0)
+
+    area = sum(shape.area for shape in shapes)
+    samples = []
+    for index, (hull, shape) in enumerate(zip(hulls, shapes, strict=True)):
+        some = np.concatenate([hull, _points(hull[shape.simplices], int(np.ceil(10_000 * shape.area / area)))])
+        for other in [*shapes[:index], *shapes[index + 1 :]]:
+            some = some[(some @ other.equations[:, :3].T + other.equations[:, 3]).max(axis=1) > -1e-7]
+        samples.append(some)
+    return float(out), _off_surface(np.concatenate(samples), vertices[faces])
+
+
+def _off_surface(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Largest distance of the points from the triangles.
+
+    A point's nearest corner or sample bounds its distance from above; only points that may exceed the largest known
+    distance are measured, each against the triangles that may be as near.
+    """
+    bound = KDTree(np.concatenate([_points(triangles), triangles.reshape(-1, 3)])).query(points)[0]
+    center = triangles.mean(axis=1)
+    reach = np.linalg.norm(triangles - center[:, None], axis=2).max(axis=1)
+    largest = 0.0
+    for index in np.argsort(-bound):
+        if bound[index] <= largest:
+            break
+        near = triangles[np.linalg.norm(center - points[index], axis=1) - reach <= bound[index]]
+        found = trimesh.triangles.closest_point(near, np.repeat(points[index][None], len(near), axis=0))
+        largest = max(largest, float(np.linalg.norm(found - points[index], axis=1).min()))
+    return largest
 
 
 def hull_gap(body: Body) -> float:
