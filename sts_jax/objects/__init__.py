@@ -11,9 +11,10 @@ from sts_jax.objects.body import (
     rigid,
     stack,
 )
+from sts_jax.objects.libraries import Entry, Item, Library, bodies, describe, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import fill_moments, hull_gap
+from sts_jax.objects.solids import convex_parts, fill_moments, hull_gap, surface_gaps
 
 __all__ = [
     "CATEGORIES",
@@ -22,11 +23,21 @@ __all__ = [
     "NUM_FILLS",
     "TEXTURE_CLASSES",
     "Body",
+    "Entry",
+    "Item",
+    "Library",
+    "bodies",
+    "convex_parts",
+    "describe",
     "fill_moments",
     "hull_gap",
+    "library",
     "load",
     "make",
     "mirror",
+    "read",
     "rigid",
     "stack",
+    "surface_gaps",
+    "survey",
 ]

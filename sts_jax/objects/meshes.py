@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -231,7 +232,9 @@ def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
         ) from error
     # Slivers, which nothing can be collapsed into, are welded first: by 1/1000 of the size and more.
     for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
-        vertices, faces = fast_simplification.simplify(*_welded(surface, weld), target_count=target)
+        vertices, faces = _welded(surface, weld)
+        if len(faces) > target:
+            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=target)
         if 0 < len(faces) <= target:
             break
     else:
@@ -365,8 +368,9 @@ def _found(folder: Path, name: str, images: Path | None) -> Path | None:
 
 
 def _named(file: Path, word: str) -> list[str]:
-    lines = (line.split(maxsplit=1) for line in file.read_text(errors="replace").splitlines())
-    return [line[1].strip() for line in lines if len(line) == 2 and line[0].lower() == word]
+    return re.findall(
+        rf"^[ \t]*{word}[ \t]+(\S.*?)\s*$", file.read_text(errors="replace"), re.IGNORECASE | re.MULTILINE
+    )
 
 
 def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
