@@ -475,7 +475,7 @@ def _keep(place: Path, entry: Entry) -> None:
 
 def _kept(place: Path, item: Item) -> Entry | None:
     try:
-        with np.load(place, allow_pickle=False) as data:
+        with place.open("rb") as file, np.load(file, allow_pickle=False) as data:
             body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})
             about = json.loads(data["about"].tobytes())
         return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]))

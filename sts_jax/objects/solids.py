@@ -204,10 +204,14 @@ def convex_hull(
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
     """Distance (m) of each point from a convex hull; 0 inside."""
     shape = ConvexHull(hull)
-    outside = (points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1)
-    distance = np.zeros(len(points))
+    normals, offsets = shape.equations[:, :3], shape.equations[:, 3]
+    sides = points @ normals.T + offsets
+    plane = np.argmax(sides, axis=1)
+    distance = np.maximum(sides[np.arange(len(points)), plane], 0.0)
+    # Where the foot on the plane it is furthest beyond lies on the hull, that was the distance; else an edge is nearer.
+    feet = points - distance[:, None] * normals[plane]
+    rows = np.nonzero((distance > 0) & ((feet @ normals.T + offsets).max(axis=1) > 1e-12))[0]
     triangles = hull[shape.simplices]
-    rows = np.nonzero(outside > 1e-9)[0]
     for some in np.array_split(rows, -(-len(rows) * len(triangles) // 200_000)) if len(rows) else []:
         pairs = np.repeat(some, len(triangles))
         nearest = trimesh.triangles.closest_point(np.tile(triangles, (len(some), 1, 1)), points[pairs])
@@ -225,11 +229,6 @@ def surface_samples(
     u, v = np.random.default_rng(0).random((2, num))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return face, np.stack([1 - u - v, u, v], axis=1)
-
-
-def _points(triangles: np.ndarray, num: int = 10_000) -> np.ndarray:
-    face, weight = surface_samples(triangles, num)
-    return np.einsum("nk,nkc->nc", weight, triangles[face])
 
 
 def convex_parts(
@@ -285,51 +284,68 @@ def surface_gaps(
 ) -> tuple[float, float]:
     """Largest distances (m) between the visible surface and what collides.
 
-    Both are taken over the vertices and 10,000 points of the one and exact to the other, so the first is exact for
-    one hull, and otherwise a peak between two points can be missed by about half their spacing.
+    Each is taken over the corners and 10,000 points of the one and exact to the other, so a peak between two points
+    can be missed by about half their spacing; the first is exact for one hull.
 
     Args:
         vertices: m.
-        faces: of the visible surface.
+        faces: of the visible surface, counter-clockwise from outside.
         hulls: the vertices of each convex part.
 
     Returns:
-        How far the surface sticks out of every part: what is drawn sinks in by so much. How far the parts' common
-        outside stands off the surface: it collides by so much where nothing is seen, as in a bowl's hollow.
+        How far the surface sticks out of every part: what is drawn sinks in by so much. How far from the surface, and
+        outside it, the parts reach: they collide by so much where nothing is seen, as in a bowl's hollow.
     """
-    points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces])])
+    points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
     for shape in shapes:
         points = points[(points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1) > 1e-9]
     out = np.min([outside_hull(points, hull) for hull in hulls], axis=0).max(initial=0.0)
 
-    area = sum(shape.area for shape in shapes)
-    samples = []
-    for index, (hull, shape) in enumerate(zip(hulls, shapes, strict=True)):
-        some = np.concatenate([hull, _points(hull[shape.simplices], int(np.ceil(10_000 * shape.area / area)))])
-        for other in [*shapes[:index], *shapes[index + 1 :]]:
-            some = some[(some @ other.equations[:, :3].T + other.equations[:, 3]).max(axis=1) > -1e-7]
-        samples.append(some)
-    return float(out), _off_surface(np.concatenate(samples), vertices[faces])
+    triangles = np.concatenate([hull[shape.simplices] for hull, shape in zip(hulls, shapes, strict=True)])
+    points = np.unique(np.concatenate([triangles.reshape(-1, 3), _points(triangles, 10_000)]), axis=0)
+    return float(out), _reach(points, vertices[faces])
 
 
-def _off_surface(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Largest distance of the points from the triangles.
+def _points(triangles: np.ndarray, num: int) -> np.ndarray:
+    face, weight = surface_samples(triangles, num)
+    return np.einsum("nk,nkc->nc", weight, triangles[face])
 
-    A point's nearest corner or sample bounds its distance from above; only points that may exceed the largest known
-    distance are measured, each against the triangles that may be as near.
+
+def _reach(points: np.ndarray, triangles: np.ndarray) -> float:
+    """Largest distance from the triangles of those points that lie outside them.
+
+    The nearest corner or sample bounds a point's distance from above, so only points that may exceed the largest found
+    so far are measured, each against the triangles that may be as near.
     """
-    bound = KDTree(np.concatenate([_points(triangles), triangles.reshape(-1, 3)])).query(points)[0]
+    bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
     center = triangles.mean(axis=1)
-    reach = np.linalg.norm(triangles - center[:, None], axis=2).max(axis=1)
-    largest = 0.0
-    for index in np.argsort(-bound):
-        if bound[index] <= largest:
+    radius = np.linalg.norm(triangles - center[:, None], axis=2).max(axis=1)
+    order, largest = np.argsort(-bound, kind="stable"), 0.0
+    for some in np.array_split(order, -(-len(order) // 128)):
+        if bound[some[0]] <= largest:
             break
-        near = triangles[np.linalg.norm(center - points[index], axis=1) - reach <= bound[index]]
-        found = trimesh.triangles.closest_point(near, np.repeat(points[index][None], len(near), axis=0))
-        largest = max(largest, float(np.linalg.norm(found - points[index], axis=1).min()))
+        apart = np.linalg.norm(center - points[some, None], axis=2)
+        row, column = np.nonzero(apart - radius <= bound[some, None] * (1 + 1e-9))
+        nearest = trimesh.triangles.closest_point(triangles[column], points[some][row])
+        distance = np.full(len(some), np.inf)
+        np.minimum.at(distance, row, np.linalg.norm(nearest - points[some][row], axis=1))
+        for index in np.argsort(-distance, kind="stable"):
+            if distance[index] <= max(largest, 1e-6):
+                break
+            if _turns(points[some[index]], triangles) < 0.5:
+                largest = float(distance[index])
     return largest
+
+
+def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
+    """How often the triangles wind around a point (van Oosterom and Strackee, 1983): 1 inside, 0 outside."""
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    across = np.einsum("fi,fi->f", a, np.cross(b, c))
+    dots = (np.einsum("fi,fi->f", left, right) for left, right in ((a, b), (b, c), (c, a)))
+    along = one * two * three + sum(dot * size for dot, size in zip(dots, (three, one, two), strict=True))
+    return float(np.arctan2(across, along).sum() / (2 * np.pi))
 
 
 def hull_gap(body: Body) -> float:

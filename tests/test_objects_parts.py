@@ -1,0 +1,101 @@
+"""Convex parts and the gaps between what is seen and what collides."""
+
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from sts_jax.objects import convex_parts, surface_gaps
+from sts_jax.objects.solids import outside_hull
+
+
+def corner_piece() -> trimesh.Trimesh:
+    """An L of two arms, 100 and 80 mm long and 20 mm thick, in the plane y = 0; its cavity is x > 20 mm, z > 20 mm."""
+    outline = np.array([[0, 0], [0.1, 0], [0.1, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
+    front = np.insert(outline, 1, -0.02, axis=1)
+    back = np.insert(outline, 1, 0.02, axis=1)
+    caps = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    ring = np.arange(6)
+    after = (ring + 1) % 6
+    sides = np.concatenate([np.stack([ring, after + 6, after], 1), np.stack([ring, ring + 6, after + 6], 1)])
+    return trimesh.Trimesh(np.vstack([front, back]), np.vstack([caps, caps[:, ::-1] + 6, sides]))
+
+
+def bowl(radius: float = 0.05, wall: float = 0.006) -> trimesh.Trimesh:
+    """Half a hollow ball, opening upwards."""
+    angle = np.linspace(0, np.pi / 2, 13)
+    profile = [[radius * np.sin(a), -radius * np.cos(a)] for a in angle]
+    profile += [[(radius - wall) * np.sin(a), -(radius - wall) * np.cos(a)] for a in angle[::-1]]
+    return trimesh.creation.revolve(np.array(profile), sections=32)
+
+
+def inside(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
+    """By linear programming's cousin: a point is inside where the hull of it and the part is the part."""
+    volumes = [trimesh.convex.convex_hull(part).volume for part in parts]
+    grown = [[trimesh.convex.convex_hull(np.vstack([part, point])).volume for part in parts] for point in points]
+    return (np.array(grown) <= np.array(volumes) * (1 + 1e-9)).any(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "free", "filled"),
+    [
+        (corner_piece(), [[0.03, 0, 0.03], [0.04, 0.01, 0.03], [0.025, 0, 0.05]], [[0.09, 0, 0.01], [0.01, 0, 0.07]]),
+        (bowl(), [[0, 0, -0.01], [0.02, 0, -0.015], [0, -0.02, -0.02]], [[0, 0, -0.047], [0.047, 0, -0.003]]),
+    ],
+    ids=["corner", "bowl"],
+)
+def test_parts_leave_the_cavity_free_and_the_hull_does_not(mesh, free, filled):
+    assert mesh.is_volume
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    parts = convex_parts(vertices, faces, limit=8, vertices_per_part=32)
+    assert 2 <= len(parts) <= 8
+    assert all(4 <= len(part) <= 32 for part in parts)
+    assert inside(np.array(free), [mesh.convex_hull.vertices]).all()
+    assert not inside(np.array(free), parts).any()
+    assert inside(np.array(filled), parts).all()
+    with_hull = surface_gaps(vertices, faces, [np.asarray(mesh.convex_hull.vertices)])
+    with_parts = surface_gaps(vertices, faces, parts)
+    assert with_parts[1] < 0.4 * with_hull[1]
+    assert with_parts[0] < 0.002
+    again = convex_parts(vertices, faces, limit=8, vertices_per_part=32)
+    assert all(np.array_equal(one, other) for one, other in zip(parts, again, strict=True))
+
+
+def test_gaps_of_known_shapes():
+    mesh = trimesh.creation.box((0.06, 0.04, 0.02))
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    assert surface_gaps(vertices, faces, [vertices]) == pytest.approx((0, 0), abs=1e-9)
+    # A hull 1 mm smaller all round: the corners stick out by its diagonal. One 2 mm higher stands off by as much.
+    small = vertices - 0.001 * np.sign(vertices)
+    assert surface_gaps(vertices, faces, [small])[0] == pytest.approx(0.001 * 3**0.5, rel=1e-6)
+    high = vertices + np.array([0, 0, 0.002]) * (vertices[:, 2:] > 0)
+    assert surface_gaps(vertices, faces, [high]) == pytest.approx((0, 0.002), abs=1e-9)
+    # Two halves that meet, or lie within, are the whole: their common face is inside.
+    halves = [np.where((vertices[:, :1] * sign < 0), [0, 1, 1], 1) * vertices for sign in (1, -1)]
+    assert surface_gaps(vertices, faces, halves) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_gap_of_a_corner_is_that_of_its_cavity():
+    mesh = corner_piece()
+    gaps = surface_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), [np.asarray(mesh.convex_hull.vertices)])
+    # The hull's slanted side from (100, 20) to (20, 80): furthest from both arms where it is as far from either.
+    along = np.linspace(0, 1, 100_001)
+    x, z = 0.1 - 0.08 * along, 0.02 + 0.06 * along
+    truth = np.minimum(z - 0.02, x - 0.02).max()
+    assert gaps == pytest.approx((0, truth), rel=0.01, abs=1e-9)
+
+
+def test_distance_from_a_hull_of_many_points_at_once():
+    rng = np.random.default_rng(0)
+    hull = trimesh.creation.box((0.2, 0.2, 0.2)).vertices
+    points = rng.uniform(-0.3, 0.3, (40_000, 3))
+    beyond = np.maximum(np.abs(points) - 0.1, 0)
+    np.testing.assert_allclose(outside_hull(points, np.asarray(hull)), np.linalg.norm(beyond, axis=1), atol=1e-9)
+
+
+def test_parts_name_their_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    mesh = corner_piece()
+    with pytest.raises(ImportError, match=r"coacd.*sts_jax\[meshes\]"):
+        convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
