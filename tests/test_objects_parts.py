@@ -24,10 +24,10 @@ def corner_piece() -> trimesh.Trimesh:
 
 def bowl(radius: float = 0.05, wall: float = 0.006) -> trimesh.Trimesh:
     """Half a hollow ball, opening upwards."""
-    angle = np.linspace(0, np.pi / 2, 13)
+    angle = np.linspace(0, np.pi / 2, 7)
     profile = [[radius * np.sin(a), -radius * np.cos(a)] for a in angle]
     profile += [[(radius - wall) * np.sin(a), -(radius - wall) * np.cos(a)] for a in angle[::-1]]
-    return trimesh.creation.revolve(np.array(profile), sections=32)
+    return trimesh.creation.revolve(np.array(profile), sections=16)
 
 
 def inside(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
@@ -58,8 +58,14 @@ def test_parts_leave_the_cavity_free_and_the_hull_does_not(mesh, free, filled):
     with_parts = surface_gaps(vertices, faces, parts)
     assert with_parts[1] < 0.4 * with_hull[1]
     assert with_parts[0] < 0.002
-    again = convex_parts(vertices, faces, limit=8, vertices_per_part=32)
+
+
+def test_parts_are_the_same_every_time():
+    vertices, faces = np.asarray(corner_piece().vertices), np.asarray(corner_piece().faces)
+    parts, again = convex_parts(vertices, faces), convex_parts(vertices, faces)
     assert all(np.array_equal(one, other) for one, other in zip(parts, again, strict=True))
+    volumes = [trimesh.convex.convex_hull(part).volume for part in parts]
+    assert volumes == sorted(volumes, reverse=True)
 
 
 def test_gaps_of_known_shapes():
@@ -84,6 +90,14 @@ def test_gap_of_a_corner_is_that_of_its_cavity():
     x, z = 0.1 - 0.08 * along, 0.02 + 0.06 * along
     truth = np.minimum(z - 0.02, x - 0.02).max()
     assert gaps == pytest.approx((0, truth), rel=0.01, abs=1e-9)
+
+
+def test_a_sheet_encloses_nothing():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    sheet = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0])
+    for faces in (sheet.faces, sheet.faces[:, ::-1]):
+        gaps = surface_gaps(np.asarray(sheet.vertices), np.asarray(faces), [np.asarray(sheet.convex_hull.vertices)])
+        assert gaps == pytest.approx((0, 0.04), rel=0.05, abs=1e-9)  # the middle of the open side
 
 
 def test_distance_from_a_hull_of_many_points_at_once():

@@ -304,7 +304,8 @@ def surface_gaps(
 
     triangles = np.concatenate([hull[shape.simplices] for hull, shape in zip(hulls, shapes, strict=True)])
     points = np.unique(np.concatenate([triangles.reshape(-1, 3), _points(triangles, 10_000)]), axis=0)
-    return float(out), _reach(points, vertices[faces])
+    closed = bool(trimesh.Trimesh(vertices, faces, process=False).is_watertight)
+    return float(out), _reach(points, vertices[faces], closed)
 
 
 def _points(triangles: np.ndarray, num: int) -> np.ndarray:
@@ -312,8 +313,8 @@ def _points(triangles: np.ndarray, num: int) -> np.ndarray:
     return np.einsum("nk,nkc->nc", weight, triangles[face])
 
 
-def _reach(points: np.ndarray, triangles: np.ndarray) -> float:
-    """Largest distance from the triangles of those points that lie outside them.
+def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
+    """Largest distance from the triangles of those points that lie outside them: all, where they enclose nothing.
 
     The nearest corner or sample bounds a point's distance from above, so only points that may exceed the largest found
     so far are measured, each against the triangles that may be as near.
@@ -321,20 +322,28 @@ def _reach(points: np.ndarray, triangles: np.ndarray) -> float:
     bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
     center = triangles.mean(axis=1)
     radius = np.linalg.norm(triangles - center[:, None], axis=2).max(axis=1)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     order, largest = np.argsort(-bound, kind="stable"), 0.0
     for some in np.array_split(order, -(-len(order) // 128)):
         if bound[some[0]] <= largest:
             break
         apart = np.linalg.norm(center - points[some, None], axis=2)
         row, column = np.nonzero(apart - radius <= bound[some, None] * (1 + 1e-9))
-        nearest = trimesh.triangles.closest_point(triangles[column], points[some][row])
+        away = points[some][row] - trimesh.triangles.closest_point(triangles[column], points[some][row])
+        lengths = np.linalg.norm(away, axis=1)
         distance = np.full(len(some), np.inf)
-        np.minimum.at(distance, row, np.linalg.norm(nearest - points[some][row], axis=1))
+        np.minimum.at(distance, row, lengths)
+        # Of a closed surface, the nearest faces say which side a point is on; where they disagree, the winding does.
+        nearest = lengths <= distance[row] + 1e-9
+        front = np.zeros((2, len(some)), bool)
+        np.logical_or.at(front, ((np.einsum("pi,pi->p", away, normals[column]) > 0).astype(int), row), nearest)
         for index in np.argsort(-distance, kind="stable"):
             if distance[index] <= max(largest, 1e-6):
                 break
-            if _turns(points[some[index]], triangles) < 0.5:
+            behind, before = front[:, index]
+            if not closed or (before and (not behind or _turns(points[some[index]], triangles) < 0.5)):
                 largest = float(distance[index])
+                break
     return largest
 
 
