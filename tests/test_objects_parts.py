@@ -2,12 +2,13 @@
 
 import sys
 
+import jax
 import numpy as np
 import pytest
 import trimesh
 
-from sts_jax.objects import convex_parts, surface_gaps
-from sts_jax.objects.solids import outside_hull
+from sts_jax import objects
+from sts_jax.objects.solids import convex_parts, outside_hull, surface_gaps
 
 
 def corner_piece() -> trimesh.Trimesh:
@@ -113,3 +114,42 @@ def test_parts_name_their_package(monkeypatch):
     mesh = corner_piece()
     with pytest.raises(ImportError, match=r"coacd.*sts_jax\[meshes\]"):
         convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def test_a_decomposed_body_is_the_body_but_for_its_hulls(tmp_path):
+    corner_piece().export(tmp_path / "corner.stl")
+    whole, body = objects.load(tmp_path / "corner.stl"), objects.load(tmp_path / "corner.stl", parts=True)
+    assert body.hulls.shape == (objects.PART_CLASSES[1], objects.HULL_CLASSES[0], 3)
+    assert len(np.unique(np.asarray(body.hulls), axis=0)) == 2
+    np.testing.assert_array_equal(body.hulls[2:], np.broadcast_to(body.hulls[1], body.hulls[2:].shape))
+    for name in ("vertices", "faces", "colors", "shell_mass", "shell_inertia", "interior", "category"):
+        np.testing.assert_array_equal(getattr(body, name), getattr(whole, name))
+    assert objects.gaps(whole)[1] == pytest.approx(0.0343, abs=5e-4)
+    assert max(objects.gaps(body)) < 0.002
+
+
+def test_what_is_convex_stays_as_it_is(tmp_path):
+    trimesh.creation.box((0.06, 0.04, 0.02)).export(tmp_path / "box.stl")
+    body = objects.load(tmp_path / "box.stl")
+    assert objects.decompose(body) is body
+    assert objects.gaps(body) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_scissors_open_up():
+    scissors = objects.make(jax.random.key(0), "scissors")
+    body = objects.decompose(scissors)
+    assert body.hulls.shape[0] == objects.PART_CLASSES[1]
+    assert objects.gaps(scissors)[1] > 0.02
+    assert objects.gaps(body)[1] < 0.01
+    assert objects.hull_gap(body) < 5e-4
+
+
+def test_a_library_decomposes_where_the_hull_is_wrong(tmp_path):
+    corner_piece().export(tmp_path / "corner.stl")
+    trimesh.creation.box((0.06, 0.04, 0.02)).export(tmp_path / "box.stl")
+    listed = objects.library(tmp_path, parts=True, cache=tmp_path / "kept")
+    box, corner = (objects.read(listed, index) for index in (0, 1))
+    assert (len(box.body.hulls), len(corner.body.hulls)) == (1, 8)
+    assert " in 2 parts; " in objects.describe(corner)
+    assert objects.read(listed, 1).gaps == corner.gaps
+    assert len(objects.read(objects.library(tmp_path, cache=tmp_path / "kept"), 1).body.hulls) == 1

@@ -4,9 +4,10 @@ from sts_jax.objects.body import (
     CATEGORIES,
     FACE_CLASSES,
     HULL_CLASSES,
-    NUM_FILLS,
+    PART_CLASSES,
     TEXTURE_CLASSES,
     Body,
+    fill_moments,
     mirror,
     rigid,
     stack,
@@ -14,30 +15,31 @@ from sts_jax.objects.body import (
 from sts_jax.objects.libraries import Entry, Item, Library, bodies, describe, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import convex_parts, fill_moments, hull_gap, surface_gaps
+from sts_jax.objects.solids import decompose, gaps, hull_gap, rest_poses
 
 __all__ = [
     "CATEGORIES",
     "FACE_CLASSES",
     "HULL_CLASSES",
-    "NUM_FILLS",
+    "PART_CLASSES",
     "TEXTURE_CLASSES",
     "Body",
     "Entry",
     "Item",
     "Library",
     "bodies",
-    "convex_parts",
+    "decompose",
     "describe",
     "fill_moments",
+    "gaps",
     "hull_gap",
     "library",
     "load",
     "make",
     "mirror",
     "read",
+    "rest_poses",
     "rigid",
     "stack",
-    "surface_gaps",
     "survey",
 ]

@@ -24,14 +24,15 @@ import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, HULL_CLASSES, NUM_FILLS, TEXTURE_CLASSES, Body
+from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
 from sts_jax.objects.meshes import PAD, load, references, rotation
 from sts_jax.objects.procedural import STEEL
-from sts_jax.objects.solids import WALL, surface_gaps
+from sts_jax.objects.solids import WALL, decompose, gaps
 
 LARGEST = 0.12  # m, longest side: what is larger is scaled down to it, so that it can lie on the 0.15 m pad
 SMALLEST = 0.005  # m, longest side: anything shorter has a wrong unit
 THINNEST = 0.0005  # m, a hull thinner than this is a sheet, on which no contact is stable
+HOLLOW = 0.002  # m, a hull that stands off the surface by more is worth decomposing
 NUM_FACES = 4096  # of the padding classes, the one up to which rendering stays cheap
 
 # ShapeNetSem's categories (the `category` column of its metadata.csv, named in its taxonomy.txt) by class. Its "Mouse"
@@ -94,6 +95,7 @@ class Library:
     cache: Path | None = None  # folder of what is made of the files
     faces: int = NUM_FACES  # what has more is decimated
     largest: float = LARGEST  # m
+    parts: bool = False  # whether what a hull fits badly collides as convex parts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +104,7 @@ class Entry:
 
     item: Item
     body: Body
-    gaps: tuple[float, float]  # m, see `surface_gaps`
+    gaps: tuple[float, float]  # m, by which the surface sticks out of what collides, and what collides off the surface
     notes: tuple[str, ...]
 
 
@@ -114,6 +116,7 @@ def library(
     longest_side: float | None = None,
     faces: int = NUM_FACES,
     largest: float = LARGEST,
+    parts: bool = False,
 ) -> Library:
     """The objects of a folder, listed without opening a mesh.
 
@@ -129,6 +132,8 @@ def library(
         longest_side: m, to which every object is scaled; None keeps their sizes.
         faces: what has more is decimated to so many.
         largest: m; what is longer is scaled down to it.
+        parts: decompose into convex parts what its hull stands off by more than 2 mm; else all keep their hulls. It
+            takes some ten seconds an object and the package coacd.
 
     Returns:
         The list, sorted by class and name.
@@ -167,6 +172,7 @@ def library(
         cache=None if cache is None else Path(cache),
         faces=faces,
         largest=largest,
+        parts=parts,
     )
 
 
@@ -310,7 +316,7 @@ def read(collection: Library, index: int) -> Entry:
         The body and what there is to say of it.
 
     Raises:
-        ImportError: it has more faces than the library asks for, and the package that decimates is not installed.
+        ImportError: it has more faces than the library asks for, or is to be decomposed, without the package for it.
         FileNotFoundError: the file is gone.
         ValueError: no body can be made of it; the message says why.
     """
@@ -389,7 +395,9 @@ def describe(entry: Entry) -> str:
     """The line of one object in a listing."""
     size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(entry.body.vertices), axis=0))
     drawn = int(np.asarray(entry.body.faces).any(axis=1).sum())
-    hull = f"{len(np.unique(np.asarray(entry.body.hull), axis=0))} vertices"
+    hulls = np.asarray(entry.body.hulls)
+    parts = f" in {len(np.unique(hulls, axis=0))} parts" if len(hulls) > 1 else ""
+    hull = f"{len(np.unique(hulls.reshape(-1, 3), axis=0))} vertices{parts}"
     out, off = entry.gaps
     facts = [size, f"{drawn} faces", hull, f"{out * 1e3:.2f} / {off * 1e3:.2f}", *entry.notes]
     return f"{entry.item.label}  {entry.item.name}: " + "; ".join(facts)
@@ -428,19 +436,24 @@ def _made(collection: Library, item: Item) -> Entry:
             category=CATEGORIES.index(item.label) if item.label in CATEGORIES else -1,
         )
     notes = [_short(warning.message, item) for warning in said]
-    vertices, faces = np.asarray(body.vertices, float), np.asarray(body.faces)
+    vertices = np.asarray(body.vertices, float)
     longest = float(np.ptp(vertices, axis=0).max())
     if longest < SMALLEST:
         raise ValueError(f"its longest side is {longest * 1e3:.2g} mm: is its unit right?")
     if item.stated is not None and not 0.9 < longest / min(item.stated, collection.largest) < 1.1:
         notes.append(f"the table's aligned.dims give a longest side of {item.stated * 1e3:.0f} mm")
-    shape = ConvexHull(np.asarray(body.hull, float))
+    shape = ConvexHull(np.asarray(body.hulls[0], float))
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:
         raise ValueError(f"it is a sheet {thickness * 1e3:.2g} mm thick, too flat to lie or slide on anything")
-    faces = faces[faces.any(axis=1)]
-    hulls = [np.unique(np.asarray(body.hull, float), axis=0)]
-    return Entry(item, body, surface_gaps(vertices, faces, hulls), (*item.notes, *notes))
+    apart = gaps(body)
+    if collection.parts and apart[1] > HOLLOW:
+        try:
+            body = decompose(body)
+            apart = gaps(body)
+        except ValueError as error:
+            notes.append(str(error))
+    return Entry(item, body, apart, (*item.notes, *notes))
 
 
 # The cache: one file an object, under a name that changes with all it depends on.
@@ -450,8 +463,8 @@ def _key(collection: Library, item: Item) -> str:
     digest = hashlib.sha256()
     fields = [field.name for field in dataclasses.fields(Body)]
     settings = [item.scale, item.longest_side, item.up, item.front, item.label, item.notes]
-    layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, TEXTURE_CLASSES, NUM_FILLS]
-    digest.update(json.dumps([layout, settings, collection.faces, collection.largest]).encode())
+    layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
+    digest.update(json.dumps([layout, settings, collection.faces, collection.largest, collection.parts]).encode())
     try:
         named = references(item.path, item.textures)
     except (OSError, ValueError):

@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull, KDTree
 
 from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body
-from sts_jax.objects.solids import CONTENTS, WALL, assemble, linear, surface_samples
+from sts_jax.objects.solids import CONTENTS, WALL, assemble, decompose, linear, surface_samples
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
 PLAIN = 0.7  # sRGB grey of a mesh that names no colour
@@ -63,6 +63,7 @@ def load(
     texture: str | os.PathLike[str] | None = None,
     textures: str | os.PathLike[str] | None = None,
     faces: int | None = None,
+    parts: bool = False,
     category: int = -1,
 ) -> Body:
     """A mesh file as a body; a scene's meshes become one.
@@ -91,6 +92,7 @@ def load(
         textures: another folder where the images that the file names may lie.
         faces: decimate what has more faces to so many, with a warning; its colours are then sampled from the texture,
             one to a corner, and the texture is left out. Needs the package fast-simplification.
+        parts: let it collide as convex parts instead of its hull (`decompose`). Needs the package coacd.
         category: index into CATEGORIES, or -1.
 
     Returns:
@@ -98,10 +100,10 @@ def load(
 
     Raises:
         FileNotFoundError: the file or the texture is not there; with `strict` also one that the file names.
-        ImportError: decimation without its package.
+        ImportError: decimation or decomposition without its package.
         ValueError: the file cannot be read as a mesh, has no faces, NaN, too many faces, no extent in some direction,
             is larger than the pad; `mass`, `density`, a size or direction is not what it should be; not closed and
-            `strict`; it cannot be decimated so far.
+            `strict`; it cannot be decimated so far, or decomposed.
     """
     path = Path(path)
     for name, value, unit in (
@@ -165,7 +167,11 @@ def load(
     surface = _surface(path, corners * _factor(path, corners, longest_side, scale, largest), *_albedo(path, pieces))
     if faces is not None and len(surface.faces) > faces:
         surface = _decimated(path, surface, faces)
-    return _body(path, surface, mass, density, hollow, strict, category)
+    body = _body(path, surface, mass, density, hollow, strict, category)
+    try:
+        return decompose(body) if parts else body
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 class _Surface(NamedTuple):
