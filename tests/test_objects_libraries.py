@@ -403,6 +403,7 @@ def test_decimation_of_loose_parts(tmp_path):
     )
     with pytest.warns(UserWarning, match="decimated from 5,120"), pytest.warns(UserWarning, match="not closed"):
         body = objects.load(tmp_path / "scales.ply", faces=1024)
+    assert body.vertices.shape == (1024, 3)
     np.testing.assert_allclose(np.ptp(surface(body).vertices, axis=0), 0.08, rtol=0.03)
 
 

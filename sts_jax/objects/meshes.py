@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull, KDTree
 
 from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body
-from sts_jax.objects.solids import CONTENTS, WALL, assemble, decompose, linear, surface_samples
+from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
 PLAIN = 0.7  # sRGB grey of a mesh that names no colour
@@ -90,8 +90,8 @@ def load(
         front: the direction in the file that becomes -y, once `up` is a direction too.
         texture: an image to use instead of what the file names, on the file's texture coordinates.
         textures: another folder where the images that the file names may lie.
-        faces: decimate what has more faces to so many, with a warning; its colours are then sampled from the texture,
-            one to a corner, and the texture is left out. Needs the package fast-simplification.
+        faces: decimate what has more faces or vertices to so many, with a warning; its colours are then sampled from
+            the texture, one to a corner, and the texture is left out. Needs the package fast-simplification.
         parts: let it collide as convex parts instead of its hull (`decompose`). Needs the package coacd.
         category: index into CATEGORIES, or -1.
 
@@ -165,7 +165,7 @@ def load(
         bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
         raise ValueError(f"{path}: {bad} faces have NaN or infinite vertices: repair the mesh")
     surface = _surface(path, corners * _factor(path, corners, longest_side, scale, largest), *_albedo(path, pieces))
-    if faces is not None and len(surface.faces) > faces:
+    if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
         surface = _decimated(path, surface, faces)
     body = _body(path, surface, mass, density, hollow, strict, category)
     try:
@@ -241,7 +241,7 @@ def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
         vertices, faces = _welded(surface, weld)
         if len(faces) > target:
             vertices, faces = fast_simplification.simplify(vertices, faces, target_count=target)
-        if 0 < len(faces) <= target:
+        if 0 < len(faces) <= target and len(vertices) <= target:
             break
     else:
         raise ValueError(
@@ -313,7 +313,11 @@ def _body(
                 f"{path}: the mesh {what}; its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
-        interior = (vertices, _outward(vertices, hull))
+        if len(hull.simplices) > max(len(faces), len(vertices)):  # so that the body stays in its class
+            points = convex_hull(vertices, limit=256, tolerance=0.0)
+            interior = (points, _outward(points, ConvexHull(points)))
+        else:
+            interior = (vertices, _outward(vertices, hull))
     try:
         return assemble(
             vertices,
