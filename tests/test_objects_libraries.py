@@ -218,6 +218,8 @@ def test_axes_and_size_of_any_folder(folder):
     # A glTF's +y is up and its +z is the front.
     turned = (truth.vertices - truth.center_mass) @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]).T
     same_points(surface(objects.bodies(objects.library(folder), [0])[0][0]).vertices, turned)
+    upright = objects.bodies(objects.library(folder, up="y"), [1])[0][0]  # the STL, read as the glTF is
+    same_points(surface(upright).vertices, turned)
     for arguments, size in (({"scale": 0.5}, 0.045), ({"longest_side": 0.03}, 0.03)):
         body = objects.bodies(objects.library(folder, **arguments), [1])[0][0]
         np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), size, rtol=1e-5)

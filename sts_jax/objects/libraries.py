@@ -17,7 +17,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +25,7 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
-from sts_jax.objects.meshes import PAD, load, references, rotation
+from sts_jax.objects.meshes import AXES, PAD, load, references, rotation
 from sts_jax.objects.procedural import STEEL
 from sts_jax.objects.solids import WALL, decompose, gaps
 
@@ -114,6 +114,7 @@ def library(
     cache: str | os.PathLike[str] | None = None,
     scale: float | None = None,
     longest_side: float | None = None,
+    up: Literal["x", "y", "z"] | None = None,
     faces: int = NUM_FACES,
     largest: float = LARGEST,
     parts: bool = False,
@@ -130,7 +131,8 @@ def library(
         cache: a folder, made where it is missing, that keeps what is made of each file; None makes it each time.
         scale: m, of one unit of the files; None takes ShapeNetSem's table, or one metre.
         longest_side: m, to which every object is scaled; None keeps their sizes.
-        faces: what has more is decimated to so many.
+        up: the files' axis that becomes +z; None takes ShapeNetSem's table, or "z", for glTF "y".
+        faces: what has more faces or vertices is decimated to so many.
         largest: m; what is longer is scaled down to it.
         parts: decompose into convex parts what its hull stands off by more than 2 mm; else all keep their hulls. It
             takes some ten seconds an object and the package coacd.
@@ -154,6 +156,8 @@ def library(
     ):
         if value is not None and not 0 < value <= most:
             raise ValueError(f"{folder}: {name} must be positive and at most {most} m, got {value}")
+    if up is not None and up not in AXES:
+        raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
     if faces < 4:
         raise ValueError(f"{folder}: faces must be at least 4, got {faces}")
     root = _shapenet_root(folder)
@@ -163,6 +167,8 @@ def library(
         raise ValueError(f"{folder}: holds no mesh that can be used: give a folder with mesh files in it{reasons}")
     if scale is not None or longest_side is not None:
         items = [dataclasses.replace(item, scale=scale, longest_side=longest_side, stated=None) for item in items]
+    if up is not None:
+        items = [dataclasses.replace(item, up=AXES[up][0], front=AXES[up][1]) for item in items]
     items.sort(key=lambda item: (item.label, item.name))
     return Library(
         folder=folder,
@@ -187,14 +193,14 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             if path.suffix.lower() in _OTHERS:
                 skipped.append(("/".join(parts), "trimesh cannot read it here: export it as glb, ply, obj or stl"))
             continue
-        upright = path.suffix.lower() not in (".glb", ".gltf")  # whose up is +y and front +z
+        above, front = AXES["y" if path.suffix.lower() in (".glb", ".gltf") else "z"]
         items.append(
             Item(
                 path=path,
                 name="/".join(parts),
                 label=parts[0] if len(parts) > 1 else folder.resolve().name,
-                up=_UP if upright else (0.0, 1.0, 0.0),
-                front=_FRONT if upright else (0.0, 0.0, 1.0),
+                up=above,
+                front=front,
             )
         )
     return items, skipped
@@ -383,10 +389,10 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
     number = Counter(item.label for item in items)
     head = [f"{len(items)} objects: " + ", ".join(f"{name} {number[name]}" for name in usable.classes)]
     if lines:
+        head.append("class  name: size (mm); faces; collision hull; gaps (mm); notes")
         head.append(
-            "class  name: size (mm); faces; collision hull; largest gaps (mm) by which the surface sticks out of"
+            "gaps: how far the surface sticks out of the hull at most / how far the hull stands off the surface"
         )
-        head.append("the hull / the hull stands off the surface; notes")
     tail = [f"{len(usable.skipped)} lines on what was left out:", *(f"{name}: {why}" for name, why in usable.skipped)]
     return usable, "\n".join([*head, *lines, *(tail if usable.skipped else [])]) + "\n"
 

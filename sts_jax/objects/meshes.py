@@ -21,7 +21,11 @@ PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
 PLAIN = 0.7  # sRGB grey of a mesh that names no colour
 
 # Up and front of a file whose up axis alone is given; front becomes -y. A glTF's front is its +z (its specification).
-_AXES = {"x": ((1, 0, 0), (0, 0, -1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, 1), (0, -1, 0))}
+AXES = {
+    "x": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    "y": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "z": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
+}
 
 
 def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "3 3"]:
@@ -123,12 +127,12 @@ def load(
     if faces is not None and faces < 4:
         raise ValueError(f"{path}: faces must be at least 4, got {faces}")
     if isinstance(up, str):
-        if up not in _AXES or front is not None:
+        if up not in AXES or front is not None:
             raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers where front is given, got {up!r}")
-        turn = rotation(*_AXES[up])
+        turn = rotation(*AXES[up])
     else:
         try:
-            turn = rotation(up, _AXES["z"][1] if front is None else front)
+            turn = rotation(up, AXES["z"][1] if front is None else front)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
     if not path.is_file():
