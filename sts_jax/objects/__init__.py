@@ -12,9 +12,10 @@ from sts_jax.objects.body import (
     rigid,
     stack,
 )
+from sts_jax.objects.libraries import Entry, Item, Library, bodies, describe, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import hull_gap, rest_poses
+from sts_jax.objects.solids import decompose, gaps, hull_gap, rest_poses
 
 __all__ = [
     "CATEGORIES",
@@ -23,12 +24,22 @@ __all__ = [
     "PART_CLASSES",
     "TEXTURE_CLASSES",
     "Body",
+    "Entry",
+    "Item",
+    "Library",
+    "bodies",
+    "decompose",
+    "describe",
     "fill_moments",
+    "gaps",
     "hull_gap",
+    "library",
     "load",
     "make",
     "mirror",
+    "read",
     "rest_poses",
     "rigid",
     "stack",
+    "survey",
 ]

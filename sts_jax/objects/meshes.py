@@ -1,36 +1,74 @@
 """Mesh files as bodies: any format trimesh reads, with its texture or colours."""
 
+import json
 import os
+import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 from PIL import Image
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 
 from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body
-from sts_jax.objects.solids import CONTENTS, WALL, assemble, linear
+from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
 PLAIN = 0.7  # sRGB grey of a mesh that names no colour
 
-_UP = {
-    "x": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]),
-    "y": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    "z": np.eye(3),
+# Up and front of a file whose up axis alone is given; front becomes -y. A glTF's front is its +z (its specification).
+AXES = {
+    "x": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    "y": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "z": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
 }
+
+
+def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "3 3"]:
+    """The rotation R that takes a file's up axis to +z and what of its front lies across it to -y.
+
+    Args:
+        up: any length.
+        front: any length, not along `up`.
+
+    Returns:
+        R, proper: a point becomes R p.
+
+    Raises:
+        ValueError: an axis is not finite or zero, or both lie in one line.
+    """
+    z, y = np.array(up, float), -np.array(front, float)
+    if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
+        raise ValueError(f"up must be three finite numbers, not all zero, and front too, got {up} and {front}")
+    z /= np.linalg.norm(z)
+    across = y - (y @ z) * z
+    if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(y):
+        raise ValueError(f"up {tuple(up)} and front {tuple(front)} lie in one line: which way the object looks is open")
+    y = across / np.linalg.norm(across)
+    return np.stack([np.cross(y, z), y, z])
 
 
 def load(
     path: str | os.PathLike[str],
     *,
     longest_side: float | None = None,
+    scale: float | None = None,
+    largest: float | None = None,
     mass: float | None = None,
+    density: float = WALL,
+    hollow: bool = True,
     strict: bool = False,
-    up: Literal["x", "y", "z"] = "z",
+    up: Literal["x", "y", "z"] | tuple[float, float, float] = "z",
+    front: tuple[float, float, float] | None = None,
     texture: str | os.PathLike[str] | None = None,
+    textures: str | os.PathLike[str] | None = None,
+    faces: int | None = None,
+    parts: bool = False,
+    category: int = -1,
 ) -> Body:
     """A mesh file as a body; a scene's meshes become one.
 
@@ -43,38 +81,70 @@ def load(
 
     Args:
         path: the file; what it refers to (materials, images) is found beside it.
-        longest_side: m, of the bounding box, to which the mesh is scaled; None keeps the file's units as metres.
-        mass: kg, spread over the surface, with no contents. None makes it a shell of 1.2 kg/m^2 that holds
+        longest_side: m, of the bounding box, to which the mesh is scaled; None keeps the file's size.
+        scale: m, of one unit of the file; None is a metre.
+        largest: m; a mesh whose longest side is longer is scaled down to it, with a warning.
+        mass: kg, spread over the surface, with no contents. None makes it a shell of `density` that holds
             1,000 kg/m^3 (what of it is filled is given to `rigid`).
+        density: kg/m^2 of the surface.
+        hollow: whether it holds something; False is a solid thing, all of whose mass is on its surface.
         strict: refuse what is otherwise mended with a warning: a mesh that encloses no volume (its convex hull's is
             taken), an OBJ that names a material or image that is not there (it is left out).
-        up: the file's axis that becomes +z; glTF files are made with "y".
+        up: the file's axis, or a direction in it, that becomes +z; glTF files are made with "y".
+        front: the direction in the file that becomes -y, once `up` is a direction too.
         texture: an image to use instead of what the file names, on the file's texture coordinates.
+        textures: another folder where the images that the file names may lie.
+        faces: decimate what has more faces or vertices to so many, with a warning; its colours are then sampled from
+            the texture, one to a corner, and the texture is left out. Needs the package fast-simplification.
+        parts: let it collide as convex parts instead of its hull (`decompose`). Needs the package coacd.
+        category: index into CATEGORIES, or -1.
 
     Returns:
-        The body, of category -1.
+        The body.
 
     Raises:
         FileNotFoundError: the file or the texture is not there; with `strict` also one that the file names.
+        ImportError: decimation or decomposition without its package.
         ValueError: the file cannot be read as a mesh, has no faces, NaN, too many faces, no extent in some direction,
-            is larger than the pad; `mass` or `longest_side` is not positive; not closed and `strict`.
+            is larger than the pad; `mass`, `density`, a size or direction is not what it should be; not closed and
+            `strict`; it cannot be decimated so far, or decomposed.
     """
     path = Path(path)
-    for name, value in (("longest_side", longest_side), ("mass", mass)):
+    for name, value, unit in (
+        ("longest_side", longest_side, "metres"),
+        ("scale", scale, "metres"),
+        ("largest", largest, "metres"),
+        ("mass", mass, "kilograms"),
+        ("density", density, "kilograms per square metre"),
+    ):
         if value is not None and not (np.isfinite(value) and value > 0):
-            unit = {"longest_side": "metres", "mass": "kilograms"}[name]
             raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value}")
-    if longest_side is not None and longest_side > PAD:
-        raise ValueError(f"{path}: longest_side is {longest_side} m, the pad is {PAD} m wide: give at most that")
-    if up not in _UP:
-        raise ValueError(f"{path}: up must be 'x', 'y' or 'z', got {up!r}")
+    for name, value in (("longest_side", longest_side), ("largest", largest)):
+        if value is not None and value > PAD:
+            raise ValueError(f"{path}: {name} is {value} m, the pad is {PAD} m wide: give at most that")
+    if longest_side is not None and scale is not None:
+        raise ValueError(f"{path}: give longest_side or scale, not both")
+    if faces is not None and faces < 4:
+        raise ValueError(f"{path}: faces must be at least 4, got {faces}")
+    if isinstance(up, str):
+        if up not in AXES or front is not None:
+            raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers where front is given, got {up!r}")
+        turn = rotation(*AXES[up])
+    else:
+        try:
+            turn = rotation(up, AXES["z"][1] if front is None else front)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
     sheet = None if texture is None else _image(Path(texture))
+    images = None if textures is None else Path(textures)
     if sheet is None:
-        _check_materials(path, strict)
+        _check_materials(path, images, strict)
     try:
-        scene = trimesh.load_scene(path, process=False)
+        # trimesh opens images inside; those of a folder of their own are found by a resolver that looks there last.
+        resolver = None if images is None else _Resolver(path, images)
+        scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise ValueError(
@@ -89,52 +159,146 @@ def load(
             )
         material = trimesh.visual.material.PBRMaterial(baseColorTexture=sheet)
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
-    return _body(path, pieces, longest_side, mass, strict, up)
-
-
-def _body(
-    path: Path, pieces: list[trimesh.Trimesh], longest_side: float | None, mass: float | None, strict: bool, up: str
-) -> Body:
     number = sum(len(piece.faces) for piece in pieces)
-    if number > FACE_CLASSES[-1]:
+    if faces is None and number > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: {number:,} faces, at most {FACE_CLASSES[-1]:,} can be drawn: decimate it first, for example with "
-            "trimesh's simplify_quadric_decimation (package fast-simplification)"
+            f"{path}: {number:,} faces, at most {FACE_CLASSES[-1]:,} can be drawn: give faces= to decimate it"
         )
-    corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ _UP[up].T
+    corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
     if not np.isfinite(corners).all():
         bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
         raise ValueError(f"{path}: {bad} faces have NaN or infinite vertices: repair the mesh")
+    surface = _surface(path, corners * _factor(path, corners, longest_side, scale, largest), *_albedo(path, pieces))
+    if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
+        surface = _decimated(path, surface, faces)
+    body = _body(path, surface, mass, density, hollow, strict, category)
+    try:
+        return decompose(body) if parts else body
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+class _Surface(NamedTuple):
+    vertices: np.ndarray  # (v, 3), m; those at one place are one, whatever seams the colours have
+    faces: np.ndarray  # (f, 3)
+    colors: np.ndarray  # (f, 3, 3)
+    uv: np.ndarray  # (f, 3, 2)
+    texture: np.ndarray | None  # (t, t, 3)
+
+
+def _factor(
+    path: Path, corners: np.ndarray, longest_side: float | None, scale: float | None, largest: float | None
+) -> float:
     extent = float(np.ptp(corners, axis=(0, 1)).max())
     if not extent > 0:
         raise ValueError(f"{path}: all vertices lie in one point")
     if longest_side is not None:
-        corners *= longest_side / extent
-    elif extent > PAD:
+        return longest_side / extent
+    factor = 1.0 if scale is None else scale
+    extent *= factor
+    if largest is not None and extent > largest:
+        warnings.warn(f"{path}: its longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
+        return factor * largest / extent
+    if extent > PAD:
         raise ValueError(
             f"{path}: longest side is {extent:.3g} m, the pad is {PAD} m wide: give longest_side in metres "
             "(the file may be in millimetres)"
         )
-    colors, uv, texture = _albedo(path, pieces)
+    return factor
 
-    # Corners at one place are one vertex, whatever seams the colours have.
+
+def _surface(
+    path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None
+) -> _Surface:
     grain = np.ptp(corners, axis=(0, 1)).max() * 1e-7
     _, first, index = np.unique(
         np.round(corners.reshape(-1, 3) / grain), axis=0, return_index=True, return_inverse=True
     )
-    vertices, faces = corners.reshape(-1, 3)[first], index.reshape(-1, 3)
+    return _proper(path, _Surface(corners.reshape(-1, 3)[first], index.reshape(-1, 3), colors, uv, texture))
+
+
+def _proper(path: Path, surface: _Surface) -> _Surface:
+    """Without faces of no area and vertices of no face."""
+    faces = surface.faces
     proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not proper.any():
         raise ValueError(f"{path}: no face has any area")
-    faces, colors, uv = faces[proper], colors[proper], uv[proper]
-    used, faces = np.unique(faces, return_inverse=True)
-    vertices, faces = vertices[used], faces.reshape(-1, 3)
-    if len(vertices) > FACE_CLASSES[-1]:
-        raise ValueError(f"{path}: {len(vertices):,} vertices, at most {FACE_CLASSES[-1]:,} fit: decimate it first")
+    used, faces = np.unique(faces[proper], return_inverse=True)
+    return surface._replace(
+        vertices=surface.vertices[used],
+        faces=faces.reshape(-1, 3),
+        colors=surface.colors[proper],
+        uv=surface.uv[proper],
+    )
 
-    surface = trimesh.Trimesh(vertices, faces, process=False)
-    closed = bool(surface.is_watertight and surface.is_winding_consistent)
-    if closed and surface.volume < 0:
+
+def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
+    try:
+        import fast_simplification
+    except ImportError as error:
+        raise ImportError(
+            f"{path}: {len(surface.faces):,} faces, and decimation needs the package fast-simplification, which is not "
+            "installed: pip install 'sts_jax[meshes]'"
+        ) from error
+    # Slivers, which nothing can be collapsed into, are welded first: by 1/1000 of the size and more.
+    for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
+        vertices, faces = _welded(surface, weld)
+        if len(faces) > target:
+            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=target)
+        if 0 < len(faces) <= target and len(vertices) <= target:
+            break
+    else:
+        raise ValueError(
+            f"{path}: {len(surface.faces):,} faces cannot be decimated to {target:,}: too many loose parts"
+        )
+    triangles, corners = surface.vertices[surface.faces], np.asarray(vertices, float)[faces]
+    # Each corner, drawn a little to its face's centre, takes the albedo of the nearest sample that looks the same way.
+    face, weight = surface_samples(triangles, 20 * target)
+    albedo = np.einsum("nk,nkc->nc", weight, surface.colors[face])
+    if surface.texture is not None:
+        size = len(surface.texture)
+        column, row = (np.einsum("nk,nkc->nc", weight, surface.uv[face]) % 1 * size).astype(int).T % size
+        albedo = albedo * surface.texture[row, column]
+    facing = 0.05 * np.ptp(surface.vertices, axis=0).max()
+    tree = KDTree(np.hstack([np.einsum("nk,nkc->nc", weight, triangles[face]), facing * _normals(triangles)[face]]))
+    place = (0.8 * corners + 0.2 * corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
+    nearest = tree.query(np.hstack([place, facing * np.repeat(_normals(corners), 3, axis=0)]))[1]
+    what = "" if surface.texture is None else "; its texture became colours, one to a corner"
+    warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{what}", stacklevel=3)
+    colors = albedo[nearest].reshape(-1, 3, 3)
+    return _proper(
+        path,
+        _Surface(np.asarray(vertices, float), np.asarray(faces, int), colors, np.zeros((len(faces), 3, 2)), None),
+    )
+
+
+def _welded(surface: _Surface, share: float) -> tuple[np.ndarray, np.ndarray]:
+    if not share:
+        return surface.vertices, surface.faces.astype(np.int32)
+    cell = share * np.ptp(surface.vertices, axis=0).max()
+    _, first, index = np.unique(np.round(surface.vertices / cell), axis=0, return_index=True, return_inverse=True)
+    faces = index.reshape(-1)[surface.faces]
+    return surface.vertices[first], faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)].astype(np.int32)
+
+
+def _normals(triangles: np.ndarray) -> np.ndarray:
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    size = np.linalg.norm(cross, axis=1, keepdims=True)
+    return cross / np.where(size > 0, size, 1)
+
+
+def _body(
+    path: Path, surface: _Surface, mass: float | None, density: float, hollow: bool, strict: bool, category: int
+) -> Body:
+    vertices, faces, colors, uv, texture = surface
+    if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
+        raise ValueError(
+            f"{path}: {len(faces):,} faces, {len(vertices):,} vertices, at most {FACE_CLASSES[-1]:,} fit: "
+            "give faces= to decimate it"
+        )
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
+    if closed and mesh.volume < 0:
         faces, colors, uv = faces[:, ::-1], colors[:, ::-1], uv[:, ::-1]
     try:
         hull = ConvexHull(vertices)
@@ -143,28 +307,34 @@ def _body(
             f"{path}: the mesh is flat, even its convex hull has no volume: give it a thickness"
         ) from error
     interior = (vertices, faces)
-    if not (closed and abs(surface.volume) > 1e-6 * hull.volume):
+    holds = hollow and mass is None
+    if not (closed and abs(mesh.volume) > 1e-6 * hull.volume):
         what = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(f"{path}: the mesh {what}: close it, or take strict=False for its convex hull's volume")
-        if mass is None:
+        if holds:
             warnings.warn(
                 f"{path}: the mesh {what}; its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
-        interior = (vertices, _outward(vertices, hull))
+        if len(hull.simplices) > max(len(faces), len(vertices)):  # so that the body stays in its class
+            points = convex_hull(vertices, limit=256, tolerance=0.0)
+            interior = (points, _outward(points, ConvexHull(points)))
+        else:
+            interior = (vertices, _outward(vertices, hull))
     try:
         return assemble(
             vertices,
             faces,
             colors,
-            density=np.full(len(faces), WALL),
-            interior=interior if mass is None else None,
-            contents_density=CONTENTS if mass is None else 0.0,
+            density=np.full(len(faces), density),
+            interior=interior if holds else None,
+            contents_density=CONTENTS if holds else 0.0,
             mass=mass,
             uv=uv,
             texture=texture,
             two_sided=not closed,
+            category=category,
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -194,26 +364,57 @@ def _image(path: Path) -> Image.Image:
         raise ValueError(f"{path}: cannot be read as an image ({error}): replace it") from error
 
 
-def _check_materials(path: Path, strict: bool) -> None:
+class _Resolver(trimesh.resolvers.FilePathResolver):
+    def __init__(self, path: Path, images: Path) -> None:
+        super().__init__(str(path))
+        self.images = images
+
+    def get(self, name: str) -> bytes:
+        found = _found(Path(self.parent), name, self.images)
+        return super().get(name) if found is None else found.read_bytes()
+
+
+def _found(folder: Path, name: str, images: Path | None) -> Path | None:
+    """A file by the name that another gives it: beside it, or under its last name in the folder of images."""
+    name = name.strip().replace("\\", "/")
+    places = [folder / name] + ([] if images is None else [images / Path(name).name])
+    return next((place for place in places if place.is_file()), None)
+
+
+def _named(file: Path, word: str) -> list[str]:
+    return re.findall(
+        rf"^[ \t]*{word}[ \t]+(\S.*?)\s*$", file.read_text(errors="replace"), re.IGNORECASE | re.MULTILINE
+    )
+
+
+def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
+    """What an OBJ or glTF file names, by name: the files, or None where they are not there; nothing else is read."""
+    if path.suffix.lower() == ".gltf":
+        tree = json.loads(path.read_text())
+        names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
+        return {name: _found(path.parent, name, images) for name in names if not name.startswith("data:")}
+    if path.suffix.lower() != ".obj":
+        return {}
+    files = {name: _found(path.parent, name, None) for name in _named(path, "mtllib")}
+    for library in [library for library in files.values() if library is not None]:
+        files |= {name: _found(path.parent, name, images) for name in _named(library, "map_kd")}
+    return files
+
+
+def _check_materials(path: Path, images: Path | None, strict: bool) -> None:
     """trimesh passes in silence over an OBJ's materials and images that are missing or torn."""
     if path.suffix.lower() != ".obj":
         return
-
-    def named(file: Path, word: str) -> list[Path]:
-        lines = (line.split(maxsplit=1) for line in file.read_text(errors="replace").splitlines())
-        return [file.parent / line[1].strip() for line in lines if len(line) == 2 and line[0].lower() == word]
-
-    files = named(path, "mtllib")
-    files += [image for library in files if library.is_file() for image in named(library, "map_kd")]
-    missing = [str(file) for file in files if not file.is_file()]
+    files = references(path, images)
+    missing = [str(path.parent / name) for name, file in files.items() if file is None]
     if missing and strict:
         raise FileNotFoundError(f"{path} names {', '.join(missing)}, not there: put it in place, or give texture=")
     if missing:
         warnings.warn(
             f"{path} names {', '.join(missing)}, not there: drawn without it; texture= gives one", stacklevel=3
         )
-    for file in files:
-        if file.suffix.lower() != ".mtl" and file.is_file():
+    for file in files.values():
+        if file is not None and file.suffix.lower() != ".mtl":
             _image(file)
 
 

@@ -4,13 +4,16 @@ Triangles are counter-clockwise seen from outside. A row of moments is `[1, x, y
 integrated over a solid or a surface.
 """
 
+import dataclasses
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
-from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, Body
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, Body
 
 WALL = 1.2  # kg/m^2, plastic about 1.2 mm thick: the shell of everything that holds something
 CONTENTS = 1000.0  # kg/m^3, water
@@ -153,13 +156,192 @@ def rest_poses(
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
     """Distance (m) of each point from a convex hull; 0 inside."""
     shape = ConvexHull(hull)
-    outside = (points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1)
-    distance = np.zeros(len(points))
+    normals, offsets = shape.equations[:, :3], shape.equations[:, 3]
+    sides = points @ normals.T + offsets
+    plane = np.argmax(sides, axis=1)
+    distance = np.maximum(sides[np.arange(len(points)), plane], 0.0)
+    # Where the foot on the plane it is furthest beyond lies on the hull, that was the distance; else an edge is nearer.
+    feet = points - distance[:, None] * normals[plane]
+    rows = np.nonzero((distance > 0) & ((feet @ normals.T + offsets).max(axis=1) > 1e-12))[0]
     triangles = hull[shape.simplices]
-    for index in np.nonzero(outside > 1e-9)[0]:
-        nearest = trimesh.triangles.closest_point(triangles, np.repeat(points[index][None], len(triangles), axis=0))
-        distance[index] = np.linalg.norm(nearest - points[index], axis=1).min()
+    for some in np.array_split(rows, -(-len(rows) * len(triangles) // 200_000)) if len(rows) else []:
+        pairs = np.repeat(some, len(triangles))
+        nearest = trimesh.triangles.closest_point(np.tile(triangles, (len(some), 1, 1)), points[pairs])
+        distance[some] = np.linalg.norm(nearest - points[pairs], axis=1).reshape(len(some), -1).min(axis=1)
     return distance
+
+
+def surface_samples(
+    triangles: Float[np.ndarray, "f 3 3"], num: int
+) -> tuple[Int[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
+    """Places spread evenly by area over triangles, always the same: the face of each and its corners' weights."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    share = np.cumsum(np.linalg.norm(cross, axis=1))
+    face = np.searchsorted(share, (np.arange(num) + 0.5) / num * share[-1])
+    u, v = np.random.default_rng(0).random((2, num))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return face, np.stack([1 - u - v, u, v], axis=1)
+
+
+def convex_parts(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *,
+    limit: int = PART_CLASSES[-1],
+    vertices_per_part: int = HULL_CLASSES[0],
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """A surface as several convex parts, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
+
+    The same mesh gives the same parts. Open surfaces are closed by the library first, which thickens them a little.
+
+    Args:
+        vertices: m.
+        faces: counter-clockwise from outside.
+        limit: most parts.
+        vertices_per_part: most vertices of each.
+
+    Returns:
+        The vertices of each part, m; one part where the surface is convex.
+
+    Raises:
+        ImportError: coacd is not installed.
+        ValueError: the surface cannot be decomposed.
+    """
+    try:
+        import coacd
+    except ImportError as error:
+        raise ImportError(
+            "convex parts need the package coacd, which is not installed: pip install 'sts_jax[meshes]'"
+        ) from error
+    coacd.set_log_level("off")
+    try:
+        pieces = coacd.run_coacd(
+            coacd.Mesh(np.asarray(vertices, float), np.asarray(faces, np.int32)),
+            max_convex_hull=limit,
+            resolution=1000,
+            mcts_nodes=10,
+            mcts_iterations=40,
+            seed=0,
+        )
+        parts = [convex_hull(np.asarray(corners, float), limit=vertices_per_part) for corners, _ in pieces]
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"no convex parts were found ({error}): keep the convex hull") from error
+    if not parts:
+        raise ValueError("no convex parts were found: keep the convex hull")
+    return sorted(parts, key=lambda part: (-ConvexHull(part).volume, *part[0]))
+
+
+def decompose(body: Body) -> Body:
+    """A body that collides as several convex parts instead of its convex hull: scissors, a bowl, a mug.
+
+    Args:
+        body: one body.
+
+    Returns:
+        The same body with the parts as `hulls`, at most PART_CLASSES[-1] of HULL_CLASSES[0] vertices each; the body
+        itself where one part is all it takes.
+
+    Raises:
+        ImportError: coacd is not installed.
+        ValueError: the surface cannot be decomposed.
+    """
+    parts = convex_parts(*_surface(body))
+    if len(parts) == 1:
+        return body
+    size = _class(max(map(len, parts)), HULL_CLASSES)
+    padded = np.stack([_pad(part, size, part[-1]) for part in parts])
+    hulls = _pad(padded, _class(len(parts), PART_CLASSES), padded[-1])
+    return dataclasses.replace(body, hulls=jnp.asarray(hulls, np.float32))
+
+
+def gaps(body: Body) -> tuple[float, float]:
+    """`surface_gaps` (m) of one body: how far its surface sticks out of what collides, and the other way round."""
+    parts = np.asarray(body.hulls, float)
+    new = np.array([True, *(parts[1:] != parts[:-1]).any(axis=(1, 2))])  # padding repeats the last part
+    return surface_gaps(*_surface(body), [np.unique(part, axis=0) for part in parts[new]])
+
+
+def _surface(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    faces = np.asarray(body.faces)
+    return np.asarray(body.vertices, float), faces[faces.any(axis=1)]
+
+
+def surface_gaps(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
+) -> tuple[float, float]:
+    """Largest distances (m) between the visible surface and what collides.
+
+    Each is taken over the corners and 10,000 points of the one and exact to the other, so a peak between two points
+    can be missed by about half their spacing; the first is exact for one hull.
+
+    Args:
+        vertices: m.
+        faces: of the visible surface, counter-clockwise from outside.
+        hulls: the vertices of each convex part.
+
+    Returns:
+        How far the surface sticks out of every part: what is drawn sinks in by so much. How far from the surface, and
+        outside it, the parts reach: they collide by so much where nothing is seen, as in a bowl's hollow.
+    """
+    points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
+    shapes = [ConvexHull(hull) for hull in hulls]
+    for shape in shapes:
+        points = points[(points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1) > 1e-9]
+    out = np.min([outside_hull(points, hull) for hull in hulls], axis=0).max(initial=0.0)
+
+    triangles = np.concatenate([hull[shape.simplices] for hull, shape in zip(hulls, shapes, strict=True)])
+    points = np.unique(np.concatenate([triangles.reshape(-1, 3), _points(triangles, 10_000)]), axis=0)
+    closed = bool(trimesh.Trimesh(vertices, faces, process=False).is_watertight)
+    return float(out), _reach(points, vertices[faces], closed)
+
+
+def _points(triangles: np.ndarray, num: int) -> np.ndarray:
+    face, weight = surface_samples(triangles, num)
+    return np.einsum("nk,nkc->nc", weight, triangles[face])
+
+
+def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
+    """Largest distance from the triangles of those points that lie outside them: all, where they enclose nothing.
+
+    The nearest corner or sample bounds a point's distance from above, so only points that may exceed the largest found
+    so far are measured, each against the triangles that may be as near.
+    """
+    bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
+    center = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - center[:, None], axis=2).max(axis=1)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    order, largest = np.argsort(-bound, kind="stable"), 0.0
+    for some in np.array_split(order, -(-len(order) // 128)):
+        if bound[some[0]] <= largest:
+            break
+        apart = np.linalg.norm(center - points[some, None], axis=2)
+        row, column = np.nonzero(apart - radius <= bound[some, None] * (1 + 1e-9))
+        away = points[some][row] - trimesh.triangles.closest_point(triangles[column], points[some][row])
+        lengths = np.linalg.norm(away, axis=1)
+        distance = np.full(len(some), np.inf)
+        np.minimum.at(distance, row, lengths)
+        # Of a closed surface, the nearest faces say which side a point is on; where they disagree, the winding does.
+        nearest = lengths <= distance[row] + 1e-9
+        front = np.zeros((2, len(some)), bool)
+        np.logical_or.at(front, ((np.einsum("pi,pi->p", away, normals[column]) > 0).astype(int), row), nearest)
+        for index in np.argsort(-distance, kind="stable"):
+            if distance[index] <= max(largest, 1e-6):
+                break
+            behind, before = front[:, index]
+            if not closed or (before and (not behind or _turns(points[some[index]], triangles) < 0.5)):
+                largest = float(distance[index])
+                break
+    return largest
+
+
+def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
+    """How often the triangles wind around a point (van Oosterom and Strackee, 1983): 1 inside, 0 outside."""
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    across = np.einsum("fi,fi->f", a, np.cross(b, c))
+    dots = (np.einsum("fi,fi->f", left, right) for left, right in ((a, b), (b, c), (c, a)))
+    along = one * two * three + sum(dot * size for dot, size in zip(dots, (three, one, two), strict=True))
+    return float(np.arctan2(across, along).sum() / (2 * np.pi))
 
 
 def hull_gap(body: Body) -> float:

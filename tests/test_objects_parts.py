@@ -1,0 +1,155 @@
+"""Convex parts and the gaps between what is seen and what collides."""
+
+import sys
+
+import jax
+import numpy as np
+import pytest
+import trimesh
+
+from sts_jax import objects
+from sts_jax.objects.solids import convex_parts, outside_hull, surface_gaps
+
+
+def corner_piece() -> trimesh.Trimesh:
+    """An L of two arms, 100 and 80 mm long and 20 mm thick, in the plane y = 0; its cavity is x > 20 mm, z > 20 mm."""
+    outline = np.array([[0, 0], [0.1, 0], [0.1, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
+    front = np.insert(outline, 1, -0.02, axis=1)
+    back = np.insert(outline, 1, 0.02, axis=1)
+    caps = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    ring = np.arange(6)
+    after = (ring + 1) % 6
+    sides = np.concatenate([np.stack([ring, after + 6, after], 1), np.stack([ring, ring + 6, after + 6], 1)])
+    return trimesh.Trimesh(np.vstack([front, back]), np.vstack([caps, caps[:, ::-1] + 6, sides]))
+
+
+def bowl(radius: float = 0.05, wall: float = 0.006) -> trimesh.Trimesh:
+    """Half a hollow ball, opening upwards."""
+    angle = np.linspace(0, np.pi / 2, 7)
+    profile = [[radius * np.sin(a), -radius * np.cos(a)] for a in angle]
+    profile += [[(radius - wall) * np.sin(a), -(radius - wall) * np.cos(a)] for a in angle[::-1]]
+    return trimesh.creation.revolve(np.array(profile), sections=16)
+
+
+def inside(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
+    """By linear programming's cousin: a point is inside where the hull of it and the part is the part."""
+    volumes = [trimesh.convex.convex_hull(part).volume for part in parts]
+    grown = [[trimesh.convex.convex_hull(np.vstack([part, point])).volume for part in parts] for point in points]
+    return (np.array(grown) <= np.array(volumes) * (1 + 1e-9)).any(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "free", "filled"),
+    [
+        (corner_piece(), [[0.03, 0, 0.03], [0.04, 0.01, 0.03], [0.025, 0, 0.05]], [[0.09, 0, 0.01], [0.01, 0, 0.07]]),
+        (bowl(), [[0, 0, -0.01], [0.02, 0, -0.015], [0, -0.02, -0.02]], [[0, 0, -0.047], [0.047, 0, -0.003]]),
+    ],
+    ids=["corner", "bowl"],
+)
+def test_parts_leave_the_cavity_free_and_the_hull_does_not(mesh, free, filled):
+    assert mesh.is_volume
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    parts = convex_parts(vertices, faces, limit=8, vertices_per_part=32)
+    assert 2 <= len(parts) <= 8
+    assert all(4 <= len(part) <= 32 for part in parts)
+    assert inside(np.array(free), [mesh.convex_hull.vertices]).all()
+    assert not inside(np.array(free), parts).any()
+    assert inside(np.array(filled), parts).all()
+    with_hull = surface_gaps(vertices, faces, [np.asarray(mesh.convex_hull.vertices)])
+    with_parts = surface_gaps(vertices, faces, parts)
+    assert with_parts[1] < 0.4 * with_hull[1]
+    assert with_parts[0] < 0.002
+
+
+def test_parts_are_the_same_every_time():
+    vertices, faces = np.asarray(corner_piece().vertices), np.asarray(corner_piece().faces)
+    parts, again = convex_parts(vertices, faces), convex_parts(vertices, faces)
+    assert all(np.array_equal(one, other) for one, other in zip(parts, again, strict=True))
+    volumes = [trimesh.convex.convex_hull(part).volume for part in parts]
+    assert volumes == sorted(volumes, reverse=True)
+
+
+def test_gaps_of_known_shapes():
+    mesh = trimesh.creation.box((0.06, 0.04, 0.02))
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    assert surface_gaps(vertices, faces, [vertices]) == pytest.approx((0, 0), abs=1e-9)
+    # A hull 1 mm smaller all round: the corners stick out by its diagonal. One 2 mm higher stands off by as much.
+    small = vertices - 0.001 * np.sign(vertices)
+    assert surface_gaps(vertices, faces, [small])[0] == pytest.approx(0.001 * 3**0.5, rel=1e-6)
+    high = vertices + np.array([0, 0, 0.002]) * (vertices[:, 2:] > 0)
+    assert surface_gaps(vertices, faces, [high]) == pytest.approx((0, 0.002), abs=1e-9)
+    # Two halves that meet, or lie within, are the whole: their common face is inside.
+    halves = [np.where((vertices[:, :1] * sign < 0), [0, 1, 1], 1) * vertices for sign in (1, -1)]
+    assert surface_gaps(vertices, faces, halves) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_gap_of_a_corner_is_that_of_its_cavity():
+    mesh = corner_piece()
+    gaps = surface_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), [np.asarray(mesh.convex_hull.vertices)])
+    # The hull's slanted side from (100, 20) to (20, 80): furthest from both arms where it is as far from either.
+    along = np.linspace(0, 1, 100_001)
+    x, z = 0.1 - 0.08 * along, 0.02 + 0.06 * along
+    truth = np.minimum(z - 0.02, x - 0.02).max()
+    assert gaps == pytest.approx((0, truth), rel=0.01, abs=1e-9)
+
+
+def test_a_sheet_encloses_nothing():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    sheet = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0])
+    for faces in (sheet.faces, sheet.faces[:, ::-1]):
+        gaps = surface_gaps(np.asarray(sheet.vertices), np.asarray(faces), [np.asarray(sheet.convex_hull.vertices)])
+        assert gaps == pytest.approx((0, 0.04), rel=0.05, abs=1e-9)  # the middle of the open side
+
+
+def test_distance_from_a_hull_of_many_points_at_once():
+    rng = np.random.default_rng(0)
+    hull = trimesh.creation.box((0.2, 0.2, 0.2)).vertices
+    points = rng.uniform(-0.3, 0.3, (40_000, 3))
+    beyond = np.maximum(np.abs(points) - 0.1, 0)
+    np.testing.assert_allclose(outside_hull(points, np.asarray(hull)), np.linalg.norm(beyond, axis=1), atol=1e-9)
+
+
+def test_parts_name_their_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    mesh = corner_piece()
+    with pytest.raises(ImportError, match=r"coacd.*sts_jax\[meshes\]"):
+        convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def test_a_decomposed_body_is_the_body_but_for_its_hulls(tmp_path):
+    corner_piece().export(tmp_path / "corner.stl")
+    whole, body = objects.load(tmp_path / "corner.stl"), objects.load(tmp_path / "corner.stl", parts=True)
+    assert body.hulls.shape == (objects.PART_CLASSES[1], objects.HULL_CLASSES[0], 3)
+    assert len(np.unique(np.asarray(body.hulls), axis=0)) == 2
+    np.testing.assert_array_equal(body.hulls[2:], np.broadcast_to(body.hulls[1], body.hulls[2:].shape))
+    for name in ("vertices", "faces", "colors", "shell_mass", "shell_inertia", "interior", "category"):
+        np.testing.assert_array_equal(getattr(body, name), getattr(whole, name))
+    assert objects.gaps(whole)[1] == pytest.approx(0.0343, abs=5e-4)
+    assert max(objects.gaps(body)) < 0.002
+
+
+def test_what_is_convex_stays_as_it_is(tmp_path):
+    trimesh.creation.box((0.06, 0.04, 0.02)).export(tmp_path / "box.stl")
+    body = objects.load(tmp_path / "box.stl")
+    assert objects.decompose(body) is body
+    assert objects.gaps(body) == pytest.approx((0, 0), abs=1e-6)
+
+
+def test_scissors_open_up():
+    scissors = objects.make(jax.random.key(0), "scissors")
+    body = objects.decompose(scissors)
+    assert body.hulls.shape[0] == objects.PART_CLASSES[1]
+    assert objects.gaps(scissors)[1] > 0.02
+    assert objects.gaps(body)[1] < 0.01
+    assert objects.hull_gap(body) < 5e-4
+
+
+def test_a_library_decomposes_where_the_hull_is_wrong(tmp_path):
+    corner_piece().export(tmp_path / "corner.stl")
+    trimesh.creation.box((0.06, 0.04, 0.02)).export(tmp_path / "box.stl")
+    listed = objects.library(tmp_path, parts=True, cache=tmp_path / "kept")
+    box, corner = (objects.read(listed, index) for index in (0, 1))
+    assert (len(box.body.hulls), len(corner.body.hulls)) == (1, 8)
+    assert " in 2 parts; " in objects.describe(corner)
+    assert objects.read(listed, 1).gaps == corner.gaps
+    assert len(objects.read(objects.library(tmp_path, cache=tmp_path / "kept"), 1).body.hulls) == 1
