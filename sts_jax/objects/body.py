@@ -69,8 +69,8 @@ def stack(bodies: Sequence[Body]) -> Body:
         if shape != shapes[0]:
             raise ValueError(
                 f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, hulls "
-                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}; body 0 has "
-                f"{len(bodies[0].faces)}, {bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class by itself"
+                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}; body 0 has {len(bodies[0].faces)} "
+                f"faces, {bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class by itself"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 
