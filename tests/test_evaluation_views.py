@@ -8,7 +8,7 @@ import pytest
 import sts_jax as sts
 from sts_jax import dataset, evaluation
 
-FORK = sts.objects.CATEGORIES.index("fork")
+FORK = sts.objects.make(jax.random.key(0), "fork")
 LYING = [0.03, -0.02, 0.005, 1.0, 0, 0, 0]
 
 
@@ -18,7 +18,7 @@ def pictures():
     poses[1, 2] = -0.004  # in the gel
     poses[2, :2] = -poses[2, :2]
     poses[3, 2] = -0.1  # fell off
-    return evaluation.stand_ins(sts.Sensor(), np.full(4, FORK), poses, (64, 64))
+    return evaluation.stand_ins(sts.Sensor(), [FORK] * 4, poses, (64, 64))
 
 
 def middle(picture, empty):

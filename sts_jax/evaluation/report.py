@@ -42,7 +42,10 @@ def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndar
 
 
 def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
-    """The outcome as an image shows it: fallen off where it is empty, closer to the blank sensor than a threshold."""
+    """The outcome of freefall as an image shows it: off the pad where it is closer to the empty one than a threshold.
+
+    How a thing lies that is still on the pad is not read from images: there is no outcome of other scenarios.
+    """
     empty = emptiness(visual, blank) <= threshold
     return np.where(empty, int(physics.Outcome.FELL_OFF), int(physics.Outcome.RESTS))
 
@@ -55,11 +58,17 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
     """What can be said without learning: the mean target, the input itself, the target of the nearest input.
 
-    The neighbour is the training item whose first visual image is nearest in squared distance.
+    The neighbour is the training item whose first visual image is nearest in squared distance. With a condition, its
+    squared distance counts as much: both are divided by the training set's variance, the condition's number by number.
     """
     inputs = train.visual[:, 0].reshape(len(train.visual), -1).astype(np.float32)
     queries = test.visual[:, 0].reshape(len(test.visual), -1).astype(np.float32)
     distance = (inputs**2).sum(1) - 2 * queries @ inputs.T
+    width = train.condition.shape[1]
+    if width:
+        variance = float(((inputs - inputs.mean(0)) ** 2).sum(1).mean())
+        gap = test.condition[:, None] - train.condition[None]
+        distance = distance / variance + (gap**2 / train.condition.var(0)).sum(-1) / width
     nearest = distance.argmin(1)
     num = len(test.visual)
 

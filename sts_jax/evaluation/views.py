@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sts_jax import _math, objects, optics, physics
+from sts_jax import _math, optics, physics
 from sts_jax.dataset import render_uint8
 from sts_jax.objects import Body
 from sts_jax.sensor import Sensor
@@ -60,29 +61,27 @@ def outside(
 
 
 def stand_ins(
-    sensor: Sensor, category: np.ndarray, poses: np.ndarray, resolution: tuple[int, int]
+    sensor: Sensor, bodies: Sequence[Body], poses: np.ndarray, resolution: tuple[int, int]
 ) -> Float[np.ndarray, "n h w 3"]:
-    """What the sensor would see of a grey sample of a category at predicted poses.
+    """What the sensor would see of other objects, in grey, at predicted poses.
 
-    The sample is the same for all objects of a category, so the picture tells a pose and nothing else of an object. A
-    predicted pose lies a little in the gel or over it: the sample is drawn with its lowest point on the gel, and not
+    Where the same one stands in for all objects of a class, the picture tells a pose and nothing else of an object. A
+    predicted pose lies a little in the gel or over it: the stand-in is drawn with its lowest point on the gel, and not
     at all where the pose is one that fell off.
 
     Args:
         sensor: The sensor.
-        category: Indices into `objects.CATEGORIES`, `(n,)`.
+        bodies: The one that stands in at each pose, `n`.
         poses: Predicted, `(n, 7)`.
         resolution: (height, width), pixels.
 
     Returns:
         Images in [0, 1].
     """
-    if np.any((category < 0) | (category >= len(objects.CATEGORIES))):
-        raise ValueError(f"categories {category.tolist()}: a stand-in is one of the {len(objects.CATEGORIES)} classes")
     images = []
-    for index, where in zip(category, jnp.asarray(poses, jnp.float32), strict=True):
-        body = objects.make(jax.random.key(0), objects.CATEGORIES[index])
-        body = dataclasses.replace(body, colors=jnp.full_like(body.colors, _STAND_IN))
+    for body, where in zip(bodies, jnp.asarray(poses, jnp.float32), strict=True):
+        grey, plain = jnp.full_like(body.colors, _STAND_IN), jnp.ones_like(body.texture)
+        body = dataclasses.replace(body, colors=grey, texture=plain)
         lowest = jnp.min(_math.transform(where, body.vertices)[:, 2])
         height = jnp.where(physics.fell_off(where), -1.0, where[2] - lowest)
         pose = where.at[2].set(height)[None]

@@ -3,7 +3,7 @@
 import dataclasses
 import enum
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,6 +54,10 @@ class Start(NamedTuple):
 class _Common:
     """What all scenarios have."""
 
+    symmetries: ClassVar[tuple[int, ...]]  # of the square pad, under which the scenario is itself; see `dataset.turn`
+    condition_scale: ClassVar[tuple[float, ...]]  # how large (SI) each number of its condition typically is
+    outcomes: ClassVar[tuple[Outcome, ...]]  # those it knows, the most telling first
+
     rate: float
     frames: int
     fill: tuple[float, float]
@@ -99,6 +103,10 @@ class Freefall(_Common):
 
     Paper, "Data Collection". Ranges are uniform.
     """
+
+    symmetries = tuple(range(8))
+    condition_scale = ()
+    outcomes = (Outcome.RESTS, Outcome.FELL_OFF)
 
     height: float = 0.05  # m, lowest point of the object above the pad in frame 0
     spread: float = 0.05  # m, radius of the disc from which the object's origin is drawn
@@ -162,6 +170,10 @@ class Perturbed(_Common):
     Paper, "Data Collection"; ranges are uniform. A fill decides most where the base is narrow: the defaults are for
     bottles.
     """
+
+    symmetries = tuple(range(8))
+    condition_scale = (10.0, 10.0, 0.1)  # m/s^2, m/s^2, s
+    outcomes = (Outcome.TOPPLES, Outcome.SLIDES, Outcome.STANDS, Outcome.FELL_OFF)
 
     acceleration: tuple[float, float] = (3.0, 12.0)  # m/s^2, in any direction
     duration: tuple[float, float] = (0.06, 0.12)  # s
