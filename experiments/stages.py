@@ -222,6 +222,8 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     if both in rows:
         shown["MVAE from all"] = rows[both]
     title = f"{workdir.name}: the first {config.num_shown} of the held-out list, by {split}"
+    if config.collection.scenario.condition_scale:
+        title += "; red: where to, and how hard, the jerk drives it"
     evaluation.figures.predictions(figures / "predictions.png", test, shown, num=config.num_shown, title=title)
     category = np.array(dataset.class_names(config.collection))[test.object]
     best = rows[both] if both in rows else rows[single]
@@ -416,8 +418,10 @@ def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Se
 
 
 def views(body: sts.objects.Body, pose: np.ndarray, sensor: sts.Sensor) -> np.ndarray:
-    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1]."""
+    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1]; what fell off and was frozen is no longer drawn."""
     size = jnp.array(sensor.gel.size)
+    frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
+    pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
     return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size)) for each in pose])
 
 
@@ -427,7 +431,7 @@ def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[st
     words = [f"a {name} {outcome}", *(f"{key.replace('_', ' ')} {value:.2f}" for key, value in hidden.items())]
     if len(trajectory["condition"]):
         x, y, duration = trajectory["condition"]
-        words.append(f"pad jerked by ({x:.1f}, {y:.1f}) m/s$^2$ for {1e3 * duration:.0f} ms")
+        words.append(f"pad jerked by ({x:.1f}, {y:.1f}) m/s² for {1e3 * duration:.0f} ms")
     return ", ".join(words)
 
 
