@@ -1,5 +1,7 @@
 """Stand-ins: a predicted pose as a picture that tells nothing else."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +39,12 @@ def test_a_stand_in_lies_where_the_pose_says(pictures):
 
 def test_the_height_of_an_unsure_pose_does_not_matter(pictures):
     np.testing.assert_array_equal(pictures[0], pictures[1])
+
+
+def test_a_stand_in_has_no_colours_of_its_own(pictures):
+    loud = dataclasses.replace(FORK, colors=FORK.colors * 0 + 0.9, texture=FORK.texture * 0 + 0.5)
+    again = evaluation.stand_ins(sts.Sensor(), [loud], np.array([LYING], np.float32), (64, 64))
+    np.testing.assert_array_equal(again[0], pictures[0])
 
 
 def test_one_that_fell_off_is_not_drawn(pictures):
