@@ -53,7 +53,7 @@ def main(config: Config) -> None:
             crop=False,
         )
         visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
-        view = stages.views(body, one.pose, sensor)
+        view = stages.views(body, one.pose, one.gravity, sensor)
         words = stages.describe(name, one._asdict(), one.hidden._asdict())
         path = config.out / f"{config.scenario}-{i}.png"
         evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)

@@ -409,7 +409,7 @@ def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Se
     evaluation.figures.strip(
         path,
         data.trajectory["time"][index],
-        views(body, data.trajectory["pose"][index], sensor),
+        views(body, data.trajectory["pose"][index], data.trajectory["gravity"][index], sensor),
         images.visual / 255,
         images.tactile / 255,
         data.trajectory["wrench"][index],
@@ -417,12 +417,15 @@ def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Se
     )
 
 
-def views(body: sts.objects.Body, pose: np.ndarray, sensor: sts.Sensor) -> np.ndarray:
-    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1]; what fell off and was frozen is no longer drawn."""
-    size = jnp.array(sensor.gel.size)
+def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor) -> np.ndarray:
+    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the gravity of its end drawn downwards.
+
+    What fell off and was frozen is no longer drawn.
+    """
+    size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
     pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
-    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size)) for each in pose])
+    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up)) for each in pose])
 
 
 def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]) -> str:

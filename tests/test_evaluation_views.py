@@ -52,3 +52,19 @@ def test_one_that_fell_off_is_not_drawn(pictures):
     gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
     visual, _, _ = dataset.render_uint8(sts.Sensor(), body, gone, jnp.zeros((1, 6)), resolution=(64, 64), crop=False)
     np.testing.assert_array_equal(pictures[3], np.asarray(visual[0]) / 255)
+
+
+def test_a_slope_is_seen_as_one():
+    red = dataclasses.replace(FORK, colors=FORK.colors * 0 + jnp.array([1.0, 0, 0]))
+    size, slope = jnp.array([0.15, 0.15]), jnp.pi / 6
+    up = jnp.array([0.0, -jnp.sin(slope), jnp.cos(slope)])
+    stand = jnp.array([1.0, 0, 0, 0])
+
+    def place(position, up):
+        picture = np.asarray(evaluation.outside(red, jnp.concatenate([position, stand]), size, up)).astype(float)
+        return np.argwhere(picture[..., 0] > picture[..., 1] + 0.3).mean(0)
+
+    level = place(jnp.array([0.0, 0, 0.06]), jnp.array([0.0, 0, 9.81]))
+    np.testing.assert_allclose(place(0.06 * up, 9.81 * up), level, atol=2)  # what is above is drawn above
+    downhill = place(jnp.array([0.0, 0.04, 0.06]), 9.81 * up)
+    assert downhill[0] > place(jnp.array([0.0, 0.04, 0.06]), None)[0] + 8

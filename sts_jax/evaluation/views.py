@@ -22,7 +22,12 @@ _STAND_IN = 0.1  # albedo
 
 @functools.partial(jax.jit, static_argnames=("resolution",))
 def outside(
-    body: Body, pose: Float[Array, "7"], size: Float[Array, "2"], *, resolution: tuple[int, int] = (160, 160)
+    body: Body,
+    pose: Float[Array, "7"],
+    size: Float[Array, "2"],
+    up: Float[Array, "3"] | None = None,
+    *,
+    resolution: tuple[int, int] = (160, 160),
 ) -> Float[Array, "h w 3"]:
     """A picture of the object and the pad from outside, three-quarter view.
 
@@ -30,6 +35,7 @@ def outside(
         body: The object.
         pose: Mesh frame in the sensor frame.
         size: Of the pad along x and y (m), `(2,)`.
+        up: The vertical in the sensor frame, of any length: the pad is shown as tilted as it is; level if not given.
         resolution: (height, width), pixels.
 
     Returns:
@@ -45,6 +51,10 @@ def outside(
     flat = jnp.broadcast_to(jnp.concatenate([flat, flat])[:, None], (12, 3, 3))
     normals = jnp.concatenate([body.normals @ _math.quat_matrix(pose[3:]).T, flat])
     top = flat[..., 2:] > 0
+    if up is not None:
+        axis, along = jnp.cross(up, jnp.array([0.0, 0.0, 1.0])), _math.norm(up)
+        level = _math.quat_from_rotvec(_math.normalize(axis) * jnp.arctan2(_math.norm(axis) / along, up[2] / along))
+        vertices, normals = (x @ _math.quat_matrix(level).T for x in (vertices, normals))
     albedo = body.colors * optics.sample_texture(body.texture, body.uv)
     albedo = jnp.concatenate([albedo, jnp.where(top, _PAD, _HOUSING)])
     return optics.photograph(
