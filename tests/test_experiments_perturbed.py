@@ -14,7 +14,12 @@ from sts_jax import dataset, physics
 TINY = dataclasses.replace(
     perturbed.SMOKE,
     collection=dataclasses.replace(
-        perturbed.SMOKE.collection, scenario=physics.Perturbed(frames=6), num_objects=10, num_per_object=1, num_full=1
+        perturbed.SMOKE.collection,
+        scenario=physics.Perturbed(frames=6),
+        num_objects=10,
+        num_per_object=1,
+        num_full=1,
+        symmetries=True,
     ),
     steps=(2, 2),
     training=dataclasses.replace(perturbed.SMOKE.training, batch_size=4, checkpoint_every=2),
@@ -44,6 +49,21 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     assert {path.name for path in (workdir / "figures").glob("*.png")} == {
         f"{name}.png" for name in ("predictions", "training", "strip", "line_up")
     }
+
+
+def test_pairs_have_the_condition_turned_like_the_pose(workdir):
+    data = dataset.load(workdir / "dataset")
+    pairs = data.pairs(np.array([1, 0]), symmetries=True)
+    assert pairs.condition.shape == (16, 3)
+    assert pairs.condition.dtype == np.float32
+    np.testing.assert_array_equal(data.pairs(np.array([1, 0])).condition, data.trajectory["condition"][[1, 0]])
+    np.testing.assert_array_equal(pairs.condition[[0, 8]], data.trajectory["condition"][[1, 0]])
+    # The angle from where it stands to where the pad goes stays, but for its sign in a mirror.
+    place, along = (x[..., 0] + 1j * x[..., 1] for x in (pairs.pose[:, 0], pairs.condition))
+    angle = np.angle(along / place).reshape(2, 2, 4)
+    np.testing.assert_allclose(angle[:, 0], np.tile(angle[:, 0, :1], 4), atol=1e-3)
+    np.testing.assert_allclose(angle[:, 1], np.tile(-angle[:, 0, :1], 4), atol=1e-3)
+    assert len(np.unique(np.round(np.angle(along[:8]), 3))) == 8
 
 
 def test_a_model_answers_a_jerk_in_si_units(workdir):

@@ -178,8 +178,8 @@ def test_a_condition_is_given_in_si_units(tmp_path):
     logits, _ = mvae.predict(
         predictor.model.graphdef,
         predictor.model.state,
-        {"visual": given["visual"]},
-        condition=(condition / scale).astype(np.float32),
+        {"visual": jnp.asarray(given["visual"])},
+        condition=jnp.asarray(condition / scale),
     )
     np.testing.assert_allclose(out.visual, jax.nn.sigmoid(logits["visual"]), atol=1e-5)
     other = predictor(visual=given["visual"], condition=-condition)

@@ -30,6 +30,7 @@ class Scores(NamedTuple):
     tactile_object: metrics.ImageError | None
     position: np.ndarray | None  # m (n,)
     angle: np.ndarray | None  # rad (n,)
+    axis: np.ndarray | None  # rad (n,), of the up axes
     outcome: np.ndarray | None  # int (n,)
 
 
@@ -115,6 +116,7 @@ def score(predicted: Predicted, test: Pairs) -> Scores:
         images(predicted.tactile, test.tactile[:, 1], inside),
         None if pose is None else metrics.position_error(pose, test.pose[:, 1]),
         None if pose is None else metrics.geodesic_angle(pose, test.pose[:, 1]),
+        None if pose is None else metrics.axis_angle(pose, test.pose[:, 1]),
         predicted.outcome,
     )
 
@@ -166,10 +168,11 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
 
 
 # The figures of a predictor: per stream BCE and excess (nats a pixel and channel), skill over all pixels and over the
-# target's object pixels; position (m) and angle (rad) over all items and over those that stayed on the pad.
+# target's object pixels; position (m), angle and angle of the up axes (rad) over all items and over those that stayed
+# on the pad.
 FIGURES = (
     *(f"{s}_{f}{p}" for s in ("visual", "tactile") for f in ("bce", "excess", "skill") for p in ("", "_object")),
-    *("position", "position_on_pad", "angle", "angle_on_pad", "outcome_balanced_accuracy"),
+    *("position", "position_on_pad", "angle", "angle_on_pad", "axis", "axis_on_pad", "outcome_balanced_accuracy"),
 )
 
 
@@ -186,7 +189,7 @@ def _figures(s: Scores, constant: Scores, test: Pairs, stayed: np.ndarray, weigh
         out += [
             float("nan") if e is None else metrics.skill(e, r, weight) for e, r in zip(errors, references, strict=True)
         ]
-    for error in (s.position, s.angle):
+    for error in (s.position, s.angle, s.axis):
         for keep in (np.ones_like(stayed), stayed):
             w = weight * keep
             out.append(float("nan") if error is None or w.sum() == 0 else float((w * error).sum() / w.sum()))
@@ -209,6 +212,8 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
         ("on pad", "position_on_pad", 1e3, 1),
         ("angle (deg)", "angle", 180 / np.pi, 0),
         ("on pad", "angle_on_pad", 180 / np.pi, 0),
+        ("up axis (deg)", "axis", 180 / np.pi, 0),
+        ("on pad", "axis_on_pad", 180 / np.pi, 0),
         ("outcome, balanced", "outcome_balanced_accuracy", 1, 3),
     ]
     outcomes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items())
@@ -225,7 +230,7 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     for name, row in summary["predictors"].items():
         cells = [_cell(row[key], scale, digits, "skill" in key) for _, key, scale, digits in heads]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    shown = [h for h in heads if "_skill" in h[1] or h[1] in ("position", "angle")]
+    shown = [h for h in heads if "_skill" in h[1] or h[1] in ("position", "angle", "axis")]
     lines += [
         "",
         "Differences from the baselines (skill: positive is better; errors: negative is better):",
