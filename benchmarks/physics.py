@@ -47,7 +47,7 @@ def median_seconds(run: Callable[[], object], repeats: int = 3) -> float:
 
 def mass_properties(body: objects.Body, hidden: physics.Hidden) -> list[tuple[float, np.ndarray, np.ndarray]]:
     """Mass, centre of mass and inertia of each draw."""
-    rigid = jax.vmap(functools.partial(objects.rigid, body))(hidden.fill, hidden.shell_scale)
+    rigid = jax.vmap(functools.partial(objects.rigid, body))(hidden.fill, hidden.shell_scale, hidden.up)
     return list(zip(*(np.asarray(x, np.float64) for x in rigid), strict=True))
 
 
@@ -66,7 +66,7 @@ def speed(num: int) -> None:
         own = np.flatnonzero(np.asarray(traj.body) == index)
         hidden = jax.tree.map(lambda x, own=own: x[own], traj.hidden)
         for row, rigid, friction in zip(own, mass_properties(body, hidden), hidden.friction, strict=True):
-            model = scene.compile_scene(np.asarray(body.hull), pad, scenario.contact)
+            model = scene.compile_scene(np.asarray(body.hulls), pad, scenario.contact)
             data = mujoco.MjData(model)
             scene.set_rigid(model, data, *rigid, float(friction))
             worlds.append((model, data, np.asarray(traj.pose[row, 0])))

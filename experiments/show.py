@@ -15,17 +15,21 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, perturbed, stages
+from experiments import freefall, inclined, perturbed, stages
 from sts_jax import dataset, evaluation
 
-SCENARIOS = {"freefall": freefall.DEFAULT.collection, "perturbed": perturbed.DEFAULT.collection}
+SCENARIOS = {
+    "freefall": freefall.DEFAULT.collection,
+    "inclined": inclined.DEFAULT.collection,
+    "perturbed": perturbed.DEFAULT.collection,
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """What is shown."""
 
-    scenario: Annotated[str, tyro.conf.Positional]  # freefall or perturbed
+    scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined or perturbed
     num: int = 4  # trajectories, each of another object
     seed: int = 0
     out: Path = Path("show")  # the folder
@@ -53,7 +57,7 @@ def main(config: Config) -> None:
             crop=False,
         )
         visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
-        view = stages.views(body, one.pose, one.gravity, sensor)
+        view = stages.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
         words = stages.describe(name, one._asdict(), one.hidden._asdict())
         path = config.out / f"{config.scenario}-{i}.png"
         evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)

@@ -399,25 +399,22 @@ def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Se
         return
     rank = [config.collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
     index = int(full[np.argmin(rank)])
-    number = data.trajectory["body"][index]
+    one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
     images = data.strip(index)
-    body = dataset.make_bodies(config.collection, np.array([number]))[0]
-    what = describe(
-        dataset.class_names(config.collection)[number],
-        *({name: leaf[index] for name, leaf in leaves.items()} for leaves in (data.trajectory, data.hidden)),
-    )
+    body = dataset.make_bodies(config.collection, np.array([one["body"]]))[0]
+    what = describe(dataset.class_names(config.collection)[one["body"]], one, hidden)
     evaluation.figures.strip(
         path,
-        data.trajectory["time"][index],
-        views(body, data.trajectory["pose"][index], data.trajectory["gravity"][index], sensor),
+        one["time"],
+        views(body, one["pose"], one["gravity"], sensor, config.collection.scenario.wall),
         images.visual / 255,
         images.tactile / 255,
-        data.trajectory["wrench"][index],
+        one["wrench"],
         title=f"trajectory {index}: {what}",
     )
 
 
-def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor) -> np.ndarray:
+def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
     """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the gravity of its end drawn downwards.
 
     What fell off and was frozen is no longer drawn.
@@ -425,13 +422,16 @@ def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor:
     size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
     pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
-    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up)) for each in pose])
+    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up, wall)) for each in pose])
 
 
 def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]) -> str:
     """One trajectory in words: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
     outcome = sts.physics.Outcome(int(trajectory["outcome"])).name.lower().replace("_", " ")
-    words = [f"a {name} {outcome}", *(f"{key.replace('_', ' ')} {value:.2f}" for key, value in hidden.items())]
+    words = [f"a {name} {outcome}"]
+    words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]
+    if hidden["up"][2] < 1:
+        words.append("contents' up ({:.1f}, {:.1f}, {:.1f})".format(*hidden["up"]))
     if len(trajectory["condition"]):
         x, y, duration = trajectory["condition"]
         words.append(f"pad jerked by ({x:.1f}, {y:.1f}) m/s² for {1e3 * duration:.0f} ms")

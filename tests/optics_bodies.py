@@ -9,7 +9,7 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from sts_jax.objects.body import FACE_CLASSES, NUM_FILLS, Body
+from sts_jax.objects.body import FACE_CLASSES, Body
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
@@ -31,11 +31,11 @@ def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -
         uv=jnp.zeros((padded, 3, 2)),
         texture=jnp.ones((1, 1, 3)),
         two_sided=jnp.bool_(False),
-        hull=jnp.asarray(pad(hull, 64, hull[-1]), jnp.float32),
+        hulls=jnp.asarray(pad(hull, 64, hull[-1]), jnp.float32)[None],
         shell_mass=jnp.float32(0.1),
         shell_com=jnp.zeros(3),
         shell_inertia=jnp.eye(3) * 1e-4,
-        contents=jnp.zeros((NUM_FILLS, 10)),
+        interior=jnp.zeros((padded, 3, 3)),
         contents_density=jnp.float32(0),
         category=jnp.int32(-1),
     )

@@ -104,5 +104,5 @@ def test_what_is_shown_is_a_strip_and_an_animation(tmp_path, monkeypatch):
         return int(((page[..., 0] > 200) & (page[..., 1:].max(-1) < 60)).sum())
 
     assert red(later) > red(first) + 50  # the jerk is on
-    with pytest.raises(ValueError, match="give one of freefall, perturbed"):
+    with pytest.raises(ValueError, match="give one of freefall, inclined, perturbed"):
         show.main(show.Config("sideways", out=tmp_path))

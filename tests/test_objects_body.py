@@ -85,10 +85,27 @@ def test_solid_things_weigh_the_same_at_any_fill():
         np.testing.assert_array_equal(a, b)
 
 
-def test_rigid_has_a_gradient_everywhere():
+def test_rigid_has_a_gradient_everywhere_and_the_right_one():
     body = objects.make(jax.random.key(2), "camera")
-    grad = jax.jit(jax.grad(lambda fill: sum(jnp.sum(x) for x in objects.rigid(body, fill, 1.0))))
+    up = jnp.array([0.6, 0.0, 0.8])
+    height = jax.jit(lambda fill: objects.rigid(body, fill, 1.0, up)[1] @ up)
+    grad = jax.jit(jax.grad(height))
     assert all(np.isfinite(grad(fill)) for fill in (0.0, 0.3, 1.0))
+    np.testing.assert_allclose(grad(0.3), (height(0.32) - height(0.28)) / 0.04, rtol=0.02)
+    np.testing.assert_allclose(grad(0.8), (height(0.82) - height(0.78)) / 0.04, rtol=0.02)
+
+
+def test_contents_that_settled_elsewhere_move_the_balance_there(jar):
+    body, solid = jar
+    up = np.array([0.3, -0.8, 0.5]) / np.linalg.norm([0.3, -0.8, 0.5])
+    mass, com, inertia = objects.rigid(body, 0.4, 1.0, up)
+    turned = solid.copy()  # the same solid with `up` along +z
+    turn = trimesh.geometry.align_vectors(up, [0, 0, 1])
+    turned.apply_transform(turn)
+    true_mass, true_com, true_inertia = brute(body, turned, 0.4, 1.0)
+    np.testing.assert_allclose(mass, true_mass, rtol=1e-4)
+    np.testing.assert_allclose(turn[:3, :3] @ com, true_com, atol=2e-4)
+    np.testing.assert_allclose(turn[:3, :3] @ inertia @ turn[:3, :3].T, true_inertia, atol=0.015 * true_inertia.max())
 
 
 def test_stack_is_for_vmap_and_knows_classes():
@@ -120,7 +137,7 @@ def test_a_mirrored_body_is_that_of_the_mirrored_mesh(jar, tmp_path):
     assert trimesh.Trimesh(np.asarray(got.vertices, float), faces[faces.any(1)]).volume == pytest.approx(solid.volume)
     for a, b in zip(objects.rigid(got, 0.4, 1.1), objects.rigid(truth, 0.4, 1.1), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(np.ptp(got.hull, 0), np.ptp(truth.hull, 0), rtol=1e-5)
+    np.testing.assert_allclose(np.ptp(got.hulls[0], 0), np.ptp(truth.hulls[0], 0), rtol=1e-5)
     corner = np.asarray(got.vertices)[faces[faces.any(1)]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     assert (np.einsum("fi,fci->fc", normal, np.asarray(got.normals)[faces.any(1)]) > 0).all()

@@ -26,6 +26,10 @@ def looked_up(body: objects.Body) -> np.ndarray:
     return texture[row, column] * np.asarray(body.colors)[:number]
 
 
+def volume(body: objects.Body) -> float:
+    return float(objects.fill_moments(body.interior, 1.0)[0])
+
+
 def corners(body: objects.Body) -> np.ndarray:
     return np.asarray(body.vertices)[real_faces(body)]
 
@@ -58,12 +62,12 @@ def test_closed_box(box):
     body = objects.load(box)
     area = 2 * (0.1 * 0.06 + 0.1 * 0.04 + 0.06 * 0.04)
     np.testing.assert_allclose(body.shell_mass, 1.2 * area, rtol=1e-5)
-    np.testing.assert_allclose(body.contents[-1, 0], 0.1 * 0.06 * 0.04, rtol=1e-5)
+    np.testing.assert_allclose(volume(body), 0.1 * 0.06 * 0.04, rtol=1e-5)
     assert body.contents_density == 1000
     assert not body.two_sided
     assert int(body.category) == -1
-    assert body.hull.shape == (32, 3)
-    assert len(np.unique(np.asarray(body.hull), axis=0)) == 8
+    assert body.hulls.shape == (1, 32, 3)
+    assert len(np.unique(np.asarray(body.hulls)[0], axis=0)) == 8
     np.testing.assert_allclose(corners(body).max((0, 1)), [0.05, 0.03, 0.02], rtol=1e-5)
     np.testing.assert_allclose(np.asarray(body.colors)[:12], linear(np.array(0.7)), rtol=1e-5)
 
@@ -94,7 +98,7 @@ def test_up_is_a_rotation(tmp_path, up):
     assert abs(high[0]) < 1e-6
     assert abs(high[1]) < 1e-6
     assert high[2] > -low[2]
-    assert float(body.contents[-1, 0]) > 0  # not turned inside out
+    assert volume(body) > 0  # not turned inside out
 
 
 def test_obj_texture_the_right_way_up(tmp_path):
@@ -168,7 +172,7 @@ def test_gltf_factor_is_linear_and_scenes_are_merged(tmp_path):
     np.testing.assert_allclose(color[high][:, :2], np.broadcast_to([0, 64 / 255], (36, 2)), atol=1e-3)
     np.testing.assert_allclose(color[~high][:, :2], np.broadcast_to([128 / 255, 0], (36, 2)), atol=1e-3)
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), [0.02, 0.02, 0.07], rtol=1e-5)
-    np.testing.assert_allclose(body.contents[-1, 0], 2 * 0.02**3, rtol=1e-4)
+    np.testing.assert_allclose(volume(body), 2 * 0.02**3, rtol=1e-4)
 
 
 def test_several_textures_become_one(tmp_path):
@@ -196,7 +200,7 @@ def test_bowl_takes_its_hull_with_one_warning(tmp_path):
     with pytest.warns(UserWarning, match=r"bowl\.stl.*not closed.*convex hull") as caught:
         body = objects.load(path)
     assert len(caught) == 1
-    np.testing.assert_allclose(body.contents[-1, 0], bowl.convex_hull.volume, rtol=1e-4)
+    np.testing.assert_allclose(volume(body), bowl.convex_hull.volume, rtol=1e-4)
     assert body.two_sided
     with pytest.raises(ValueError, match="not closed"):
         objects.load(path, strict=True)
@@ -217,7 +221,7 @@ def test_inside_out_mesh_is_turned(tmp_path):
     mesh.invert()
     mesh.export(tmp_path / "inverted.stl")
     body = objects.load(tmp_path / "inverted.stl")
-    np.testing.assert_allclose(body.contents[-1, 0], 0.1 * 0.06 * 0.04, rtol=1e-5)
+    np.testing.assert_allclose(volume(body), 0.1 * 0.06 * 0.04, rtol=1e-5)
     outward = np.einsum("fki,fki->fk", np.asarray(body.normals)[:12], corners(body))
     assert (outward > 0).all()
 
@@ -225,7 +229,7 @@ def test_inside_out_mesh_is_turned(tmp_path):
 def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
     trimesh.creation.icosphere(subdivisions=3, radius=0.04).export(tmp_path / "ball.stl")
     body = objects.load(tmp_path / "ball.stl")
-    assert body.hull.shape == (64, 3)
+    assert body.hulls.shape == (1, 64, 3)
     assert 1e-3 < objects.hull_gap(body) < 3e-3
     np.testing.assert_allclose(np.asarray(body.normals)[:1280], corners(body) / 0.04, atol=0.05)
 
@@ -298,7 +302,7 @@ def test_public_textured_mesh():
     assert np.asarray(body.texture).std() > 0.05
     assert objects.hull_gap(body) < 2e-4
     assert len(np.unique(np.round(looked_up(body).reshape(-1, 3), 2), axis=0)) > 5
-    assert 10e-6 < float(body.contents[-1, 0]) < 100e-6
+    assert 10e-6 < volume(body) < 100e-6
     vertices = np.asarray(body.vertices)
     extent = np.ptp(vertices, axis=0)
     np.testing.assert_allclose(extent.max(), 0.08, rtol=1e-5)

@@ -24,7 +24,8 @@ def test_fits_its_classes_and_the_pad(bodies, category):
     for body in bodies[category]:
         assert body.vertices.shape == (objects.FACE_CLASSES[0], 3)
         assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
-        assert body.hull.shape[0] in objects.HULL_CLASSES
+        assert body.hulls.shape[0] == 1
+        assert body.hulls.shape[1] in objects.HULL_CLASSES
         assert body.texture.shape == (1, 1, 3)
         longest = np.ptp(np.asarray(body.vertices), axis=0).max()
         assert 0.050 - 1e-6 <= longest <= 0.130 + 1e-6
@@ -37,16 +38,16 @@ def test_what_collides_is_what_is_seen(bodies, category):
     for body in bodies[category]:
         assert objects.hull_gap(body) < 1e-4  # m: stated 0.1 mm, aim 0.2 mm
         seen = {tuple(p) for p in np.asarray(body.vertices)}
-        assert {tuple(p) for p in np.asarray(body.hull)} <= seen
+        assert {tuple(p) for p in np.asarray(body.hulls[0])} <= seen
         assert {int(i) for i in np.unique(real_faces(body))} >= {
-            int(np.nonzero((np.asarray(body.vertices) == p).all(1))[0][0]) for p in np.asarray(body.hull)
+            int(np.nonzero((np.asarray(body.vertices) == p).all(1))[0][0]) for p in np.asarray(body.hulls[0])
         }
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
 def test_hull_suits_the_collider(bodies, category):
     for body in bodies[category]:
-        shape = ConvexHull(np.unique(np.asarray(body.hull, float), axis=0))
+        shape = ConvexHull(np.unique(np.asarray(body.hulls[0], float), axis=0))
         assert (shape.equations[:, 3] < -1e-3).all()  # the origin is inside, by a millimetre and more
         _, face = np.unique(np.round(shape.equations, 4), axis=0, return_inverse=True)
         corners = [len(np.unique(shape.simplices[face.ravel() == i])) for i in range(face.max() + 1)]
@@ -85,17 +86,17 @@ def test_mass_is_that_of_the_surface(bodies, category):
 @pytest.mark.parametrize("category", objects.CATEGORIES)
 def test_contents(bodies, category):
     for body in bodies[category]:
-        contents = np.asarray(body.contents, float)
         if category in SOLID:
-            assert not contents.any()
+            assert not np.asarray(body.interior).any()
             assert body.contents_density == 0
             continue
         assert body.contents_density == 1000
-        volume = contents[-1, 0]
-        hull = ConvexHull(np.unique(np.asarray(body.hull, float), axis=0)).volume
-        assert 0.2 * hull < volume < hull
-        np.testing.assert_allclose(contents[:, 0], volume * np.linspace(0, 1, objects.NUM_FILLS), rtol=1e-5)
-        height = contents[1:, 3] / contents[1:, 0]
+        fills = np.linspace(0, 1, 9)
+        volume, centre, _ = jax.vmap(objects.fill_moments, in_axes=(None, 0))(body.interior, fills)
+        hull = ConvexHull(np.unique(np.asarray(body.hulls[0], float), axis=0)).volume
+        assert 0.2 * hull < volume[-1] < hull
+        np.testing.assert_allclose(volume, volume[-1] * fills, rtol=1e-5, atol=1e-12)
+        height = centre[1:, 2]
         assert (np.diff(height) > 0).all()
         assert np.asarray(body.vertices)[:, 2].min() < height[0]
 
@@ -136,7 +137,7 @@ def test_unknown_category():
 @pytest.mark.parametrize("category", objects.CATEGORIES)
 def test_it_stands_or_lies_as_made(bodies, category):
     for body in bodies[category]:
-        hull = np.asarray(body.hull, float)
+        hull = np.asarray(body.hulls[0], float)
         foot = hull[hull[:, 2] < hull[:, 2].min() + 1.5e-3, :2]
         for fill in (0.0, 0.5, 1.0):
             com = np.asarray(objects.rigid(body, fill, 1.0)[1], float)

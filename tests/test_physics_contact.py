@@ -1,4 +1,4 @@
-"""Contacts of a hull with the pad, against C MuJoCo's collision of the same mesh."""
+"""Contacts of hulls with the pad, against C MuJoCo's collision of the same mesh."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def points(name: str) -> np.ndarray:
     else:
         grid = rng.normal(size=(30, 3))
         grid *= 0.03 / np.linalg.norm(grid, axis=1, keepdims=True)
-    return np.concatenate([grid, np.repeat(grid[-1:], 32 - len(grid), axis=0)]).astype(np.float32)
+    return np.concatenate([grid, np.repeat(grid[-1:], 32 - len(grid), axis=0)]).astype(np.float32)[None]
 
 
 def in_c(model: mujoco.MjModel, data: mujoco.MjData, pose: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -122,4 +122,4 @@ def test_padding_changes_nothing() -> None:
 
 def test_flat_points_are_refused() -> None:
     with pytest.raises(ValueError, match="no volume"):
-        contact.hull(np.random.default_rng(0).normal(size=(32, 3)) * [1, 1, 0])
+        contact.hull(np.random.default_rng(0).normal(size=(1, 32, 3)) * [1, 1, 0])

@@ -77,9 +77,7 @@ def test_gravity_holds_the_whole_impulse_and_ends() -> None:
 
 def driven(body: objects.Body, mass: float, com: np.ndarray, inertia: np.ndarray, friction: float) -> mujoco.MjModel:
     """The scene with its pad on two slides, a million times as heavy as the object."""
-    points = " ".join(f"{x:.9g}" for x in np.unique(np.asarray(body.hull), axis=0).ravel())
-    asset = f'<asset><mesh name="hull" inertia="convex" vertex="{points}"/></asset>'
-    xml = scene._xml(PAD, SCENARIO.contact, ['type="mesh" mesh="hull"'], asset)
+    xml = scene.scene_xml(np.asarray(body.hulls), PAD, SCENARIO.contact)
     start = xml.index('<geom name="pad"')
     end = xml.index("/>", start) + 2
     slides = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
@@ -97,7 +95,7 @@ def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shak
     for row in range(2 * NUM):
         body, friction = bottles[shaken.body[row]], float(shaken.hidden.friction[row])
         moving = driven(body, *rigid(bottles, shaken, row), friction)
-        fixed = scene.compile_scene(np.asarray(body.hull), PAD, SCENARIO.contact)
+        fixed = scene.compile_scene(np.asarray(body.hulls), PAD, SCENARIO.contact)
         scene.set_rigid(fixed, mujoco.MjData(fixed), *rigid(bottles, shaken, row), friction)
         for model in (moving, fixed):
             model.opt.iterations, model.opt.tolerance = 100, 0  # masses this far apart converge slowly
@@ -156,7 +154,7 @@ def test_a_tall_prism_topples_at_g_b_over_h(shape: str) -> None:
     inertia = mass / 12 * np.diag([4 * half**2 + height**2, 4 * half**2 + height**2, 8 * half**2])
     scene.set_rigid(model, mujoco.MjData(model), mass, np.zeros(3), inertia, 0.8)
     own = like.tree_replace(scene.drawn(model, like))
-    hull = jax.tree.map(jnp.asarray, contact.hull(prism(base, height)))
+    hull = jax.tree.map(jnp.asarray, contact.hull(prism(base, height)[None]))
     state = roll.initial(jnp.array([0, 0, height / 2, 1, 0, 0, 0]), jnp.zeros(6))
     for factor, falls in ((0.97, False), (1.03, True)):
         size = factor * G * reach / (height / 2)

@@ -31,14 +31,13 @@ def drops(bodies: list[objects.Body]) -> physics.Trajectory:
 
 
 def rigid(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[float, np.ndarray, np.ndarray]:
-    mass, com, inertia = objects.rigid(
-        bodies[drops.body[row]], jnp.asarray(drops.hidden.fill[row]), jnp.asarray(drops.hidden.shell_scale[row])
-    )
+    own = jax.tree.map(lambda x: jnp.asarray(x[row]), drops.hidden)
+    mass, com, inertia = objects.rigid(bodies[drops.body[row]], own.fill, own.shell_scale, own.up)
     return float(mass), np.asarray(com, np.float64), np.asarray(inertia, np.float64)
 
 
 def c_model(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = scene.compile_scene(np.asarray(bodies[drops.body[row]].hull), PAD, SCENARIO.contact)
+    model = scene.compile_scene(np.asarray(bodies[drops.body[row]].hulls), PAD, SCENARIO.contact)
     data = mujoco.MjData(model)
     scene.set_rigid(model, data, *rigid(bodies, drops, row), float(drops.hidden.friction[row]))
     return model, data
@@ -61,7 +60,7 @@ def test_frame_0_is_at_rest_in_the_air_at_the_stated_height(
     for row in range(4 * NUM):
         matrix = np.empty(9)
         mujoco.mju_quat2Mat(matrix, drops.pose[row, 0, 3:].astype(np.float64))
-        lowest = np.min(np.asarray(bodies[drops.body[row]].hull) @ matrix.reshape(3, 3)[2]) + drops.pose[row, 0, 2]
+        lowest = np.min(np.asarray(bodies[drops.body[row]].hulls[0]) @ matrix.reshape(3, 3)[2]) + drops.pose[row, 0, 2]
         np.testing.assert_allclose(lowest, SCENARIO.height, atol=2e-6)
     np.testing.assert_allclose(drops.velocity[:, 0], 0, atol=1e-5)
     assert not drops.contact[:, 0].any()
@@ -167,7 +166,7 @@ def test_a_draw_is_a_freshly_compiled_model(scale: float) -> None:
     scene.set_rigid(model, mujoco.MjData(model), mass, com, inertia, 0.7)
     drawn = like.tree_replace(scene.drawn(model, like))
 
-    spec = mujoco.MjSpec.from_string(scene._xml(PAD, constants, ['type="box" size=".01 .01 .01"'] * 2))
+    spec = mujoco.MjSpec.from_string(scene._xml(PAD, 0.0, constants, ['type="box" size=".01 .01 .01"'] * 2, "", ""))
     body = spec.body("object")
     body.mass, body.ipos = mass, com
     body.fullinertia = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -184,7 +183,7 @@ def test_a_draw_is_a_freshly_compiled_model(scale: float) -> None:
 
 def block(mass: float) -> tuple[scene.mjx.Model, scene.mjx.Data, contact.Hull]:
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
-    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])))
+    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])[None]))
     model, like, data = scene.template(PAD, physics.Contact())
     model = copy.copy(model)
     scene.set_rigid(model, mujoco.MjData(model), mass, np.zeros(3), mass * np.diag([1e-4, 2e-4, 3e-4]), 0.5)

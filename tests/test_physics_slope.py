@@ -1,6 +1,7 @@
-"""A block on a slope (gravity tilted in the pad's frame): it holds, or slides as Coulomb says, in every direction."""
+"""The slope: blocks hold or slide as Coulomb says in every direction, a ball rolls, and what `Inclined` promises."""
 
 import copy
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from sts_jax import physics
+from sts_jax import _math, objects, physics
 from sts_jax.physics import contact, roll, scene
-from sts_jax.physics.scenarios import G
+from sts_jax.physics.scenarios import STANDING, G
+from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)
 SLOPE = np.radians(30)
@@ -19,13 +21,17 @@ STEPS = 50
 ROLL = jax.jit(jax.vmap(roll.roll, in_axes=(None, None, None, 0, 0)))
 
 
+SCENARIO = physics.Inclined()
+CORNERS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
+INERTIA = 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4])
+
+
 def slide(friction: float, constants: physics.Contact, frames: int) -> roll.Record:
     """A block 60 x 40 x 20 mm laid on the pad, which is then tilted towards each azimuth; a record every 50 ms."""
-    corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
-    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([corners, np.repeat(corners[-1:], 24, axis=0)])))
+    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None]))
     model, like, data = scene.template(PAD, constants)
     model = copy.copy(model)
-    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4]), friction)
+    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, friction)
     own = like.tree_replace(scene.drawn(model, like))
     down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
     start = jax.vmap(lambda xy: roll.initial(jnp.array([*(-0.03 * xy), 0.01, 1, 0, 0, 0]), jnp.zeros(6)))(
@@ -38,14 +44,14 @@ def slide(friction: float, constants: physics.Contact, frames: int) -> roll.Reco
 
 
 def test_below_the_friction_angle_it_holds() -> None:
-    found = slide(float(np.tan(SLOPE) / 0.97), physics.Perturbed().contact, 10)
+    found = slide(float(np.tan(SLOPE) / 0.97), physics.Inclined().contact, 10)
     creep = np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 6, :2], axis=1) / (5 * STEPS * 1e-3)
     assert np.all(creep < 1e-3), creep
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.4])
 def test_above_it_slides_with_what_friction_leaves(friction: float) -> None:
-    found = slide(friction, physics.Perturbed().contact, 10)
+    found = slide(friction, physics.Inclined().contact, 10)
     down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
     speed = np.einsum("nfi,ni->nf", found.velocity[..., :2], down)
     gained = (speed[:, 4] - speed[:, 2]) / (2 * STEPS * 1e-3)
@@ -53,3 +59,169 @@ def test_above_it_slides_with_what_friction_leaves(friction: float) -> None:
     np.testing.assert_allclose(gained, expected, rtol=0.02)
     across = np.abs(found.velocity[:, 4, 0] * down[:, 1] - found.velocity[:, 4, 1] * down[:, 0])
     assert np.all(across < 0.01 * speed[:, 4])
+
+
+def test_it_slides_as_in_c() -> None:
+    friction, frames = 0.4, 4
+    found = slide(friction, SCENARIO.contact, frames)
+    model = scene.compile_scene(CORNERS[None], PAD, SCENARIO.contact)
+    data = mujoco.MjData(model)
+    scene.set_rigid(model, data, 0.1, np.zeros(3), INERTIA, friction)
+    for row, azimuth in enumerate(AZIMUTHS):
+        down = np.array([np.cos(azimuth), np.sin(azimuth)])
+        mujoco.mj_resetData(model, data)
+        data.qpos[:] = [*(-0.03 * down), 0.01, 1, 0, 0, 0]
+        for frame in range(frames + 2):
+            model.opt.gravity[:] = G * np.array([*(np.sin(SLOPE) * down), -np.cos(SLOPE)]) if frame > 1 else [0, 0, -G]
+            mujoco.mj_step(model, data, nstep=STEPS)
+        np.testing.assert_allclose(found.pose[row, -1, :3], data.qpos[:3], atol=2e-4)
+
+
+def test_a_ball_rolls_with_five_sevenths_of_the_pull() -> None:
+    radius, mass = 0.02, 0.1
+    constants = dataclasses.replace(SCENARIO.contact, rolling=0.0)
+    xml = scene._xml(PAD, 0.0, constants, [f'type="sphere" size="{radius}"'], "", "")
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    scene.set_rigid(model, data, mass, np.zeros(3), 0.4 * mass * radius**2 * np.diag([1.01, 1, 0.99]), 0.8)
+    model.opt.gravity[:] = G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
+    data.qpos[:] = [0, -0.05, radius, 1, 0, 0, 0]
+    ours = scene.mjx.put_model(model)
+    step = jax.jit(lambda d: jax.lax.fori_loop(0, 100, lambda _, d: scene.mjx.step(ours, d), d))
+    speeds = [0.0]
+    state = scene.mjx.put_data(model, data)
+    for _ in range(2):
+        state = step(state)
+        speeds.append(float(state.qvel[1]))
+    np.testing.assert_allclose(np.diff(speeds)[1] / 0.1, 5 / 7 * G * np.sin(SLOPE), rtol=0.005)
+
+
+@pytest.fixture(scope="module")
+def bodies() -> list[objects.Body]:
+    return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "camera", "scissors"])]
+
+
+@pytest.fixture(scope="module")
+def slid(bodies: list[objects.Body]) -> physics.Trajectory:
+    return jax.tree.map(np.asarray, physics.simulate(jax.random.key(1), bodies, Sensor(), SCENARIO, 8))
+
+
+def points(bodies: list[objects.Body], slid: physics.Trajectory, row: int, frame: int) -> np.ndarray:
+    """Hull vertices in the sensor frame."""
+    pose = jnp.asarray(slid.pose[row, frame])
+    return np.asarray(_math.transform(pose, bodies[slid.body[row]].hulls[0]))
+
+
+def weight(bodies: list[objects.Body], slid: physics.Trajectory, row: int) -> tuple[float, np.ndarray]:
+    """The weight (N), and the centre of mass in the mesh frame (m)."""
+    own = jax.tree.map(lambda x: jnp.asarray(x[row]), slid.hidden)
+    mass, com, _ = objects.rigid(bodies[slid.body[row]], own.fill, own.shell_scale, own.up)
+    return G * float(mass), np.asarray(com)
+
+
+def test_starts_rest_on_a_face_or_hang_just_above_and_never_in_the_wall(
+    bodies: list[objects.Body], slid: physics.Trajectory
+) -> None:
+    resting = 0
+    for row in range(len(slid.pose)):
+        corners = points(bodies, slid, row, 0)
+        lowest = corners[:, 2].min()
+        assert corners[:, 1].max() < PAD[1] / 2
+        if slid.contact[row, 0]:
+            resting += 1
+            face = corners[corners[:, 2] < lowest + 1e-3]
+            assert np.linalg.matrix_rank(face - face[0], tol=2e-3) >= 2  # on a face, not on a corner
+            assert abs(lowest + STANDING) < 3e-4
+            assert np.linalg.norm(slid.velocity[row, 0, :3]) < G / SCENARIO.rate
+        else:
+            assert 0.001 - 1e-6 <= lowest <= 0.01 + 1e-6
+            np.testing.assert_array_equal(slid.velocity[row, 0], 0)
+    assert 0.6 <= resting / len(slid.pose) <= 0.95
+
+
+def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], slid: physics.Trajectory) -> None:
+    on_pad = slid.settled & (slid.outcome != physics.Outcome.FELL_OFF)
+    leaning, alone = np.flatnonzero(on_pad & slid.wall[:, -1]), np.flatnonzero(on_pad & ~slid.wall[:, -1])
+    assert len(leaning) >= 5
+    assert len(alone) >= 3
+    for row in alone:  # the pad carries all of the weight, and its moment
+        size, com = weight(bodies, slid, row)
+        pull = size * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
+        centre = np.asarray(_math.transform(jnp.asarray(slid.pose[row, -1]), jnp.asarray(com)))
+        np.testing.assert_allclose(slid.wrench[row, -1, :3], -pull, atol=0.02 * size)
+        np.testing.assert_allclose(slid.wrench[row, -1, 3:], -np.cross(centre, pull), atol=0.02 * size * 0.075)
+    for row in leaning:  # of Coulomb's friction on the pad no more than there can be
+        force = slid.wrench[row, -1, :3]
+        assert np.linalg.norm(force[:2]) <= slid.hidden.friction[row] * force[2] * 1.02 + 1e-3
+    carried = np.array([-slid.wrench[row, -1, 1] / (weight(bodies, slid, row)[0] * np.sin(SLOPE)) for row in leaning])
+    assert np.mean(carried < 0.95) > 0.5  # the wall carries the rest
+
+
+def test_pad_and_wall_together_are_all_that_pushes() -> None:
+    model, like, data = scene.template(PAD, SCENARIO.contact, SCENARIO.wall)
+    model = copy.copy(model)
+    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
+    own = like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like)))
+    hull = contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None])
+    data = data.replace(qpos=jnp.array([0, 0.0552, 0.0098, 1, 0, 0, 0]))
+    step = jax.jit(lambda data: scene.step(own, data, roll._contacts(own, jax.tree.map(jnp.asarray, hull), data.qpos)))
+    new = step(data)
+    pad, wall = scene.push(new, slice(0, 8)), scene.push(new, slice(8, 12))
+    np.testing.assert_allclose(pad + wall, new.qfrc_constraint, rtol=1e-4, atol=1e-5)
+    assert wall[1] < -0.1
+    assert pad[2] > 0.1
+    in_c = scene.compile_scene(CORNERS[None], PAD, SCENARIO.contact, SCENARIO.wall)
+    state = mujoco.MjData(in_c)
+    scene.set_rigid(in_c, state, 0.1, np.zeros(3), INERTIA, 0.3)
+    state.qpos[:] = data.qpos
+    mujoco.mj_forward(in_c, state)
+    names = {in_c.geom(int(i)).name for pair in state.contact.geom for i in pair}
+    assert {"pad", "wall"} <= names
+    np.testing.assert_allclose(new.qfrc_constraint[:3], state.qfrc_constraint[:3], rtol=0.02, atol=0.02)
+
+
+def test_outcomes_are_read_from_the_poses() -> None:
+    first = jnp.array([0.01, -0.02, 0.05, 1, 0, 0, 0])
+    turn = jnp.array([jnp.cos(0.5), 0, 0, jnp.sin(0.5)])  # 57 degrees
+    cases = {
+        physics.Outcome.STICKS: first.at[1].set(-0.012),
+        physics.Outcome.SLIDES: first.at[1].set(-0.008),
+        physics.Outcome.ROLLS: first.at[3:].set(-turn),
+        physics.Outcome.FELL_OFF: first.at[3:].set(turn).at[2].set(-0.05),
+    }
+    for outcome, last in cases.items():
+        assert int(SCENARIO.outcome(first, last)) == outcome
+
+
+def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
+    keys = jax.random.split(jax.random.key(0), 2000)
+    up = np.asarray(jax.vmap(SCENARIO.hidden)(keys).up)
+    np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(up.mean(0), 0, atol=0.05)
+    np.testing.assert_allclose(up.T @ up / len(up), np.eye(3) / 3, atol=0.03)
+    off = jax.vmap(physics.variant(SCENARIO, "off").hidden)(keys)
+    np.testing.assert_allclose(off.up, np.tile([0.0, 0, 1], (2000, 1)), atol=1e-6)
+    np.testing.assert_allclose(off.friction, 0.55, rtol=1e-6)
+    wide = jax.vmap(physics.variant(SCENARIO, "wide-friction").hidden)(keys).friction
+    assert wide.min() < 0.32
+    assert wide.max() > 0.88
+    assert physics.variant(physics.Perturbed(), "off-centre").tilt == np.pi
+    with pytest.raises(ValueError, match="unknown variant 'none'"):
+        physics.variant(SCENARIO, "none")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"slope": np.pi / 2}, {"slope": 30.0}, {"friction": (0.0, 0.5)}, {"wall": -0.1}, {"resting": 1.5}, {"tilt": 4.0}],
+)
+def test_bad_fields_are_named(bodies: list[objects.Body], change: dict) -> None:
+    with pytest.raises(ValueError, match=f"scenario.{next(iter(change))}"):
+        physics.simulate(jax.random.key(0), bodies, Sensor(), dataclasses.replace(SCENARIO, **change))
+
+
+def test_what_does_not_stand_is_refused_by_name(bodies: list[objects.Body]) -> None:
+    turned = dataclasses.replace(bodies[0], hulls=bodies[0].hulls[..., ::-1], shell_com=bodies[0].shell_com[::-1])
+    leaning = jnp.asarray(bodies[0].hulls) + bodies[0].hulls[..., 2:] * jnp.array([1.5, 0, 0])
+    for body in (dataclasses.replace(bodies[0], hulls=leaning), dataclasses.replace(turned, hulls=leaning)):
+        with pytest.raises(ValueError, match="body 1: does not stand upright"):
+            physics.simulate(jax.random.key(0), [bodies[0], body], Sensor(), physics.Perturbed())

@@ -170,7 +170,7 @@ def animation(
         page = Image.new("RGB", (width, base), "white")
         draw = ImageDraw.Draw(page)
         draw.text((6, 5), title, "black", small)
-        said = f"{time[t]:.2f} s, {slower:g} times slower than it is" + (f": {outcome}" if t == len(time) - 1 else "")
+        said = f"{time[t]:.2f} s, at 1/{slower:g} of its speed" + (f": {outcome}" if t == len(time) - 1 else "")
         draw.text((6, 23), said, "black", font)
         for column, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
             picture = Image.fromarray(np.round(255 * np.clip(images[t], 0, 1)).astype(np.uint8))
@@ -189,7 +189,7 @@ def animation(
         draw.text((4, zero - 7), "0 N", "black", small)
         for k, (name, colour) in enumerate({"Fx": "tab:blue", "Fy": "tab:orange", "Fz": "tab:green"}.items()):
             ink = colors.to_hex(colour)
-            draw.text((width - 90 + 28 * k, base - 94), name, ink, small)
+            draw.text((width - 90 + 28 * k, 23), name, ink, small)
             draw.line([*zip(across[: t + 1], heights[: t + 1, k], strict=True)], ink, 2)
         pages.append(page)
     # A GIF counts hundredths of a second.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, ScalarLike
 
 from sts_jax import _math, optics, physics
 from sts_jax.dataset import render_uint8
@@ -26,6 +26,7 @@ def outside(
     pose: Float[Array, "7"],
     size: Float[Array, "2"],
     up: Float[Array, "3"] | None = None,
+    wall: ScalarLike = 0.0,
     *,
     resolution: tuple[int, int] = (160, 160),
 ) -> Float[Array, "h w 3"]:
@@ -36,6 +37,7 @@ def outside(
         pose: Mesh frame in the sensor frame.
         size: Of the pad along x and y (m), `(2,)`.
         up: The vertical in the sensor frame, of any length: the pad is shown as tilted as it is; level if not given.
+        wall: Height of a stop wall at the pad's edge of largest y (m).
         resolution: (height, width), pixels.
 
     Returns:
@@ -45,12 +47,16 @@ def outside(
     corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)], jnp.float32)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     box = jnp.asarray(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), jnp.int32)
-    vertices = jnp.concatenate([_math.transform(pose, body.vertices), corners * half])
-    faces = jnp.concatenate([body.faces, box + len(body.vertices)])
+    thick = half[:2] + jnp.array([0.0, 0.003]) * (jnp.asarray(wall) > 0)
+    stop = jnp.stack(
+        [jnp.stack([x * half[0], y, z * wall]) for x in (-1, 1) for y in (half[1], thick[1]) for z in (0, 1)]
+    )
+    vertices = jnp.concatenate([_math.transform(pose, body.vertices), corners * half, stop])
+    faces = jnp.concatenate([body.faces, box + len(body.vertices), box + len(body.vertices) + 8])
     flat = jnp.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], jnp.float32)
-    flat = jnp.broadcast_to(jnp.concatenate([flat, flat])[:, None], (12, 3, 3))
+    flat = jnp.broadcast_to(jnp.tile(flat, (4, 1))[:, None], (24, 3, 3))
     normals = jnp.concatenate([body.normals @ _math.quat_matrix(pose[3:]).T, flat])
-    top = flat[..., 2:] > 0
+    top = (flat[..., 2:] > 0) & (jnp.arange(24) < 12)[:, None, None]
     if up is not None:
         axis, along = jnp.cross(up, jnp.array([0.0, 0.0, 1.0])), _math.norm(up)
         level = _math.quat_from_rotvec(_math.normalize(axis) * jnp.arctan2(_math.norm(axis) / along, up[2] / along))

@@ -4,22 +4,23 @@ from sts_jax.objects.body import (
     CATEGORIES,
     FACE_CLASSES,
     HULL_CLASSES,
-    NUM_FILLS,
+    PART_CLASSES,
     TEXTURE_CLASSES,
     Body,
+    fill_moments,
     mirror,
     rigid,
     stack,
 )
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import fill_moments, hull_gap
+from sts_jax.objects.solids import hull_gap, rest_poses
 
 __all__ = [
     "CATEGORIES",
     "FACE_CLASSES",
     "HULL_CLASSES",
-    "NUM_FILLS",
+    "PART_CLASSES",
     "TEXTURE_CLASSES",
     "Body",
     "fill_moments",
@@ -27,6 +28,7 @@ __all__ = [
     "load",
     "make",
     "mirror",
+    "rest_poses",
     "rigid",
     "stack",
 ]

@@ -5,16 +5,20 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 # Padding classes. Two bodies of one class have leaves of equal shape, so whatever is compiled for one serves the
 # other. A padding face is (0, 0, 0): it has no area and covers no pixel. A padding vertex (of `vertices`, which are
-# as many as the faces, or of `hull`) repeats the last one, so that extents need no mask.
+# as many as the faces, or of a hull) repeats the last one, so that extents need no mask; so does a padding hull. A
+# padding triangle of the interior has all corners in the origin: it bounds nothing.
 FACE_CLASSES = (1024, 4096, 16384, 131072)
+PART_CLASSES = (1, 8)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
-# Fill levels at which the contents' moments are tabulated: 0, 1/32, ... 1 of the interior's volume.
-NUM_FILLS = 33
+LEVEL_STEPS = 30  # halvings in the search for the contents' level: beyond float32's digits
+
+Direction = Float[Array | np.ndarray, "3"] | tuple[float, float, float]
 
 CATEGORIES = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon", "watch")
 
@@ -27,9 +31,7 @@ class Body:
     The origin lies inside the convex hull; +z is the object's up axis where it has one. The albedo at a point is
     its texture's value times its interpolated corner colour (as in glTF), in linear light.
 
-    The hidden contents are tabulated so that mass, centre of mass and inertia follow from a fill by one
-    interpolation: row k of `contents` holds, for the lowest k / (NUM_FILLS - 1) of the interior's volume along +z,
-    `[V, Vx, Vy, Vz, Vxx, Vyy, Vzz, Vxy, Vxz, Vyz]`, the integrals of 1, x, y, z, x^2, ... over the filled part.
+    Mass, centre of mass and inertia follow from the shell and from what fills the interior (`rigid`).
     """
 
     vertices: Float[Array, "*n v 3"]  # m
@@ -39,11 +41,11 @@ class Body:
     uv: Float[Array, "*n f 3 2"]  # [0, 1], texture coordinates of each corner; v = 0 is the texture's top row
     texture: Float[Array, "*n t t 3"]  # [0, 1]
     two_sided: Bool[Array, "*n"]  # open surfaces are seen from behind too
-    hull: Float[Array, "*n h 3"]  # m, vertices of the convex collision hull
+    hulls: Float[Array, "*n p h 3"]  # m, vertices of the convex parts that collide; one, unless decomposed
     shell_mass: Float[Array, "*n"]  # kg, of the empty object
     shell_com: Float[Array, "*n 3"]  # m
     shell_inertia: Float[Array, "*n 3 3"]  # kg m^2, about the shell's centre of mass, mesh axes
-    contents: Float[Array, "*n k 10"]  # m^3, m^4, m^5; see above; zeros for solid things
+    interior: Float[Array, "*n i 3 3"]  # m, triangles of the closed surface that bounds the contents; zeros if solid
     contents_density: Float[Array, "*n"]  # kg/m^3; 0 for solid things
     category: Int[Array, "*n"]  # index into CATEGORIES, -1 for a loaded mesh
 
@@ -66,9 +68,9 @@ def stack(bodies: Sequence[Body]) -> Body:
     for index, shape in enumerate(shapes):
         if shape != shapes[0]:
             raise ValueError(
-                f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, "
-                f"{len(bodies[index].hull)} hull vertices, texture {len(bodies[index].texture)}; body 0 has "
-                f"{len(bodies[0].faces)}, {len(bodies[0].hull)}, {len(bodies[0].texture)}): stack each class by itself"
+                f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, hulls of shape "
+                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}; body 0 has {len(bodies[0].faces)}, "
+                f"{bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class by itself"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 
@@ -77,8 +79,6 @@ def mirror(body: Body) -> Body:
     """The body's mirror image: y becomes -y in the mesh frame, for one body or with leading axes."""
     flip = jnp.array([1.0, -1, 1])
     corners = jnp.array([0, 2, 1])  # so that faces stay counter-clockwise from outside
-    # V, Vx, Vy, Vz, Vxx, Vyy, Vzz, Vxy, Vxz, Vyz
-    moments = jnp.array([1.0, 1, -1, 1, 1, 1, 1, -1, 1, -1])
     return dataclasses.replace(
         body,
         vertices=body.vertices * flip,
@@ -86,50 +86,104 @@ def mirror(body: Body) -> Body:
         normals=body.normals[..., corners, :] * flip,
         colors=body.colors[..., corners, :],
         uv=body.uv[..., corners, :],
-        hull=body.hull * flip,
+        hulls=body.hulls * flip,
         shell_com=body.shell_com * flip,
         shell_inertia=body.shell_inertia * jnp.outer(flip, flip),
-        contents=body.contents * moments,
+        interior=body.interior[..., corners, :] * flip,
     )
 
 
 def rigid(
-    body: Body, fill: ScalarLike, shell_scale: ScalarLike
+    body: Body, fill: ScalarLike, shell_scale: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Mass, centre of mass and inertia of a body whose contents fill it to a share of the interior's volume.
 
-    With the shell's mass m_s and second moments J_s = int r r^T dm, and the contents' V, V_r, V_rr at the fill:
-    m = s m_s + rho V, m c = s m_s c_s + rho V_r, I = tr(J) 1 - J - m (|c|^2 1 - c c^T), J = s J_s + rho V_rr.
-    The table is interpolated linearly between its rows.
+    With the shell's mass m_s, centre c_s and inertia I_s, and the contents' volume V, centre c_c and second moments
+    C = int (r - c_c) (r - c_c)^T over them: m = s m_s + rho V, m c = s m_s c_s + rho V c_c, and by Steiner's theorem
+    I = s I_s + rho (tr(C) 1 - C) + both masses' parts about c.
 
     Args:
         body: one body.
         fill: share of the interior's volume, 0 to 1; clipped.
         shell_scale: factor on the shell's mass.
+        up: unit vector in the mesh frame, away from where the contents have settled.
 
     Returns:
         mass (kg), centre of mass (m, mesh frame), inertia about the centre of mass (kg m^2, mesh axes).
     """
-    rows = body.contents.shape[0] - 1
-    level = jnp.clip(jnp.asarray(fill, body.contents.dtype), 0, 1) * rows
-    low = jnp.clip(jnp.floor(level).astype(jnp.int32), 0, rows - 1)
-    share = level - low
-    row = body.contents_density * (body.contents[low] * (1 - share) + body.contents[low + 1] * share)
+    volume, middle, second = fill_moments(body.interior, fill, up)
+    shell, contents = body.shell_mass * shell_scale, body.contents_density * volume
+    mass = shell + contents
+    com = (shell * body.shell_com + contents * middle) / mass
 
-    shell = body.shell_mass * shell_scale
-    mass = shell + row[0]
-    com = (shell * body.shell_com + row[1:4]) / mass
-    xx, yy, zz, xy, xz, yz = row[4:]
-    second = jnp.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    # Both parts about the common centre of mass, so that nothing large cancels in float32.
-    offset = body.shell_com - com
-    drop = jnp.where(row[0] > 0, row[1:4] / jnp.where(row[0] > 0, row[0], 1), com)
-    second = second - row[0] * jnp.outer(drop, drop) + row[0] * jnp.outer(drop - com, drop - com)
-    eye = jnp.eye(3, dtype=second.dtype)
-    inertia = (
-        body.shell_inertia * shell_scale
-        + shell * (offset @ offset * eye - jnp.outer(offset, offset))
-        + jnp.trace(second) * eye
-        - second
-    )
-    return mass, com, inertia
+    def steiner(mass: Float[Array, ""], offset: Float[Array, "3"]) -> Float[Array, "3 3"]:
+        return mass * (offset @ offset * jnp.eye(3) - jnp.outer(offset, offset))
+
+    inertia = body.shell_inertia * shell_scale + body.contents_density * (jnp.trace(second) * jnp.eye(3) - second)
+    return mass, com, inertia + steiner(shell, body.shell_com - com) + steiner(contents, middle - com)
+
+
+def fill_moments(
+    interior: Float[Array, "i 3 3"], fill: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
+    """Volume, centre and central second moments of the lowest share of a closed mesh.
+
+    With a point of the liquid's surface as reference, the signed tetrahedra of the triangles clipped to the half-space
+    below it sum to the filled part: the surface itself adds nothing. Its level is found by bisection.
+
+    Args:
+        interior: (i, 3, 3) m, closed, triangles counter-clockwise from outside; triangles without area are ignored.
+        fill: share of the volume, 0 to 1; clipped.
+        up: unit vector; what is lowest along it is filled.
+
+    Returns:
+        m^3, m (the interior's middle where nothing is filled), m^5.
+    """
+    up = jnp.asarray(up, interior.dtype)
+    height = interior @ up
+    bottom, top = jnp.min(height), jnp.max(height)
+    middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
+
+    def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
+        """Volumes and corners of the tetrahedra under a level, from a reference on it."""
+        # Of a triangle that crosses the level, the corner alone below is added, or the one alone above subtracted.
+        reference = middle + (level - middle @ up) * up
+        under = height < level
+        count = jnp.sum(under, axis=1)
+        lone = jnp.argmax(under == (count == 1)[:, None], axis=1)
+        order = (lone[:, None] + jnp.arange(3)) % 3
+        corner = jnp.take_along_axis(interior, order[:, :, None], axis=1) - reference
+        h = jnp.take_along_axis(height, order, axis=1)
+        crosses = (count == 1) | (count == 2)
+        rise = jnp.where(crosses[:, None], h[:, 1:] - h[:, :1], 1.0)
+        share = jnp.where(crosses[:, None], (level - h[:, :1]) / rise, 0.0)[..., None]
+        corner = corner.at[:, 1:].set(corner[:, :1] + share * (corner[:, 1:] - corner[:, :1]))
+        corners = jnp.concatenate([interior - reference, corner])
+        weight = jnp.concatenate([count >= 2, jnp.where(crosses, jnp.where(count == 1, 1, -1), 0)])
+        volume = jnp.einsum("fi,fi->f", corners[:, 0], jnp.cross(corners[:, 1], corners[:, 2])) / 6
+        return weight * volume, corners, reference, jnp.sum(weight * volume)
+
+    share = jnp.clip(jnp.asarray(fill, interior.dtype), 0, 1)
+    target = share * below(top + (top - bottom))[-1]
+
+    def halve(_: ScalarLike, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = bracket
+        level = (low + high) / 2
+        less = below(level)[-1] < jax.lax.stop_gradient(target)
+        return jnp.where(less, level, low), jnp.where(less, high, level)
+
+    low, high = jax.lax.fori_loop(0, LEVEL_STEPS, halve, jax.lax.stop_gradient((bottom, top)))
+    # A step of Newton's with a constant slope: the derivative of the level that was found is that of the root.
+    found, slope = jax.value_and_grad(lambda level: below(level)[-1])((low + high) / 2)
+    wide = slope > 0
+    level = (low + high) / 2 + jnp.where(wide, (target - found) / jnp.where(wide, slope, 1), 0)
+    # Above the top everything is under the level, whatever rounding says of the highest corners.
+    level = jnp.where(share < 1, level, top + (top - bottom))
+    volumes, corners, reference, volume = below(level)
+    total = jnp.sum(corners, axis=1)
+    filled = volume > 0
+    whole = jnp.where(filled, volume, 1.0)
+    first = jnp.where(filled, jnp.einsum("f,fi->i", volumes, total) / 4 / whole, 0.0)
+    second = jnp.einsum("f,fi,fj->ij", volumes, total, total) + jnp.einsum("f,fki,fkj->ij", volumes, corners, corners)
+    second = jnp.where(filled, second / 20 - volume * jnp.outer(first, first), 0.0)
+    return jnp.where(filled, volume, 0.0), jnp.where(filled, reference + first, middle), second

@@ -1,10 +1,8 @@
-"""Geometry of solids on the host, NumPy in float64: moments, fill levels, convex hulls, corner normals, assembly.
+"""Geometry of solids on the host, NumPy in float64: moments, convex hulls, rest poses, corner normals, assembly.
 
 Triangles are counter-clockwise seen from outside. A row of moments is `[1, x, y, z, xx, yy, zz, xy, xz, yz]`
 integrated over a solid or a surface.
 """
-
-from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,12 +10,15 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, NUM_FILLS, Body
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, Body
 
 WALL = 1.2  # kg/m^2, plastic about 1.2 mm thick: the shell of everything that holds something
 CONTENTS = 1000.0  # kg/m^3, water
 CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are made
 HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less
+SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull that lean less against one another are one face
+REST_GRAIN = 2e-5  # m, points of a hull this near a face's plane belong to it
+REST_MARGIN = 5e-4  # m, how far inside the outline of a face the centre of mass must lie for the object to rest on it
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -67,101 +68,6 @@ def _shifted(measure: np.ndarray, mean: np.ndarray, second: np.ndarray, origin: 
     return measure[:, None] * np.stack(columns, axis=1)
 
 
-def _below(triangles: np.ndarray, height: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles and weights (+1, -1) whose sum is what lies below the level.
-
-    Of a triangle that crosses it, either the corner alone below is added, or the whole less the corner alone above.
-    """
-    under = height < level
-    count = under.sum(axis=1)
-    crossing = (count == 1) | (count == 2)
-    lone = np.argmax(under == (count == 1)[:, None], axis=1)[crossing]
-    order = (lone[:, None] + np.arange(3)) % 3
-    corner = np.take_along_axis(triangles[crossing], order[:, :, None], axis=1)
-    h = np.take_along_axis(height[crossing], order, axis=1)
-    share = ((level - h[:, :1]) / (h[:, 1:] - h[:, :1]))[:, :, None]
-    corner[:, 1:] = corner[:, :1] + share * (corner[:, 1:] - corner[:, :1])
-    whole = count >= 2
-    weight = np.concatenate([np.ones(whole.sum()), np.where(count[crossing] == 1, 1.0, -1.0)])
-    return np.concatenate([triangles[whole], corner]), weight
-
-
-def fill_moments(
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    *,
-    direction: tuple[float, float, float] = (0.0, 0.0, 1.0),
-    num: int = NUM_FILLS,
-) -> Float[np.ndarray, "k 10"]:
-    """Moments of what fills a closed mesh from its lowest point along a direction, by share of its volume.
-
-    Exact for the mesh: with a point of the liquid's surface as reference, the signed tetrahedra of the triangles
-    clipped to the half-space sum to the clipped solid's moments. The level for each volume is found by bisection.
-
-    Args:
-        vertices: m.
-        faces: closed, counter-clockwise from outside.
-        direction: up, any length; contents frozen in another attitude take another direction.
-        num: number of levels K.
-
-    Returns:
-        Row k: the moments of the lowest k / (K - 1) of the volume; row 0 is zero.
-
-    Raises:
-        ValueError: the mesh encloses no volume, or the direction is zero.
-    """
-    up = np.asarray(direction, float)
-    if not np.linalg.norm(up) > 0:
-        raise ValueError(f"direction must not be zero, got {direction}")
-    up = up / np.linalg.norm(up)
-    triangles = np.asarray(vertices, float)[faces]
-    middle = triangles.mean(axis=(0, 1))
-    full = solid_moments(triangles, reference=middle).sum(axis=0)
-    if not full[0] > 0:
-        raise ValueError(f"the mesh encloses no volume ({full[0]:.3g} m^3): close it, or turn its faces outwards")
-    height = triangles @ up
-
-    def clipped(level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        part, weight = _below(triangles, height, level)
-        return part, weight, middle + (level - middle @ up) * up
-
-    def volume(level: float) -> float:
-        part, weight, reference = clipped(level)
-        r = part - reference
-        return float(weight @ np.einsum("fi,fi->f", r[:, 0], np.cross(r[:, 1], r[:, 2]))) / 6
-
-    table = np.zeros((num, 10))
-    table[-1] = full
-    bottom, top = float(height.min()), float(height.max())
-    low, low_volume = bottom, 0.0
-    for k in range(1, num - 1):
-        target = full[0] * k / (num - 1)
-        level = _root(volume, target, low, low_volume, top, full[0])
-        part, weight, reference = clipped(level)
-        table[k] = weight @ solid_moments(part, reference=reference)
-        low, low_volume = level, target
-    return table
-
-
-def _root(
-    function: Callable[[float], float], target: float, low: float, at_low: float, high: float, at_high: float
-) -> float:
-    """Root of an increasing function by secants inside a bracket, halved wherever a secant gains too little."""
-    tolerance = 1e-12 * abs(at_high)
-    for step in range(100):
-        width = high - low
-        share = 0.5 if step % 3 == 2 else np.clip((target - at_low) / (at_high - at_low), 0.01, 0.99)
-        middle = low + share * width
-        value = function(middle)
-        if abs(value - target) <= tolerance or width < 1e-15:
-            break
-        if value < target:
-            low, at_low = middle, value
-        else:
-            high, at_high = middle, value
-    return float(middle)
-
-
 def convex_hull(
     points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
 ) -> Float[np.ndarray, "h 3"]:
@@ -201,6 +107,49 @@ def convex_hull(
     return corners[np.sort(ConvexHull(corners).vertices)]
 
 
+def rest_poses(
+    points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
+    """The attitudes in which a convex hull rests on a plane.
+
+    It rests on a face where the centre of mass lies above the face and at least REST_MARGIN inside its outline.
+
+    Args:
+        points: m, whose convex hull rests.
+        com: centre of mass, m.
+
+    Returns:
+        For each such face the unit vector that points up while it lies below, and its share of the solid angle in
+        which the centre of mass sees all of them.
+    """
+    hull = ConvexHull(points)
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    r = points[hull.simplices] - com
+    length = np.linalg.norm(r, axis=2)
+    # Van Oosterom and Strackee (1983): the solid angle of a triangle.
+    numerator = np.abs(np.einsum("fi,fi->f", r[:, 0], np.cross(r[:, 1], r[:, 2])))
+    pairs = [np.einsum("fi,fi->f", r[:, i], r[:, j]) * length[:, k] for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0))]
+    angle = 2 * np.arctan2(numerator, length.prod(axis=1) + np.sum(pairs, axis=0))
+
+    ups, weights = [], []
+    left = np.ones(len(normals), bool)
+    while left.any():
+        first = np.flatnonzero(left)[np.argmax(angle[left])]
+        face = left & (normals @ normals[first] > np.cos(SAME_FACE))
+        left &= ~face
+        normal = normals[first]
+        support = points[points @ normal + offsets[first] > -REST_GRAIN]
+        across = np.linalg.svd(normal[None])[2][1:]
+        try:
+            edges = ConvexHull(support @ across.T).equations
+        except QhullError:  # an edge or a corner
+            continue
+        if np.max(edges[:, :2] @ (across @ com) + edges[:, 2]) < -REST_MARGIN:
+            ups.append(-normal)
+            weights.append(angle[face].sum())
+    return np.array(ups).reshape(-1, 3), np.array(weights) / max(np.sum(weights), 1e-12)
+
+
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
     """Distance (m) of each point from a convex hull; 0 inside."""
     shape = ConvexHull(hull)
@@ -214,9 +163,10 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
 
 
 def hull_gap(body: Body) -> float:
-    """Largest distance (m) by which the visible surface of one body sticks out of its collision hull."""
-    hull = np.unique(np.asarray(body.hull, float), axis=0)
-    return float(outside_hull(np.unique(np.asarray(body.vertices, float), axis=0), hull).max())
+    """Largest distance (m) by which the visible surface of one body sticks out of what collides."""
+    surface = np.unique(np.asarray(body.vertices, float), axis=0)
+    parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
+    return float(np.min(parts, axis=0).max())
 
 
 def corner_normals(
@@ -319,11 +269,11 @@ def assemble(
         second[i, j] = second[j, i] = value
     second -= shell[0] * np.outer(com, com)
 
-    contents = np.zeros((NUM_FILLS, 10))
-    if interior is not None:
-        contents = fill_moments(interior[0] - origin, interior[1])
+    contents = np.zeros((0, 3, 3)) if interior is None else (interior[0] - origin)[interior[1]]
+    if interior is not None and not solid_moments(contents).sum(axis=0)[0] > 0:
+        raise ValueError("the interior encloses no volume: close it, or turn its faces outwards")
 
-    size = max(_class(len(faces), FACE_CLASSES), _class(len(vertices), FACE_CLASSES))
+    size = _class(max(len(faces), len(vertices), len(contents)), FACE_CLASSES)
     single = np.float32
     uv = np.zeros((len(faces), 3, 2)) if uv is None else uv
     texture = np.ones((1, 1, 3)) if texture is None else texture
@@ -335,11 +285,11 @@ def assemble(
         uv=jnp.asarray(_pad(uv, size, 0.0), single),
         texture=jnp.asarray(texture, single),
         two_sided=jnp.asarray(two_sided, bool),
-        hull=jnp.asarray(_pad(hull, _class(len(hull), HULL_CLASSES), hull[-1]), single),
+        hulls=jnp.asarray(_pad(hull, _class(len(hull), HULL_CLASSES), hull[-1])[None], single),
         shell_mass=jnp.asarray(shell[0], single),
         shell_com=jnp.asarray(com, single),
         shell_inertia=jnp.asarray(np.trace(second) * np.eye(3) - second, single),
-        contents=jnp.asarray(contents, single),
+        interior=jnp.asarray(_pad(contents, size, 0.0), single),
         contents_density=jnp.asarray(contents_density, single),
         category=jnp.asarray(category, np.int32),
     )

@@ -1,11 +1,12 @@
-"""Where a convex hull touches the pad: exact candidates, and up to eight contact points chosen among them.
+"""Where convex hulls touch a box's top and sides: exact candidates, and some contact points chosen among them.
 
 MJX's own test of a mesh against a box was tried and left: beside a face it counts every pair of edges, so a small
 object lying on a pad much larger than itself is pushed by contacts between its edges and the pad's distant rims (it
 never comes to rest, and some are thrown off), and every mesh compiles anew. The pad is a box
-whose sides face along the axes, so its contacts with a convex hull are three kinds only:
+whose sides face along the axes (the stop wall of the slope is another), so its contacts with a convex hull are three
+kinds only:
 
-- a vertex of the hull inside the pad: the nearest of the top and the four sides pushes it out;
+- a vertex of the hull inside the box: the nearest of the top and the four sides pushes it out;
 - an edge of the hull across a rim of the top: pushed along the common normal of the two lines;
 - a corner of the top inside the hull: pushed along the normal of the nearest of the hull's lower faces.
 
@@ -22,17 +23,17 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax import _math
 
-NUM_CONTACTS = 8  # MJX reserves four for each pair of boxes: the object's stand-in is two
+PAD_CONTACTS, WALL_CONTACTS = 8, 4  # MJX reserves four for each pair of boxes
 STEEP = 5.0  # depth against extent in the choice of points
 SKIN = 0.001  # m; points this much higher than the deepest one may still belong to the support
 
 
 class Hull(NamedTuple):
-    """A convex hull in the mesh frame, padded to its class by repetition."""
+    """The convex parts of an object in the mesh frame, padded to their class by repetition."""
 
-    vertices: Float[Array | np.ndarray, "*n h 3"]  # m
-    edges: Float[Array | np.ndarray, "*n e 2 3"]  # m, both ends; diagonals of flat faces are among them and do no harm
-    planes: Float[Array | np.ndarray, "*n f 4"]  # outward unit normal, offset (m): inside is normal . x < offset
+    vertices: Float[Array | np.ndarray, "*n p h 3"]  # m
+    edges: Float[Array | np.ndarray, "*n p e 2 3"]  # m, both ends; diagonals of flat faces do no harm among them
+    planes: Float[Array | np.ndarray, "*n p f 4"]  # outward unit normal, offset (m): inside is normal . x < offset
 
 
 class Contacts(NamedTuple):
@@ -43,15 +44,19 @@ class Contacts(NamedTuple):
     frame: Float[Array, "k 3 3"]  # rows: normal from pad to object, two tangents
 
 
-def hull(vertices: np.ndarray) -> Hull:
-    """Edges and faces of the convex hull of points; counts depend on the number of points alone.
+def hull(parts: np.ndarray) -> Hull:
+    """Edges and faces of the convex hulls of points; counts depend on the number of points alone.
 
     Args:
-        vertices: (n, 3) m; repetitions are ignored.
+        parts: (p, n, 3) m, points of each part; repetitions are ignored.
 
     Raises:
-        ValueError: the points span no volume.
+        ValueError: the points of a part span no volume.
     """
+    return Hull(*(np.stack(x) for x in zip(*(_part(part) for part in parts), strict=True)))
+
+
+def _part(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     points = np.asarray(vertices, np.float64)
     try:
         found = ConvexHull(points)
@@ -65,7 +70,7 @@ def hull(vertices: np.ndarray) -> Hull:
         return np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)]).astype(np.float32)
 
     n = len(points)
-    return Hull(pad(points, n), pad(edges, 3 * n - 6), pad(planes, 2 * n - 4))
+    return pad(points, n), pad(edges, 3 * n - 6), pad(planes, 2 * n - 4)
 
 
 def _vertices(points: Float[Array, "h 3"], half: Float[Array, "2"]) -> tuple[Array, Array, Array]:
@@ -106,11 +111,11 @@ def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Arra
     return depth, corners - depth[:, None] * normal, normal
 
 
-def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"]) -> Int[Array, "k"]:
+def _spread(depth: Float[Array, "c"], points: Float[Array, "c 3"], num: int) -> Int[Array, "k"]:
     deepest = jnp.max(depth)
     candidate = jnp.where(depth > jnp.maximum(0, deepest - SKIN), 0.0, -1e3)
     # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
-    angle = 0.4 + 2 * np.pi * np.arange(NUM_CONTACTS - 1) / (NUM_CONTACTS - 1)
+    angle = 0.4 + 2 * np.pi * np.arange(num - 1) / (num - 1)
     reach = [x * points[:, 0] + y * points[:, 1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
     score = jnp.stack([depth, *(r + STEEP * depth for r in reach)]) + candidate
     # XLA's argmax is slow on CPU: the largest value, then the first place where it stands.
@@ -124,25 +129,27 @@ def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
 
 
-def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"]) -> Contacts:
-    """The contacts of a hull with the pad.
+def collide(body: Hull, pose: Float[Array, "7"], half: Float[Array, "2"], num: int = PAD_CONTACTS) -> Contacts:
+    """The contacts of an object with a box whose top is centred in the origin.
 
     The deepest point is always among them; the others, within SKIN of its depth, reach farthest in fixed directions.
 
     Args:
-        body: the hull.
-        pose: (7,) mesh frame in the sensor frame.
-        half: (2,) m, half the pad's size; its top is z = 0.
+        body: its convex parts.
+        pose: (7,) mesh frame in the frame of the box's top.
+        half: (2,) m, half the box's size; its top is z = 0, its depth has no end.
+        num: how many contacts.
     """
     rotation = _math.quat_matrix(pose[3:])
-    points = jnp.asarray(body.vertices) @ rotation.T + pose[:3]
-    ends = jnp.asarray(body.edges) @ rotation.T + pose[:3]
-    normals = body.planes[:, :3] @ rotation.T
-    planes = jnp.concatenate([normals, (body.planes[:, 3] + normals @ pose[:3])[:, None]], axis=1)
+    points = jnp.reshape(body.vertices, (-1, 3)) @ rotation.T + pose[:3]
+    ends = jnp.reshape(body.edges, (-1, 2, 3)) @ rotation.T + pose[:3]
+    normals = body.planes[..., :3] @ rotation.T
+    planes = jnp.concatenate([normals, (body.planes[..., 3] + normals @ pose[:3])[..., None]], axis=-1)
     rims = [_rim(ends, half, axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)]
-    kinds = [_vertices(points, half), *rims, _corners(planes, half)]
+    corners = [_corners(part, half) for part in planes]
+    kinds = [_vertices(points, half), *rims, *corners]
     depth, points, normal = (jnp.concatenate(x) for x in zip(*kinds, strict=True))
-    chosen = _spread(depth, points)
+    chosen = _spread(depth, points, num)
     new = jnp.sum(jnp.tril(chosen == chosen[:, None]), axis=1) == 1
     depth, points, normal = depth[chosen], points[chosen], normal[chosen]
     dist = jnp.where(new & (depth > 0), -depth, 1.0)

@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import _math
 from sts_jax.physics import scene
-from sts_jax.physics.contact import Hull, collide
+from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide
 from sts_jax.physics.scene import mjx
 
 SLOW_SPEED = 0.005  # m/s; slower than this ...
@@ -32,6 +33,7 @@ class State(NamedTuple):
     finite: Bool[Array, ""]  # no state so far was non-finite
     impulse: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
     loaded: Int[Array, ""]  # number of those steps
+    wall: Bool[Array, ""]  # the stop wall pushes
 
 
 class Record(NamedTuple):
@@ -41,6 +43,7 @@ class Record(NamedTuple):
     velocity: Float[Array, "6"]
     wrench: Float[Array, "6"]
     contact: Bool[Array, ""]
+    wall: Bool[Array, ""]
 
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"]) -> State:
@@ -59,51 +62,71 @@ def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"]) -> State:
         finite=jnp.ones((), bool),
         impulse=jnp.zeros(6),
         loaded=zero,
+        wall=jnp.zeros((), bool),
     )
 
 
-def _depth(points: Float[Array, "n 3"], half: Float[Array, "3"]) -> Float[Array, ""]:
-    across = jnp.min(half[:2] - jnp.abs(points[:, :2]), axis=1)
-    return jnp.max(jnp.minimum(-points[:, 2], across), initial=0.0)
+def _fixed(model: mjx.Model) -> list[tuple[Array, Array]]:
+    """Of the pad, and of the wall where there is one: centre of the top (m) and half the size (m)."""
+    geoms = np.flatnonzero(model.geom_bodyid == 0)
+    return [(model.geom_pos[i] + jnp.zeros(3).at[2].set(model.geom_size[i, 2]), model.geom_size[i, :2]) for i in geoms]
+
+
+def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts:
+    found = []
+    for (top, half), num in zip(_fixed(model), (PAD_CONTACTS, WALL_CONTACTS), strict=False):
+        own = collide(hull, pose.at[:3].add(-top), half, num)
+        found.append(own._replace(pos=own.pos + top))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
+
+
+def _depth(points: Float[Array, "n 3"], model: mjx.Model) -> Float[Array, ""]:
+    """How deep (m) the deepest point is in the pad or the wall."""
+    depths = []
+    for top, half in _fixed(model):
+        inside = points - top
+        depths.append(jnp.minimum(-inside[:, 2], jnp.min(half - jnp.abs(inside[:, :2]), axis=1)))
+    return jnp.max(jnp.concatenate(depths), initial=0.0)
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
     """One time step under a gravity (m/s^2, sensor frame) that holds for this step.
 
-    Everything that constrains the object is the pad, so the pad's wrench is MuJoCo's `qfrc_constraint`: force in the
-    sensor frame, moment about the object's origin in the mesh frame; here it becomes the moment about the sensor's
-    origin.
+    The wrench is what the pad's contacts exert, without the wall's, its moment about the sensor's origin.
     """
     old = state
     model = model.tree_replace({"opt.gravity": gravity})
     data = data.replace(qpos=old.qpos, qvel=old.qvel, qacc_warmstart=old.warmstart)
-    half = model.geom_size[0]
-    new = scene.step(model, data, collide(hull, old.qpos, half[:2]))
+    contacts = _contacts(model, hull, old.qpos)
+    new = scene.step(model, data, contacts)
 
-    push = new.qfrc_constraint
+    push = scene.push(new, slice(0, PAD_CONTACTS))
     rotation = _math.quat_matrix(old.qpos[3:])
     moment = rotation @ push[3:] + jnp.cross(old.qpos[:3], push[:3])
     wrench = jnp.concatenate([push[:3], moment])
     contact = jnp.any(push != 0)
+    wall = jnp.any(scene.push(new, slice(PAD_CONTACTS, len(contacts.dist))) != 0)
 
-    points = hull.vertices @ _math.quat_matrix(new.qpos[3:]).T + new.qpos[:3]
+    points = jnp.reshape(hull.vertices, (-1, 3)) @ _math.quat_matrix(new.qpos[3:]).T + new.qpos[:3]
     timestep = model.opt.timestep
     slow = (_math.norm(new.qvel[:3]) < SLOW_SPEED) & (_math.norm(new.qvel[3:]) < SLOW_TURN)
-    begun = contact & (old.apart * timestep >= PARTED_TIME)
+    touched = contact | wall
+    begun = touched & (old.apart * timestep >= PARTED_TIME)
     now = State(
         qpos=new.qpos,
         qvel=new.qvel,
         warmstart=new.qacc_warmstart,
         gone=jnp.max(points[:, 2]) < -GONE_DEPTH,
         slow=jnp.where(slow, old.slow + 1, 0),
-        apart=jnp.where(contact, 0, old.apart + 1),
+        apart=jnp.where(touched, 0, old.apart + 1),
         touches=old.touches + begun,
-        sunk=jnp.maximum(old.sunk, _depth(points, half)),
+        sunk=jnp.maximum(old.sunk, _depth(points, model)),
         finite=old.finite & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)),
         impulse=jnp.where(contact, old.impulse + wrench, 0),
         loaded=jnp.where(contact, old.loaded + 1, 0),
+        wall=wall,
     )
-    frozen = old._replace(qvel=jnp.zeros(6), impulse=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32))
+    frozen = old._replace(qvel=jnp.zeros(6), impulse=jnp.zeros(6), loaded=jnp.zeros((), jnp.int32), wall=False)
     return jax.tree.map(lambda a, b: jnp.where(old.gone, a, b), frozen, now)
 
 
@@ -115,6 +138,7 @@ def _record(state: State) -> Record:
         velocity=jnp.concatenate([state.qvel[:3], turn]),
         wrench=jnp.where(contact, state.impulse / jnp.maximum(state.loaded, 1), 0),
         contact=contact,
+        wall=state.wall,
     )
 
 

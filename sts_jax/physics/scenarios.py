@@ -3,10 +3,11 @@
 import dataclasses
 import enum
 import math
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax import _math
@@ -16,8 +17,8 @@ G = 9.81  # m/s^2
 FELL_OFF_HEIGHT = -0.005  # m; an object's origin lies inside its hull: on the pad it is above, after leaving below
 MOVED = 0.01  # m; what moved less stayed where it was
 STANDING = 2.3e-5  # m, how deep in the pad a start at rest is: as deep as an object stands with SLIDING's contact
-TOPPLED = math.pi / 4  # rad; what leans more lies
-
+CLEARANCE = 0.001  # m; what starts on the slope is at least this far from the stop wall
+TURNED = math.pi / 4  # rad; what leans more lies, what turned more rolled
 
 # Contact of what slides and topples. Rolling friction widens the base that an object topples over by its length, so it
 # must be small beside it; and a contact that is soft at first touch carries what slides, where a stiff one rattles (its
@@ -33,6 +34,8 @@ class Outcome(enum.IntEnum):
     STANDS = 2
     SLIDES = 3
     TOPPLES = 4
+    STICKS = 5
+    ROLLS = 6
 
 
 class Hidden(NamedTuple):
@@ -41,14 +44,26 @@ class Hidden(NamedTuple):
     fill: Float[Array, "*n"]  # share of the interior's volume that is filled
     shell_scale: Float[Array, "*n"]  # shell's mass over its nominal mass
     friction: Float[Array, "*n"]  # sliding friction against the pad
+    up: Float[Array, "*n 3"]  # unit vector in the mesh frame; the contents have settled against it
+
+
+class Shape(NamedTuple):
+    """What of a body decides where it may start."""
+
+    points: Float[Array | np.ndarray, "*n h 3"]  # m, of its convex hull, mesh frame; padded by repetition
+    rests: Float[Array | np.ndarray, "*n k 3"]  # unit vectors in the mesh frame that point up while it rests; padded
+    shares: Float[Array | np.ndarray, "*n k"]  # of each rest, see `objects.rest_poses`; 0 for padding
 
 
 class Start(NamedTuple):
-    """State at the beginning of frame 0's interval, and the input the scenario applies."""
+    """Where an object is released, at rest, and the input the scenario applies."""
 
     pose: Float[Array, "7"]
-    velocity: Float[Array, "6"]
+    held: Bool[Array, ""]  # it hangs weightless until frame 0; or it feels gravity one interval before
     condition: Float[Array, "c"]
+
+
+Variant = Literal["default", "off", "wide-friction", "off-centre"]
 
 
 class _Common:
@@ -63,7 +78,10 @@ class _Common:
     fill: tuple[float, float]
     shell_scale: tuple[float, float]
     friction: tuple[float, float]
+    tilt: float
     contact: Contact
+    wall: float = 0.0
+    must_stand: ClassVar[bool] = False
 
     @property
     def steps(self) -> int:
@@ -72,9 +90,13 @@ class _Common:
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
         """Draws the hidden values of one trajectory; consumes `key`."""
-        keys = jax.random.split(key, 3)
+        *keys, high, around = jax.random.split(key, 5)
         ranges = (self.fill, self.shell_scale, self.friction)
-        return Hidden(*(jax.random.uniform(k, (), minval=a, maxval=b) for k, (a, b) in zip(keys, ranges, strict=True)))
+        values = (jax.random.uniform(k, (), minval=a, maxval=b) for k, (a, b) in zip(keys, ranges, strict=True))
+        z = jax.random.uniform(high, minval=math.cos(self.tilt), maxval=1.0)
+        angle = jax.random.uniform(around, maxval=2 * jnp.pi)
+        radius = jnp.sqrt(jnp.maximum(1 - z**2, 0))
+        return Hidden(*values, up=jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]))
 
     def check(self) -> None:
         """Insists on values that can be simulated.
@@ -93,6 +115,8 @@ class _Common:
         _check_range("friction", self.friction)
         if self.fill[1] > 1:
             raise ValueError(f"scenario.fill is {self.fill}; a share is at most 1")
+        if not 0 <= self.tilt <= math.pi:
+            raise ValueError(f"scenario.tilt is {self.tilt} rad; it must be from 0 to pi")
         if self.frames < 1:
             raise ValueError(f"scenario.frames is {self.frames}; at least one is needed")
 
@@ -115,40 +139,28 @@ class Freefall(_Common):
     fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.4, 0.8)
+    tilt: float = 0.0  # rad, the contents' up leans by at most this from the object's +z, in any direction
     contact: Contact = dataclasses.field(default_factory=Contact)
-
-    @property
-    def rise(self) -> float:
-        """How far (m) an object rises in the interval before frame 0, by semi-implicit Euler's sum t (t - dt) / 2."""
-        time = 1 / self.rate
-        return G * time * (time - self.contact.timestep) / 2
 
     def check(self) -> None:
         """See `_Common.check`."""
         super().check()
         _check_length("height", self.height)
         _check_length("spread", self.spread)
-        if self.height <= self.rise:
-            raise ValueError(
-                f"scenario.height is {self.height} m: one interval (1 / rate) before frame 0 an object is "
-                f"{self.rise:.4f} m lower, in the pad; raise height or rate"
-            )
 
-    def start(self, key: PRNGKeyArray, hull: Float[Array, "n 3"]) -> Start:
+    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draws one start; consumes `key`.
-
-        The object is thrown upwards one interval before frame 0 such that frame 0 is the top of its flight, at rest.
 
         Args:
             key: one trajectory's.
-            hull: (n, 3) m, the hull's vertices in the mesh frame.
+            shape: of the body.
+            pad: m, its size along x and y.
         """
+        del pad
         turn, radius, angle = jax.random.split(key, 3)
         quat = _math.random_quat(turn)
-        lowest = jnp.min(hull @ _math.quat_matrix(quat)[2])
-        position = jnp.append(_in_disc(radius, angle, self.spread), self.height - self.rise - lowest)
-        velocity = jnp.zeros(6).at[2].set(G / self.rate)
-        return Start(jnp.concatenate([position, quat]), velocity, jnp.zeros(0))
+        pose = _above(_in_disc(radius, angle, self.spread), quat, shape, self.height)
+        return Start(pose, jnp.ones((), bool), jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
         """Gravity in the sensor frame (m/s^2) in the step that begins at a time (s, 0 is frame 0)."""
@@ -183,7 +195,9 @@ class Perturbed(_Common):
     fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.45, 0.65)
+    tilt: float = 0.0  # rad, as in `Freefall`
     contact: Contact = SLIDING
+    must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
         """See `_Common.check`."""
@@ -192,17 +206,16 @@ class Perturbed(_Common):
         _check_range("acceleration", self.acceleration, positive=False)
         _check_range("duration", self.duration, positive=False)
 
-    def start(self, key: PRNGKeyArray, hull: Float[Array, "n 3"]) -> Start:
+    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draws one start and one jerk; consumes `key`. The object's +z is up; arguments as for `Freefall.start`."""
+        del pad
         turn, radius, angle, push, heading, time = jax.random.split(key, 6)
-        yaw = jax.random.uniform(turn, maxval=2 * jnp.pi)
-        quat = _math.quat_canonical(_math.quat_from_rotvec(jnp.stack([0.0, 0.0, yaw])))
-        position = jnp.append(_in_disc(radius, angle, self.spread), -jnp.min(hull[:, 2]) - STANDING)
+        pose = _above(_in_disc(radius, angle, self.spread), _yaw(turn), shape, -STANDING)
         size = jax.random.uniform(push, minval=self.acceleration[0], maxval=self.acceleration[1])
         along = jax.random.uniform(heading, maxval=2 * jnp.pi)
         lasts = jax.random.uniform(time, minval=self.duration[0], maxval=self.duration[1])
         condition = jnp.stack([size * jnp.cos(along), size * jnp.sin(along), lasts])
-        return Start(jnp.concatenate([position, quat]), jnp.zeros(6), condition)
+        return Start(pose, jnp.zeros((), bool), condition)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
         """As `Freefall.gravity`; a step in which the jerk ends has the share of it that falls into the step."""
@@ -212,19 +225,137 @@ class Perturbed(_Common):
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
         """`FELL_OFF`, `TOPPLES` (leans by more than 45 degrees), `SLIDES` (moved by 10 mm) or `STANDS`."""
-        leans = _math.quat_matrix(_math.normalize(last[3:]))[2, 2] < math.cos(TOPPLED)
+        leans = _math.quat_matrix(_math.normalize(last[3:]))[2, 2] < math.cos(TURNED)
         moved = _math.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STANDS)
         ends = jnp.where(fell_off(last), Outcome.FELL_OFF, jnp.where(leans, Outcome.TOPPLES, stays))
         return ends.astype(jnp.int32)
 
 
-Scenario = Freefall | Perturbed
+@dataclasses.dataclass(frozen=True)
+class Inclined(_Common):
+    """An object laid on the tilted pad, or let go just above it; downhill is +y, where a stop wall stands at the edge.
+
+    Paper, "Data Collection"; ranges are uniform. On the slope weight tells little, and the centre of pressure tells
+    where contents lie: they are frozen in any direction.
+    """
+
+    symmetries = (0, 6)  # x -> -x
+    condition_scale = ()
+    outcomes = (Outcome.ROLLS, Outcome.SLIDES, Outcome.STICKS, Outcome.FELL_OFF)
+
+    slope: float = math.radians(30)  # rad
+    wall: float = 0.02  # m, height of the stop wall at the lower edge; 0 is none
+    resting: float = 0.8  # share of the starts at rest on a stable face; the others are in any orientation ...
+    gap: tuple[float, float] = (0.001, 0.01)  # m, ... and this far above the pad
+    across: float = 0.04  # m, the object's origin starts within this of the middle
+    along: tuple[float, float] = (-0.05, 0.03)  # m, y of the origin
+    rate: float = 31.25  # frames/s
+    frames: int = 60
+    fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
+    friction: tuple[float, float] = (0.35, 0.75)
+    tilt: float = math.pi  # rad, as in `Freefall`
+    contact: Contact = SLIDING
+
+    def check(self) -> None:
+        """See `_Common.check`."""
+        super().check()
+        if not 0 <= self.slope < math.pi / 2:
+            raise ValueError(
+                f"scenario.slope is {self.slope} rad; it must be at least 0 and below pi / 2 "
+                "(degrees? give math.radians(30))"
+            )
+        _check_length("wall", self.wall)
+        _check_length("across", self.across)
+        _check_range("gap", self.gap, positive=False)
+        if not (math.isfinite(sum(self.along)) and self.along[0] <= self.along[1]):
+            raise ValueError(f"scenario.along is {self.along}; it must be (low, high), finite")
+        if not 0 <= self.resting <= 1:
+            raise ValueError(f"scenario.resting is {self.resting}; a share is from 0 to 1")
+
+    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
+        """Draws one start; consumes `key`. Arguments as for `Freefall.start`; nothing starts in the wall."""
+        kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
+        rests = jax.random.uniform(kind) < self.resting
+        up = shape.rests[jax.random.categorical(face, jnp.log(shape.shares))]
+        quat = jnp.where(rests, _math.quat_multiply(_yaw(turn), _upright(up)), _math.random_quat(free))
+        lower_end = jnp.max(shape.points @ _math.quat_matrix(quat)[1])
+        place = jnp.stack(
+            [
+                jax.random.uniform(x, minval=-self.across, maxval=self.across),
+                jnp.minimum(
+                    jax.random.uniform(y, minval=self.along[0], maxval=self.along[1]),
+                    pad[1] / 2 - CLEARANCE - lower_end,
+                ),
+            ]
+        )
+        height = jnp.where(rests, -STANDING, jax.random.uniform(gap, minval=self.gap[0], maxval=self.gap[1]))
+        return Start(_above(place, _math.quat_canonical(quat), shape, height), ~rests, jnp.zeros(0))
+
+    def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
+        """As `Freefall.gravity`."""
+        del time, condition
+        return G * jnp.array([0.0, math.sin(self.slope), -math.cos(self.slope)])
+
+    def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
+        """`FELL_OFF`, `ROLLS` (turned by more than 45 degrees about any axis), `SLIDES` (moved by 10 mm) or `STICKS`."""
+        same = jnp.abs(_math.normalize(first[3:]) @ _math.normalize(last[3:]))
+        moved = _math.norm(last[:2] - first[:2]) >= MOVED
+        stays = jnp.where(moved, Outcome.SLIDES, Outcome.STICKS)
+        ends = jnp.where(fell_off(last), Outcome.FELL_OFF, jnp.where(same < math.cos(TURNED / 2), Outcome.ROLLS, stays))
+        return ends.astype(jnp.int32)
+
+
+Scenario = Freefall | Inclined | Perturbed
+
+
+def variant(scenario: Scenario, name: Variant) -> Scenario:
+    """A scenario with other hidden values.
+
+    Args:
+        scenario: whose other fields stay.
+        name: `off`: nothing is hidden, every value is the middle of its range and contents have settled at the base;
+            `wide-friction`: friction U(.3, .9); `off-centre`: contents frozen in any direction.
+
+    Raises:
+        ValueError: unknown name.
+    """
+    middle = {field: (sum(getattr(scenario, field)) / 2,) * 2 for field in ("fill", "shell_scale", "friction")}
+    changes: dict[str, dict] = {
+        "default": {},
+        "off": {**middle, "tilt": 0.0},
+        "wide-friction": {"friction": (0.3, 0.9)},
+        "off-centre": {"tilt": math.pi},
+    }
+    if name not in changes:
+        raise ValueError(f"unknown variant {name!r} of the hidden values: one of {', '.join(changes)}")
+    return dataclasses.replace(scenario, **changes[name])
 
 
 def fell_off(pose: Float[Array, "*n 7"]) -> Bool[Array, "*n"]:
     """Whether a pose, true or predicted, is one of an object that has left the pad."""
     return pose[..., 2] < FELL_OFF_HEIGHT
+
+
+def _above(
+    place: Float[Array, "2"], quat: Float[Array, "4"], shape: Shape, height: Float[Array, ""] | float
+) -> Float[Array, "7"]:
+    """The pose with its origin over a place and its lowest point at a height (m)."""
+    lowest = jnp.min(shape.points @ _math.quat_matrix(quat)[2])
+    return jnp.concatenate([place, jnp.stack([height - lowest]), quat])
+
+
+def _yaw(key: PRNGKeyArray) -> Float[Array, "4"]:
+    angle = jax.random.uniform(key, maxval=2 * jnp.pi)
+    return _math.quat_canonical(_math.quat_from_rotvec(jnp.stack([0.0, 0.0, angle])))
+
+
+def _upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
+    """The shortest turn that brings a unit vector to +z."""
+    upside_down = up[2] < -0.9999
+    turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
+    return _math.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
 
 
 def _in_disc(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Float[Array, "2"]:

@@ -1,7 +1,8 @@
 """The one scene of all scenarios, as MuJoCo and as MJX models: a fixed pad and one free object above it.
 
-The pad is a box whose top face lies in z = 0 of the sensor frame. The object's body frame is its mesh frame
-(its inertia is given about an explicit centre of mass), so `qpos` is the object's pose.
+The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope a stop wall stands on it, just beyond
+the gel's lower edge (y high). The object's body frame is its mesh frame (its inertia is given about an explicit centre
+of mass), so `qpos` is the object's pose.
 
 MJX steps one template model for all objects (`step`, `template`): what differs between two is a few arrays and the
 contacts. `compile_scene` is the same scene with the object's mesh, for C MuJoCo.
@@ -14,13 +15,17 @@ import io
 
 import mujoco
 import numpy as np
+from jaxtyping import Array, Float
 
-from sts_jax.physics.contact import NUM_CONTACTS, Contacts
+from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, another engine, is not installed
     from mujoco import mjx
 
 PAD_DEPTH = 0.2  # m; what leaves the pad slides down its side and never gets beneath it
+WALL_DEPTH = 0.01  # m, thickness of the stop wall
+WALL_OVERHANG = 0.05  # m, how far the wall reaches beyond the pad to either side
+CONDIM = 6  # rows of the solver a contact: normal, two of sliding, one of torsion, two of rolling
 
 _SCENE = """
 <mujoco>
@@ -29,11 +34,11 @@ _SCENE = """
     <flag eulerdamp="disable"/>
   </option>
   <default>
-    <geom condim="6" solref="{time_constant} {damping_ratio}" solimp="{soft} {hard} {width}"/>
+    <geom condim="{condim}" solref="{time_constant} {damping_ratio}" solimp="{soft} {hard} {width}"/>
   </default>
   {asset}
   <worldbody>
-    <geom name="pad" type="box" pos="0 0 {pad_z}" size="{pad_x} {pad_y} {pad_half}" friction="0 0 0"/>
+    {fixed}
     <body name="object">
       <freejoint/>
       <inertial pos="0 0 0.001" mass="1" fullinertia="2e-4 2e-4 3e-4 0 0 1e-5"/>
@@ -61,30 +66,51 @@ class Contact:
     ls_iterations: int = 8  # line-search iterations of one Newton iteration
 
 
-def _xml(pad: tuple[float, float], contact: Contact, shapes: list[str], asset: str = "") -> str:
+def boxes(pad: tuple[float, float], wall: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Centre (m) and half size (m) of what is fixed: the pad, and the wall where its height (m) is not 0."""
+    beneath = WALL_DEPTH if wall else 0.0  # the pad goes on beneath the wall
+    found = [([0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2])]
+    if wall:
+        found.append(([0, (pad[1] + WALL_DEPTH) / 2, wall / 2], [pad[0] / 2 + WALL_OVERHANG, WALL_DEPTH / 2, wall / 2]))
+    return [(np.array(centre), np.array(half)) for centre, half in found]
+
+
+def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[str], asset: str, inert: str) -> str:
     friction = f"0.5 {contact.torsional} {contact.rolling}"
+    fixed = [
+        f'<geom name="{name}" type="box" pos="{" ".join(map(str, centre))}" size="{" ".join(map(str, half))}" '
+        f'friction="0 0 0" {extra}/>'
+        for name, extra, (centre, half) in zip(("pad", "wall"), ("", inert), boxes(pad, wall), strict=False)
+    ]
     return _SCENE.format(
         shapes="\n".join(f'<geom {shape} friction="{friction}"/>' for shape in shapes),
         asset=asset,
-        pad_x=pad[0] / 2,
-        pad_y=pad[1] / 2,
-        pad_half=PAD_DEPTH / 2,
-        pad_z=-PAD_DEPTH / 2,
+        fixed="\n".join(fixed),
+        condim=CONDIM,
         **dataclasses.asdict(contact),
     )
 
 
-def compile_scene(vertices: np.ndarray, pad: tuple[float, float], contact: Contact) -> mujoco.MjModel:
+def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
     """The scene for C MuJoCo, which finds the contacts itself; mass properties are placeholders (`set_rigid`).
 
     Args:
-        vertices: (n, 3) m, points whose convex hull collides, in the mesh frame.
+        parts: (p, n, 3) m, points of convex parts that collide, in the mesh frame.
         pad: (x, y) m, size of the pad.
         contact: constants.
+        wall: m, height of the stop wall; 0 is none.
     """
-    points = " ".join(f"{x:.9g}" for x in np.unique(vertices, axis=0).ravel())
-    asset = f'<asset><mesh name="hull" inertia="convex" vertex="{points}"/></asset>'
-    return mujoco.MjModel.from_xml_string(_xml(pad, contact, ['type="mesh" mesh="hull"'], asset))
+    return mujoco.MjModel.from_xml_string(scene_xml(parts, pad, contact, wall))
+
+
+def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> str:
+    """`compile_scene`'s scene as MuJoCo's XML."""
+    meshes, shapes = [], []
+    for index, part in enumerate(np.unique(parts, axis=0)):
+        points = " ".join(f"{x:.9g}" for x in np.unique(part, axis=0).ravel())
+        meshes.append(f'<mesh name="hull{index}" inertia="convex" vertex="{points}"/>')
+        shapes.append(f'type="mesh" mesh="hull{index}"')
+    return _xml(pad, wall, contact, shapes, f"<asset>{''.join(meshes)}</asset>", "")
 
 
 def set_rigid(
@@ -112,7 +138,7 @@ def set_rigid(
     body.ipos = com
     body.inertia = principal
     mujoco.mju_mat2Quat(model.body_iquat[body.id], axes.ravel())
-    model.geom_friction[1:, 0] = friction  # geom 0 is the pad
+    model.geom_friction[model.geom_bodyid > 0, 0] = friction
     mujoco.mj_setConst(model, data)
     model.stat.meaninertia = model.dof_M0.mean()  # scales the solver's tolerance; the compiler alone sets it
 
@@ -132,9 +158,15 @@ DRAWN = (
 
 
 @functools.cache
-def template(pad: tuple[float, float], contact: Contact) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
-    """The scene that MJX steps, for every object: a box stands for the hull, whose contacts `collide` finds."""
-    model = mujoco.MjModel.from_xml_string(_xml(pad, contact, ['type="box" size=".01 .01 .01"'] * (NUM_CONTACTS // 4)))
+def template(
+    pad: tuple[float, float], contact: Contact, wall: float = 0.0
+) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
+    """The scene that MJX steps, for every object: small boxes, of which MJX takes each for four contacts with the pad,
+    stand for the object, whose contacts with pad and wall `collide` finds.
+    """
+    count = (PAD_CONTACTS + (WALL_CONTACTS if wall else 0)) // 4
+    shapes = ['type="box" size=".01 .01 .01"'] * count
+    model = mujoco.MjModel.from_xml_string(_xml(pad, wall, contact, shapes, "", 'contype="0" conaffinity="0"'))
     return model, mjx.put_model(model), mjx.make_data(model)
 
 
@@ -158,3 +190,9 @@ def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
     data = mjx.fwd_velocity(model, position(model, data, contacts))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     return mjx.euler(model, mjx.solve(model, data))
+
+
+def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:
+    """Force (N, sensor frame) and moment about the object's origin (N m, mesh frame) that some contacts exert."""
+    rows = slice(contacts.start * CONDIM, contacts.stop * CONDIM)
+    return data._impl.efc_force[rows] @ data._impl.efc_J[rows]

@@ -3,8 +3,9 @@
 import concurrent.futures
 import copy
 import functools
+import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +18,13 @@ from sts_jax.objects import Body
 from sts_jax.physics import contact, scene
 from sts_jax.physics.contact import Hull
 from sts_jax.physics.roll import SLOW_TIME, Record, State, initial, roll
-from sts_jax.physics.scenarios import Hidden, Scenario, Start
+from sts_jax.physics.scenarios import Hidden, Scenario, Shape, Start
 from sts_jax.physics.scene import Contact, mjx
 from sts_jax.sensor import Sensor
 
 SUNK_LIMIT = 0.003  # m; a trajectory in which the object went deeper into the pad is drawn again
 ATTEMPTS = 5  # draws of one trajectory before giving up
+UPRIGHT = math.radians(1)  # what stands leans less
 WORKERS = 2  # chunks under way at once: XLA runs these small steps on one CPU core each
 
 
@@ -36,6 +38,7 @@ class Trajectory(NamedTuple):
         Array, "n f 6"
     ]  # N, N m about the sensor's origin: the pad's; mean over the contact that ends (t - dt, t]
     contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
+    wall: Bool[Array, "n f"]  # the stop wall pushes in the frame's last step
     gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
     settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
     outcome: Int[Array, "n"]  # Outcome
@@ -56,19 +59,20 @@ class _Worlds(NamedTuple):
     gravity: Float[Array, "n f s 3"]
 
 
-@functools.partial(jax.jit, static_argnames="scenario")
+@functools.partial(jax.jit, static_argnames=("scenario", "pad"))
 def _draw(
     key: PRNGKeyArray,
     body: Int[Array, "n"],
     draw: Int[Array, "n"],
     attempt: Int[Array, "n"],
-    hulls: Float[Array, "b h 3"],
+    shapes: Shape,
     scenario: Scenario,
+    pad: tuple[float, float],
 ) -> tuple[Start, Hidden]:
     def one(body: Int[Array, ""], draw: Int[Array, ""], attempt: Int[Array, ""]) -> tuple[Start, Hidden]:
         own = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), draw), attempt)
         start, hidden = jax.random.split(own)
-        return scenario.start(start, hulls[body]), scenario.hidden(hidden)
+        return scenario.start(start, jax.tree.map(lambda x: x[body], shapes), pad), scenario.hidden(hidden)
 
     return jax.vmap(one)(body, draw, attempt)
 
@@ -82,12 +86,13 @@ def _gravity(condition: Float[Array, "n c"], time: Float[Array, "f s"], scenario
 def _roll(worlds: _Worlds, model: mjx.Model, data: mjx.Data) -> tuple[State, Record]:
     def one(world: _Worlds) -> tuple[State, Record]:
         own = model.tree_replace(world.fields)
-        return roll(own, data, world.hull, initial(world.start.pose, world.start.velocity), world.gravity)
+        gravity = world.gravity.at[0].multiply(jnp.where(world.start.held, 0.0, 1.0))
+        return roll(own, data, world.hull, initial(world.start.pose, jnp.zeros(6)), gravity)
 
     return jax.vmap(one)(worlds)
 
 
-_rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))
+_rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
 
 
 def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
@@ -97,18 +102,50 @@ def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
         raise ValueError("no body was given; pass one Body or a sequence of them")
     scenario.check()
     for i, body in enumerate(bodies):
-        if body.hull.ndim != 2 or body.hull.shape[0] not in objects.HULL_CLASSES:
+        known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
+        if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
             raise ValueError(
-                f"body {i}: hull has shape {body.hull.shape}; expected (n, 3), n in {objects.HULL_CLASSES}"
+                f"body {i}: hulls has shape {body.hulls.shape}; expected (p, n, 3), p in {objects.PART_CLASSES}, "
+                f"n in {objects.HULL_CLASSES}"
             )
-        if not np.isfinite(body.hull).all():
-            raise ValueError(f"body {i}: hull has a non-finite vertex")
+        if not np.isfinite(body.hulls).all():
+            raise ValueError(f"body {i}: hulls has a non-finite vertex")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
             raise ValueError(f"body {i}: shell_mass is {body.shell_mass} kg; it must be positive and finite")
 
 
+def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
+    """What decides the starts of each body, padded to a common size.
+
+    Raises:
+        ValueError: a body has no attitude in which it rests, or does not stand upright where it must; it is named.
+    """
+    found = []
+    for index, body in enumerate(bodies):
+        points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
+        rests, shares = objects.rest_poses(points, np.asarray(body.shell_com, np.float64))
+        if not len(rests):
+            raise ValueError(f"body {index}: its centre of mass lies outside its hull, it rests on no face")
+        if scenario.must_stand and rests[:, 2].max() < math.cos(UPRIGHT):
+            raise ValueError(
+                f"body {index}: does not stand upright (+z up), as {type(scenario).__name__} needs; leave it out"
+            )
+        found.append((points, rests, shares))
+
+    def pad(arrays: Sequence[np.ndarray], mode: Literal["edge", "constant"]) -> np.ndarray:
+        size = max(map(len, arrays))
+        rest = ((0, 0),) * (arrays[0].ndim - 1)
+        return np.stack([np.pad(x, ((0, size - len(x)), *rest), mode) for x in arrays]).astype(np.float32)  # type: ignore[call-overload]
+
+    points, rests, shares = zip(*found, strict=True)
+    return Shape(pad(points, "edge"), pad(rests, "edge"), pad(shares, "constant"))
+
+
 def _check_hidden(hidden: Hidden, count: int) -> Hidden:
-    for name, values in hidden._asdict().items():
+    lengths = np.linalg.norm(hidden.up, axis=-1)
+    if lengths.shape != (count,) or not np.allclose(lengths, 1, atol=1e-3):
+        raise ValueError(f"hidden.up has shape {np.shape(hidden.up)}; expected ({count}, 3), unit vectors")
+    for name, values in hidden._replace(up=lengths)._asdict().items():
         values = np.asarray(values)
         if values.shape != (count,):
             raise ValueError(f"hidden.{name} has shape {values.shape}; expected ({count},): bodies times num")
@@ -119,16 +156,16 @@ def _check_hidden(hidden: Hidden, count: int) -> Hidden:
 
 
 def _draws(
-    bodies: Sequence[Body], which: np.ndarray, hidden: Hidden, pad: tuple[float, float], constants: Contact
+    bodies: Sequence[Body], which: np.ndarray, hidden: Hidden, pad: tuple[float, float], constants: Contact, wall: float
 ) -> dict[str, np.ndarray]:
     """The model's fields of each draw: MuJoCo derives them from mass, centre of mass, inertia and friction."""
-    original, like, _ = scene.template(pad, constants)
+    original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
     data = mujoco.MjData(model)
     fields = []
     for index, body in enumerate(bodies):
         own = jax.tree.map(lambda x, mine=which == index: x[mine], hidden)
-        rigid = [np.asarray(x, np.float64) for x in (*_rigid(body, own.fill, own.shell_scale), own.friction)]
+        rigid = [np.asarray(x, np.float64) for x in (*_rigid(body, own.fill, own.shell_scale, own.up), own.friction)]
         for mass, com, inertia, friction in zip(*rigid, strict=True):
             try:
                 scene.set_rigid(model, data, mass, com, inertia, friction)
@@ -158,7 +195,7 @@ def simulate(
         key: of the whole set.
         body: one, or a sequence of different ones.
         sensor: `sensor.gel.size` is the pad.
-        scenario: `Freefall()` or `Perturbed()`.
+        scenario: `Freefall()`, `Inclined()` or `Perturbed()`.
         num: trajectories of each body.
         hidden: (bodies * num,) each, body-major: rolls the starts of `key` with these instead of drawn ones.
         progress: called with the number of trajectories done so far, after each chunk.
@@ -176,11 +213,11 @@ def simulate(
     count = len(bodies) * num
     given = None if hidden is None else _check_hidden(hidden, count)
     pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
-    hulls = [contact.hull(np.asarray(b.hull)) for b in bodies]
-    sizes = np.array([len(b.hull) for b in bodies])
-    vertices = np.stack([np.pad(b.hull, ((0, sizes.max() - len(b.hull)), (0, 0)), "edge") for b in bodies])
+    hulls = [contact.hull(np.asarray(b.hulls)) for b in bodies]
+    sizes = np.array([b.hulls.size for b in bodies])
+    shapes = _shapes(bodies, scenario)
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
-    _, model, data = scene.template(pad, scenario.contact)
+    _, model, data = scene.template(pad, scenario.contact, scenario.wall)
     frame = np.arange(scenario.frames)[:, None] / scenario.rate
     time = jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep)  # of each step
 
@@ -199,9 +236,9 @@ def simulate(
     pending = np.arange(count)
     rows: dict[int, tuple[State, Record]] = {}
     while len(pending):
-        starts, drawn = _draw(key, which, nth, attempt, vertices, scenario=scenario)
+        starts, drawn = _draw(key, which, nth, attempt, shapes, scenario=scenario, pad=pad)
         drawn = drawn if given is None else given
-        fields = _draws(bodies, which, drawn, pad, scenario.contact)
+        fields = _draws(bodies, which, drawn, pad, scenario.contact, scenario.wall)
         by_size = [pending[sizes[which[pending]] == size] for size in np.unique(sizes)]
         chunks = [c for part in by_size for c in np.split(part, range(chunk, len(part), chunk)) if len(c)]
         with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
@@ -229,6 +266,7 @@ def simulate(
         velocity=records.velocity,
         wrench=records.wrench,
         contact=records.contact,
+        wall=records.wall,
         gravity=_gravity(starts.condition, time[:, -1:], scenario=scenario)[:, :, 0],
         settled=frozen_or_slow,
         outcome=jax.vmap(scenario.outcome)(records.pose[:, 0], records.pose[:, -1]),
