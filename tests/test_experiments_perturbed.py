@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 import sts_jax as sts
-from experiments import perturbed, show, stages
+from experiments import inclined, perturbed, show, stages
 from sts_jax import dataset, physics
 
 TINY = dataclasses.replace(
@@ -76,6 +76,14 @@ def test_a_model_answers_a_jerk_in_si_units(workdir):
     assert np.abs(out.pose - other.pose).max() > 1e-4
     with pytest.raises(ValueError, match=r"condition has shape None; .* needs \(1, 3\)"):
         predictor(tactile=pairs.tactile[:, 0] / 255)
+
+
+def test_the_slopes_presets_have_the_papers_counts():
+    default, paper = inclined.DEFAULT.collection, inclined.PAPER.collection
+    assert set(dataset.class_names(default)) == set(sts.objects.CATEGORIES)
+    assert len(dataset.split_objects(default)["test"]) >= 24
+    assert (paper.num_trajectories, paper.num_objects, paper.scenario.frames) == (2400, 480, 60)
+    assert (paper.num_full, paper.crop, paper.symmetries) == (2400, True, False)
 
 
 def test_presets_hold_out_what_they_should():
