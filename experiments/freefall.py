@@ -10,12 +10,7 @@ the same --workdir it goes on where it stopped, and touches nothing where all is
 """
 
 import dataclasses
-from pathlib import Path
-from typing import Literal
 
-import tyro
-
-import sts_jax as sts
 from experiments import stages
 from sts_jax import dataset, physics, training
 
@@ -50,29 +45,5 @@ PAPER = stages.Config(
 )
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
-
-@dataclasses.dataclass(frozen=True)
-class Args:
-    """What the command line says."""
-
-    preset: Literal["smoke", "default", "paper"] = "default"
-    workdir: Path = Path("runs/freefall")
-    plan: bool = False  # print seconds per stage from a short measurement, and stop
-
-
-def main(config: stages.Config, workdir: Path) -> None:
-    """Collect, train, evaluate."""
-    sensor = sts.Sensor()
-    stages.claim(config, workdir)
-    data = stages.collect(config, workdir, sensor)
-    for split in config.splits:
-        stages.train(config, data, workdir, sensor, split)
-        print(stages.evaluate(config, data, workdir, sensor, split))
-
-
 if __name__ == "__main__":
-    args = tyro.cli(Args, description=__doc__)
-    if args.plan:
-        print(stages.plan(PRESETS[args.preset]))
-    else:
-        main(PRESETS[args.preset], args.workdir)
+    stages.command(PRESETS, "runs/freefall", __doc__)  # collect, train, evaluate: stages.main

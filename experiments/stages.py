@@ -5,12 +5,13 @@ import itertools
 import json
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 import sts_jax as sts
 from experiments.progress import Bar, say
@@ -49,6 +50,34 @@ class Config:
     num_shown: int = 8  # held-out trajectories in the figures
 
 
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """What the command line of an experiment says."""
+
+    workdir: Path
+    preset: Literal["smoke", "default", "paper"] = "default"
+    plan: bool = False  # print seconds per stage from a short measurement, and stop
+
+
+def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
+    """An experiment from the command line."""
+    args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
+    if args.plan:
+        print(plan(presets[args.preset]))
+    else:
+        main(presets[args.preset], args.workdir)
+
+
+def main(config: Config, workdir: Path) -> None:
+    """Collect, train, evaluate."""
+    sensor = sts.Sensor()
+    claim(config, workdir)
+    data = collect(config, workdir, sensor)
+    for split in config.splits:
+        train(config, data, workdir, sensor, split)
+        print(evaluate(config, data, workdir, sensor, split))
+
+
 def claim(config: Config, workdir: Path) -> None:
     """Make a work directory this experiment's, or insist that it is."""
     dataset.claim(workdir / "config.json", dataclasses.asdict(config))
@@ -64,7 +93,7 @@ def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Datase
             progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total),
         )
     if resampled:
-        say(f"collect: {resampled} drops went non-finite or sank and were drawn again")
+        say(f"collect: {resampled} trajectories went non-finite or sank and were drawn again")
     return dataset.load(workdir / "dataset")
 
 
@@ -117,7 +146,11 @@ def preprocessing_of(config: Config) -> training.Preprocessing:
     """How an experiment's measurements are made ready for the networks."""
     collection = config.collection
     return training.Preprocessing(
-        collection.resolution, collection.crop, rotation=config.rotation, mask_blank_touch=config.mask_blank_touch
+        collection.resolution,
+        collection.crop,
+        rotation=config.rotation,
+        mask_blank_touch=config.mask_blank_touch,
+        condition_scale=collection.scenario.condition_scale,
     )
 
 
@@ -126,7 +159,8 @@ def model_config(modalities: tuple[str, ...], preprocessing: training.Preprocess
     pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
     shape = (*preprocessing.resolution, 3)
     images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
-    return mvae.Config(tuple({**images, "pose": pose}[name] for name in modalities))
+    kept = tuple({**images, "pose": pose}[name] for name in modalities)
+    return mvae.Config(kept, condition=len(preprocessing.condition_scale))
 
 
 def learnable(
@@ -135,6 +169,7 @@ def learnable(
     """First moments as inputs, last ones as targets, and which inputs no trajectory has."""
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     moments = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
+    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
     touched = np.asarray(
         preprocessing.touched(jnp.asarray(pairs.tactile[:, 0] / 255, jnp.float32), jnp.asarray(blank / 255))
     )
@@ -143,6 +178,7 @@ def learnable(
         inputs={name: np.ascontiguousarray(moments[name][:, 0]) for name in modalities if name not in absent},
         targets={name: np.ascontiguousarray(moments[name][:, 1]) for name in modalities},
         present={"tactile": touched} if "tactile" in modalities and not absent else {},
+        condition=condition if condition.shape[1] else None,
     )
     return arrays, dataclasses.replace(preprocessing, absent=absent)
 
@@ -186,18 +222,21 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     if both in rows:
         shown["MVAE from all"] = rows[both]
     title = f"{workdir.name}: the first {config.num_shown} of the held-out list, by {split}"
+    if config.collection.scenario.condition_scale:
+        title += "; red: where to, and how hard, the jerk drives it"
     evaluation.figures.predictions(figures / "predictions.png", test, shown, num=config.num_shown, title=title)
-    category = np.array([int(i) % len(sts.objects.CATEGORIES) for i in test.object])
+    category = np.array(dataset.class_names(config.collection))[test.object]
     best = rows[both] if both in rows else rows[single]
     assert best.pose is not None  # "mvae" of MODELS has one
-    first = np.sort(np.unique(test.object, return_index=True)[1])[:10]  # the first fall of each of the first objects
-    stands = evaluation.stand_ins(sensor, category[first], best.pose[first], config.collection.resolution)
+    first = np.sort(np.unique(test.object, return_index=True)[1])[:10]  # the first one of each of the first objects
+    samples = [dataset.sample_of_class(config.collection, name) for name in category[first]]
+    stands = evaluation.stand_ins(sensor, samples, best.pose[first], config.collection.resolution)
     line_up = figures / "line_up.png"
     evaluation.figures.line_up(line_up, line_up.with_suffix(".json"), test, best, category, blank, stands, first)
     logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
     evaluation.figures.training_curves(figures / "training.png", logs)
     if split == config.splits[0]:
-        draw_strip(config, data, figures / "fall.png", sensor)
+        draw_strip(config, data, figures / "strip.png", sensor)
 
     steps = {name: log[-1]["step"] if log else 0 for name, log in logs.items()}
     notes = [
@@ -237,17 +276,23 @@ def predict(
     test: dataset.Pairs,
     blank: np.ndarray,
 ) -> evaluation.Predicted:
-    """What a model says of the held-out trajectories; its outcome from the pose, or from whether its image is empty."""
+    """What a model says of the held-out trajectories.
+
+    Its outcome is that of its pose. Of a model without one it is whether its image is empty, where `scenario` asks for
+    no more than whether the object fell off; else it is left open.
+    """
 
     def run(pairs: dataset.Pairs) -> evaluation.Predicted:
+        condition = pairs.condition if pairs.condition.shape[1] else None
         out = (
             predictor(
                 visual=pairs.visual[:, 0] / 255 if "visual" in names else None,
                 tactile=pairs.tactile[:, 0] / 255 if "tactile" in names else None,
                 pose=pairs.pose[:, 0] if "pose" in names else None,
+                condition=condition,
             )
             if names
-            else predictor.prior((len(pairs.object),))
+            else predictor.prior((len(pairs.object),), condition=condition)
         )
         return evaluation.Predicted(
             *(None if leaf is None else np.asarray(leaf) for leaf in (out.visual, out.tactile, out.pose))
@@ -256,32 +301,32 @@ def predict(
     out, outcome = run(test), None
     if out.pose is not None:
         outcome = evaluation.outcome_of_pose(scenario, test.pose[:, 0], out.pose)
-    elif out.visual is not None:
+    elif out.visual is not None and len(scenario.outcomes) == 2:
         score = evaluation.emptiness(np.asarray(run(validation).visual), blank)
         threshold = evaluation.metrics.best_threshold(score, validation.outcome != int(sts.physics.Outcome.FELL_OFF))
         outcome = evaluation.outcome_of_image(out.visual, blank, threshold)
     return out._replace(outcome=outcome)
 
 
-def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
+def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
     """Seconds a stage, measured on a little of each and everything twice, so that compilation counts once.
 
     Args:
         config: The experiment.
-        drops: Trajectories to simulate; each has its first and last frame rendered in all symmetries.
+        num: Trajectories to simulate; each has its first and last frame rendered in all symmetries.
         steps: Gradient steps of each model.
 
     Returns:
         One line a stage.
     """
     sensor, collection = sts.Sensor(), config.collection
-    kinds = len(sts.objects.CATEGORIES)
+    many = 8  # objects
     lines = []
     with tempfile.TemporaryDirectory() as name, Bar() as bar:
-        spent: dict[str, list[float]] = {"drops": [], "frames": []}
+        spent: dict[str, list[float]] = {"trajectories": [], "frames": []}
         for seed in (0, 1):
             little = dataclasses.replace(
-                collection, num_objects=kinds, num_per_object=drops // kinds, num_full=0, symmetries=True, seed=seed
+                collection, num_objects=many, num_per_object=num // many, num_full=0, symmetries=True, seed=seed
             )
             stamps = {"start": time.perf_counter()}
 
@@ -290,14 +335,14 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
                 bar(f"plan: {progress.stage}", progress.done, progress.total)
 
             dataset.collect(little, sensor, Path(name) / str(seed), progress=watch)
-            spent["drops"].append(stamps["drops"] - stamps["start"])
-            spent["frames"].append(stamps["frames"] - stamps["drops"])
-        last = collection.scenario.frames
-        ends = collection.num_trajectories * 2 * (dataset.SYMMETRIES if collection.symmetries else 1)
+            spent["trajectories"].append(stamps["trajectories"] - stamps["start"])
+            spent["frames"].append(stamps["frames"] - stamps["trajectories"])
+        last, seen = collection.scenario.frames, len(dataset.symmetries_of(collection))
+        ends = collection.num_trajectories * 2 * seen
         frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
         for stage, total, measured in (
-            ("drops", collection.num_trajectories, drops),
-            ("frames", frames, 2 * dataset.SYMMETRIES * drops),
+            ("trajectories", collection.num_trajectories, num),
+            ("frames", frames, 2 * len(collection.scenario.symmetries) * num),
         ):
             first, again = spent[stage]
             rate = measured / again
@@ -308,12 +353,12 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
 
         data = dataset.load(Path(name) / "0")
         tiny = dataclasses.replace(
-            config, collection=dataclasses.replace(collection, num_objects=kinds), splits=("trajectory",)
+            config, collection=dataclasses.replace(collection, num_objects=many), splits=("trajectory",)
         )
-        pairs = data.pairs(np.arange(drops), symmetries=True)
+        pairs = data.pairs(np.arange(num), symmetries=True)
         blank = empty_frame(sensor, collection)
         share = 0.7 if config.splits[0] == "object" else 0.8
-        samples = round(share * collection.num_trajectories) * (dataset.SYMMETRIES if collection.symmetries else 1)
+        samples = round(share * collection.num_trajectories) * seen
         for number, (model, modalities) in enumerate(MODELS.items()):
             arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
             stamps_of_steps = [time.perf_counter()]
@@ -340,7 +385,7 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
             lines.append((f"train {model}: {total} steps", compiling + total * each, note))
         start = time.perf_counter()
         evaluate(tiny, data, Path(name), sensor, "trajectory")
-        lines.append(("evaluate and draw", time.perf_counter() - start, f"of {round(0.2 * drops)} trajectories"))
+        lines.append(("evaluate and draw", time.perf_counter() - start, f"of {round(0.2 * num)} trajectories"))
     repeats = len(config.splits)
     lines = [(what, seconds * (1 if what.startswith("collect") else repeats), note) for what, seconds, note in lines]
     lines.append(("together", sum(seconds for _, seconds, _ in lines), f"for {', '.join(config.splits)} split"))
@@ -348,28 +393,49 @@ def plan(config: Config, *, drops: int = 64, steps: int = 4) -> str:
 
 
 def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Sensor) -> None:
-    """The first fully rendered trajectory that stays on the pad, from outside and through the sensor."""
+    """A fully rendered trajectory, the first with the most telling outcome, from outside and through the sensor."""
     full = data.full_trajectories()
     if not len(full):
         return
-    stays = full[data.trajectory["outcome"][full] == int(sts.physics.Outcome.RESTS)]
-    index = int(stays[0] if len(stays) else full[0])
+    rank = [config.collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
+    index = int(full[np.argmin(rank)])
+    one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
     images = data.strip(index)
-    body = dataset.make_bodies(config.collection, data.trajectory["body"][[index]])[0]
-    size = jnp.array(sensor.gel.size)
-    view = np.stack(
-        [np.asarray(evaluation.outside(body, jnp.asarray(pose), size)) for pose in data.trajectory["pose"][index]]
-    )
-    category = sts.objects.CATEGORIES[int(body.category)]
+    body = dataset.make_bodies(config.collection, np.array([one["body"]]))[0]
+    what = describe(dataset.class_names(config.collection)[one["body"]], one, hidden)
     evaluation.figures.strip(
         path,
-        data.trajectory["time"][index],
-        view,
+        one["time"],
+        views(body, one["pose"], one["gravity"], sensor, config.collection.scenario.wall),
         images.visual / 255,
         images.tactile / 255,
-        data.trajectory["wrench"][index],
-        title=f"trajectory {index}: a {category}",
+        one["wrench"],
+        title=f"trajectory {index}: {what}",
     )
+
+
+def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
+    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the gravity of its end drawn downwards.
+
+    What fell off and was frozen is no longer drawn.
+    """
+    size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
+    frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
+    pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
+    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up, wall)) for each in pose])
+
+
+def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]) -> str:
+    """One trajectory in words: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
+    outcome = sts.physics.Outcome(int(trajectory["outcome"])).name.lower().replace("_", " ")
+    words = [f"a {name} {outcome}"]
+    words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]
+    if hidden["up"][2] < 1:
+        words.append("contents' up ({:.1f}, {:.1f}, {:.1f})".format(*hidden["up"]))
+    if len(trajectory["condition"]):
+        x, y, duration = trajectory["condition"]
+        words.append(f"pad jerked by ({x:.1f}, {y:.1f}) m/s² for {1e3 * duration:.0f} ms")
+    return ", ".join(words)
 
 
 def _read_lines(path: Path) -> list[dict[str, float]]:

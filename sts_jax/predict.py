@@ -50,7 +50,7 @@ def predict(
         inputs: Some of `visual`, `tactile` `(*n, height, width, 3)` in [0, 1] and `pose` `(*n, 7)`.
         present: Which items of an input count, `(*n,)`; all where not given. A touch without contact never does,
             unless the model was trained to be fed the blank one.
-        condition: `(*n, c)`, for models that have one.
+        condition: `(*n, c)`, SI units, for models that have one.
         key: For the samples; consumed.
         num_samples: How many latents to draw besides the mean.
         shape: The leading axes where there is no input at all; the prediction is then the prior's.
@@ -70,7 +70,8 @@ def predict(
     else:
         nothing = jnp.zeros((math.prod(shape), nnx.merge(graphdef, state).config.latent))
         posterior = mvae.Gaussian(nothing, nothing)
-    condition = None if condition is None else condition.reshape(-1, condition.shape[-1])
+    if condition is not None:
+        condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
 
     def decode(z: Float[Array, "... latent"], shape: tuple[int, ...]) -> Prediction:
         wide = None if condition is None else jnp.broadcast_to(condition, (*z.shape[:-1], condition.shape[-1]))
@@ -157,7 +158,8 @@ class Predictor:
             visual: `(*n, height, width, 3)` in [0, 1], any leading axes, the same for all that is given.
             tactile: `(*n, height, width, 3)` in [0, 1]; items without contact are ignored.
             pose: `(*n, 7)` m and unit quaternion, mesh frame in the sensor frame.
-            condition: `(*n, c)`, for models that have one.
+            condition: `(*n, c)`, the scenario's input in SI units, for models that have one. Of a jerk: acceleration of
+                the pad along x and y (m/s^2) and its duration (s).
             present: By name, which items of a modality count, bool `(*n,)`; what does not count may be NaN.
             key: For `num_samples`; consumed.
             num_samples: Draw this many predictions from the posterior besides that of its mean.
@@ -185,10 +187,7 @@ class Predictor:
                 )
         for name, array in arrays.items():
             self._check_values(name, array[masks[name]] if name in masks else array)
-        width = self.model.config.condition
-        shape = None if condition is None else np.shape(condition)
-        if shape != (None if width == 0 else (*lead, width)):
-            raise ValueError(f"condition has shape {shape}; {self.name} needs {(*lead, width) if width else 'none'}.")
+        condition = self._checked_condition(condition, lead)
         if num_samples < 0 or (num_samples > 0 and key is None):
             raise ValueError(f"num_samples={num_samples} needs a key and a number that is not negative.")
         return predict(
@@ -198,14 +197,22 @@ class Predictor:
             self._blank,
             arrays,
             masks,
-            None if condition is None else np.asarray(condition, np.float32),
+            condition,
             key if num_samples else None,
             num_samples,
         )
 
-    def prior(self, shape: tuple[int, ...] = ()) -> Prediction:
-        """What the model expects with nothing given: the mean of the prior, for items of any leading `shape`."""
-        return predict(self.model.graphdef, self.model.state, self.preprocessing, self._blank, {}, {}, shape=shape)
+    def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
+        """What the model expects with no measurement given: the mean of the prior, for items of any leading `shape`.
+
+        Args:
+            shape: Of the items.
+            condition: `(*shape, c)`, as in a call.
+        """
+        condition = self._checked_condition(condition, shape)
+        return predict(
+            self.model.graphdef, self.model.state, self.preprocessing, self._blank, {}, {}, condition, shape=shape
+        )
 
     @property
     def modalities(self) -> tuple[str, ...]:
@@ -235,6 +242,24 @@ class Predictor:
         if math.prod(array.shape) == 0:
             raise ValueError(f"{name} has shape {array.shape}: there is no item in it.")
         return array.astype(np.float32)
+
+    def _checked_condition(self, value: ArrayLike | None, lead: tuple[int, ...]) -> np.ndarray | None:
+        width = self.model.config.condition
+        shape = None if value is None else np.shape(value)
+        if shape != (None if width == 0 else (*lead, width)):
+            raise ValueError(f"condition has shape {shape}; {self.name} needs {(*lead, width) if width else 'none'}.")
+        if value is None:
+            return None
+        condition = np.asarray(value, np.float32)
+        if not np.isfinite(condition).all():
+            raise ValueError("condition has NaN or infinite values; every item needs one.")
+        scale = np.array(self.preprocessing.condition_scale)
+        if (np.abs(condition) > 100 * scale).any():
+            raise ValueError(
+                f"condition has {np.abs(condition).reshape(-1, width).max(0).tolist()}, where {scale.tolist()} is "
+                "usual; are these SI units?"
+            )
+        return condition
 
     def _check_values(self, name: str, array: np.ndarray) -> None:
         if not np.isfinite(array).all():

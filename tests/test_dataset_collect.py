@@ -9,7 +9,7 @@ import pytest
 
 import sts_jax as sts
 from sts_jax import _math, dataset
-from sts_jax.dataset.collect import turn, turn_wrench
+from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
 SMALL = dataset.Collection(
     sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2
@@ -30,6 +30,26 @@ def test_every_object_is_in_one_part_and_shares_are_kept():
     np.testing.assert_array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(160))
     for part in split.values():  # each category alike
         np.testing.assert_array_equal(np.bincount(part % 8, minlength=8), len(part) // 8)
+
+
+def test_the_split_of_the_published_collections_stays():
+    split = dataset.split_objects(dataset.Collection(num_objects=21, seed=5))
+    assert split["validation"].tolist() == [12, 18]
+    assert split["test"].tolist() == [2, 3, 8, 9]
+
+
+def test_classes_follow_the_categories():
+    collection = dataset.Collection(categories=("fork", "bottle"), num_objects=20)
+    names = dataset.class_names(collection)
+    assert names == ("fork", "bottle") * 10
+    for index, body in zip((1, 4), dataset.make_bodies(collection, np.array([1, 4])), strict=True):
+        assert sts.objects.CATEGORIES[int(body.category)] == names[index]
+    for part in dataset.split_objects(collection).values():
+        assert sum(names[i] == "fork" for i in part) == len(part) / 2
+    sample = dataset.sample_of_class(collection, "fork")
+    assert sts.objects.CATEGORIES[int(sample.category)] == "fork"
+    with pytest.raises(ValueError, match="is a 'spoon': its classes are fork, bottle"):
+        dataset.sample_of_class(collection, "spoon")
 
 
 def test_frames_are_those_that_sense_draws(folder):
@@ -66,6 +86,20 @@ def test_a_turn_turns_position_orientation_and_wrench():
     np.testing.assert_allclose(_math.transform(turned, point), [-y, x, z], atol=1e-7)
     wrench = jnp.array([1.0, 2, 3, 4, 5, 6])
     np.testing.assert_allclose(turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
+
+
+@pytest.mark.parametrize("scenario", [sts.physics.Freefall(), sts.physics.Inclined(), sts.physics.Perturbed()])
+def test_a_scenarios_symmetries_are_those_that_turn_its_gravity_with_its_condition(scenario):
+    condition = jnp.array([[3.0, -7.0, 0.08]])[:, : len(scenario.condition_scale)]
+    kept = []
+    for symmetry in range(8):
+        turned = turn_condition(condition, symmetry)
+        gravity, other = (scenario.gravity(jnp.float32(0.01), c[0]) for c in (condition, turned))
+        image = turn_wrench(jnp.concatenate([gravity, jnp.zeros(3)]), symmetry)[:3]
+        if np.allclose(other, image, atol=1e-5):
+            kept.append(symmetry)
+        np.testing.assert_array_equal(turned[:, 2:], condition[:, 2:])
+    assert tuple(kept) == scenario.symmetries
 
 
 def test_a_mirrored_pose_and_body_are_the_mirror_image_in_the_sensor_frame():
@@ -108,6 +142,16 @@ def test_symmetries_of_a_pad_that_is_not_square_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"gel\.size=\[0\.15"):
         dataset.collect(dataclasses.replace(SMALL, symmetries=True), sensor, tmp_path / "new")
     assert not (tmp_path / "new").exists()
+
+
+def test_a_scenario_with_a_mirror_alone_takes_any_pad(tmp_path, monkeypatch):
+    monkeypatch.setattr(sts.physics.Freefall, "symmetries", (0, 6))
+    sensor = sts.Sensor()
+    sensor = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, size=(0.15, 0.1)))
+    collection = dataclasses.replace(SMALL, num_objects=1, num_per_object=1, num_full=0)
+    dataset.collect(collection, sensor, tmp_path)
+    pose = dataset.load(tmp_path).pairs(np.array([0]), symmetries=True).pose
+    np.testing.assert_allclose(pose[1, :, :3], pose[0, :, :3] * [-1, 1, 1], atol=1e-7)
 
 
 def test_another_collection_in_the_same_folder_is_refused(folder):

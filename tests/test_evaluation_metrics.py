@@ -58,6 +58,18 @@ def test_angle_knows_that_a_quaternion_and_its_negative_are_one_rotation():
     np.testing.assert_allclose(metrics.geodesic_angle(turned, pose), [0, math.pi / 3], atol=1e-7)
 
 
+def test_the_up_axis_knows_no_turn_about_itself():
+    half = math.pi / 6
+    pose = np.zeros((3, 7))
+    pose[:, 3] = 1
+    turned = pose.copy()
+    turned[0, 3:] = [math.cos(half), 0, 0, math.sin(half)]
+    turned[1, 3:] = [math.cos(half), math.sin(half), 0, 0]
+    turned[2, 3:] = [0, math.sqrt(0.5), math.sqrt(0.5), 0]
+    np.testing.assert_allclose(metrics.axis_angle(turned, pose), [0, math.pi / 3, math.pi], atol=1e-7)
+    np.testing.assert_allclose(metrics.axis_angle(turned[:1], turned[1:2]), [math.pi / 3], atol=1e-7)
+
+
 def test_balanced_accuracy_weighs_classes_alike():
     target = np.array([0] * 9 + [1])
     assert metrics.balanced_accuracy(np.zeros(10), target) == pytest.approx(0.5)

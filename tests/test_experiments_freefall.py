@@ -27,7 +27,7 @@ TINY = dataclasses.replace(
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory):
     workdir = tmp_path_factory.mktemp("runs") / "freefall"
-    freefall.main(TINY, workdir)
+    stages.main(TINY, workdir)
     return workdir
 
 
@@ -35,7 +35,7 @@ def test_the_workdir_holds_what_is_promised(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
     assert {"config.json", "dataset", "metrics.json", "table.md"} <= names
     assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS} <= names
-    assert {f"figures/{name}.png" for name in ("predictions", "training", "fall", "line_up")} <= names
+    assert {f"figures/{name}.png" for name in ("predictions", "training", "strip", "line_up")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
     predictors = metrics["predictors"]
     assert {
@@ -55,14 +55,14 @@ def test_the_workdir_holds_what_is_promised(workdir):
 
 def test_started_again_it_touches_nothing(workdir):
     stamps = {path: path.stat().st_mtime_ns for path in workdir.rglob("*")}
-    freefall.main(TINY, workdir)
+    stages.main(TINY, workdir)
     assert stamps == {path: path.stat().st_mtime_ns for path in workdir.rglob("*")}
 
 
 def test_another_configuration_is_refused(workdir):
     other = dataclasses.replace(TINY, steps=(3, 2, 2, 2))
     with pytest.raises(ValueError, match=r"config\.json was made with steps = \[2, 2, 2, 2\]"):
-        freefall.main(other, workdir)
+        stages.main(other, workdir)
 
 
 def test_what_is_promised_to_callers_runs(workdir):

@@ -15,11 +15,11 @@ from sts_jax.predict import predict
 SIDE = 32
 
 
-def train(folder, *, absent=()):
+def train(folder, *, absent=(), condition_scale=()):
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (2, 6, SIDE, SIDE, 3), dtype=np.uint8)
     pose = np.concatenate([rng.normal(size=(6, 3)), np.tile([1.0, 0, 0, 0], (6, 1))], 1).astype(np.float32)
-    preprocessing = training.Preprocessing(resolution=(SIDE, SIDE), absent=absent)
+    preprocessing = training.Preprocessing(resolution=(SIDE, SIDE), absent=absent, condition_scale=condition_scale)
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pose)))
     moments = {"visual": images[0], "tactile": images[1], "pose": code}
     config = mvae.Config(
@@ -30,12 +30,14 @@ def train(folder, *, absent=()):
         latent=8,
         hidden=16,
         widths=(4, 4, 4, 4),
+        condition=len(condition_scale),
     )
+    condition = rng.normal(size=(6, len(condition_scale))).astype(np.float32) if condition_scale else None
     training.save_blank(folder, images[0, 0], np.full((SIDE, SIDE, 3), 178, np.uint8))
     training.train(
         training.TrainConfig(steps=2, batch_size=4, log_every=1, checkpoint_every=2),
         config,
-        training.Arrays({k: v for k, v in moments.items() if k not in absent}, moments),
+        training.Arrays({k: v for k, v in moments.items() if k not in absent}, moments, condition=condition),
         workdir=folder,
         absent=absent,
         preprocessing=dataclasses.asdict(preprocessing),
@@ -165,6 +167,37 @@ def test_a_touch_that_training_never_saw_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"mvae cannot use tactile"):
         predictor(tactile=measurement()["tactile"])
     assert predictor(visual=measurement()["visual"]).tactile.shape == (SIDE, SIDE, 3)
+
+
+def test_a_condition_is_given_in_si_units(tmp_path):
+    scale = np.array([10.0, 10.0, 0.1])
+    predictor = sts.Predictor.load(train(tmp_path / "mvae", condition_scale=tuple(scale.tolist())))
+    assert predictor.preprocessing.condition_scale == (10.0, 10.0, 0.1)
+    given, condition = measurement(2), np.array([[4.0, -9.0, 0.07], [-4.0, 9.0, 0.12]])
+    out = predictor(visual=given["visual"], condition=condition)
+    logits, _ = mvae.predict(
+        predictor.model.graphdef,
+        predictor.model.state,
+        {"visual": jnp.asarray(given["visual"])},
+        condition=jnp.asarray(condition / scale),
+    )
+    np.testing.assert_allclose(out.visual, jax.nn.sigmoid(logits["visual"]), atol=1e-5)
+    other = predictor(visual=given["visual"], condition=-condition)
+    assert np.abs(other.visual - out.visual).max() > 1e-3
+    nothing = predictor.prior((2,), condition=condition)
+    assert np.abs(nothing.pose[0] - nothing.pose[1]).max() > 1e-3
+    samples = predictor(visual=given["visual"], condition=condition, key=jax.random.key(0), num_samples=2).samples
+    assert samples.visual.shape == (2, 2, SIDE, SIDE, 3)
+    for wrong, message in (
+        (None, r"condition has shape None; .* needs \(2, 3\)"),
+        (condition[0], r"needs \(2, 3\)"),
+        (condition * np.nan, "condition has NaN"),
+        (condition * 1e3, "SI units"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            predictor(visual=given["visual"], condition=wrong)
+    with pytest.raises(ValueError, match="condition has shape None"):
+        predictor.prior()
 
 
 def test_a_checkpoint_of_another_view_is_refused(folder):

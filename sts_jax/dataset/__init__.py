@@ -1,13 +1,15 @@
 """Collections on disk: made shard by shard, read as arrays."""
 
-from sts_jax.dataset.collect import SYMMETRIES as SYMMETRIES
 from sts_jax.dataset.collect import Collection as Collection
 from sts_jax.dataset.collect import Progress as Progress
 from sts_jax.dataset.collect import claim as claim
+from sts_jax.dataset.collect import class_names as class_names
 from sts_jax.dataset.collect import collect as collect
 from sts_jax.dataset.collect import make_bodies as make_bodies
 from sts_jax.dataset.collect import render_uint8 as render_uint8
+from sts_jax.dataset.collect import sample_of_class as sample_of_class
 from sts_jax.dataset.collect import split_objects as split_objects
+from sts_jax.dataset.collect import symmetries_of as symmetries_of
 from sts_jax.dataset.load import Dataset as Dataset
 from sts_jax.dataset.load import Pairs as Pairs
 from sts_jax.dataset.load import load as load
@@ -17,7 +19,6 @@ from sts_jax.dataset.records import write_arrays as write_arrays
 from sts_jax.dataset.records import write_whole as write_whole
 
 __all__ = [
-    "SYMMETRIES",
     "Collection",
     "Dataset",
     "Images",
@@ -25,11 +26,14 @@ __all__ = [
     "Progress",
     "TornFileError",
     "claim",
+    "class_names",
     "collect",
     "load",
     "make_bodies",
     "render_uint8",
+    "sample_of_class",
     "split_objects",
+    "symmetries_of",
     "write_arrays",
     "write_whole",
 ]

@@ -22,9 +22,6 @@ from sts_jax.sensor import Sensor
 
 # Frames rendered by one compiled call.
 RENDER_BATCH = 32
-# The pad is square and gravity vertical: a fall turned by quarter turns, or mirrored, is a fall. Number s is turned by
-# s % 4 x 90 degrees about z, after having been mirrored (y becomes -y) if s >= 4.
-SYMMETRIES = 8
 SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
 
 
@@ -33,10 +30,11 @@ class Collection:
     """What a dataset is made of. Together with a `Sensor` it determines every byte."""
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
-    num_objects: int = 160  # procedural objects; the eight categories in turn
+    categories: tuple[str, ...] = objects.CATEGORIES  # of the procedural objects, in turn
+    num_objects: int = 160
     num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
     num_full: int = 20  # trajectories with every frame rendered; of the others the first and the last
-    symmetries: bool = True  # see each trajectory in all SYMMETRIES of the square pad, or only as it is
+    symmetries: bool = True  # see each trajectory in all `scenario.symmetries`, or only as it is
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
     objects_per_shard: int = 40
@@ -58,24 +56,35 @@ class Progress(NamedTuple):
 
     done: int  # trajectories (or frames) finished
     total: int
-    stage: str  # "drops" or "frames"
+    stage: str  # "trajectories" or "frames"
+
+
+def class_names(collection: Collection) -> tuple[str, ...]:
+    """The class of each object of a collection, `num_objects` names."""
+    return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))
 
 
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
     """The objects of a collection, each from its own key: object i is the same whatever else is made."""
-    key = jax.random.key(collection.seed)
-    return [
-        objects.make(jax.random.fold_in(key, int(i)), objects.CATEGORIES[int(i) % len(objects.CATEGORIES)])
-        for i in indices
-    ]
+    key, names = jax.random.key(collection.seed), class_names(collection)
+    return [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
+
+
+def sample_of_class(collection: Collection, name: str) -> objects.Body:
+    """Some object of a class, the same one for all collections: it may stand in for any of its class."""
+    if name not in collection.categories:
+        raise ValueError(
+            f"no object of the collection is a {name!r}: its classes are {', '.join(collection.categories)}"
+        )
+    return objects.make(jax.random.key(0), name)
 
 
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
-    """Which objects train, validate and test (70/10/20): shuffled by the seed, each category spread alike."""
+    """Which objects train, validate and test (70/10/20): shuffled by the seed, each class spread alike."""
     rng = np.random.default_rng([collection.seed, 1])
-    # A block of one object of each category after the other, the objects of a category in random order.
-    count = len(objects.CATEGORIES)
-    members = [rng.permutation(np.arange(c, collection.num_objects, count)) for c in range(count)]
+    # A block of one object of each class after the other, the objects of a class in random order.
+    names = np.array(class_names(collection))
+    members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
     blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
     cuts = np.round(np.cumsum(list(SPLITS.values()))[:-1] * collection.num_objects).astype(int)
     parts = np.split(np.concatenate(blocks), cuts)
@@ -83,7 +92,10 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
 
 
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
-    """A pose under a symmetry of the pad; that of a mirrored one belongs to `objects.mirror` of the body."""
+    """A pose under a symmetry of the pad; that of a mirrored one belongs to `objects.mirror` of the body.
+
+    Symmetry s turns by s % 4 quarter turns about z, after having mirrored (y becomes -y) if s >= 4.
+    """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
     spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
@@ -99,6 +111,14 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
     spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
     pair = wrench.reshape(*wrench.shape[:-1], 2, 3)
     return _math.transform(jnp.concatenate([jnp.zeros(3), spin]), pair).reshape(wrench.shape)
+
+
+def turn_condition(condition: Float[Array, "*n c"], symmetry: int) -> Float[Array, "*n c"]:
+    """A condition under a symmetry of the pad: the first two numbers are a vector along x and y, others stay."""
+    if condition.shape[-1] == 0:
+        return condition
+    vector = jnp.concatenate([condition[..., :2], jnp.zeros((*condition.shape[:-1], 4))], -1)
+    return jnp.concatenate([turn_wrench(vector, symmetry)[..., :2], condition[..., 2:]], -1)
 
 
 def collect(
@@ -120,15 +140,14 @@ def collect(
         How many trajectories were drawn again because they went non-finite or sank, in the shards made now.
 
     Raises:
-        ValueError: The folder holds another collection, the message names the field; or symmetries are asked for of a
-            pad that is not square.
+        ValueError: The folder holds another collection, the message names the field; or the pad does not have the
+            scenario's symmetries.
         OSError: The disk is full.
     """
-    if collection.symmetries and not isinstance(collection.scenario, physics.Freefall):
-        raise ValueError(f"symmetries=True with {type(collection.scenario).__name__}: its condition is not turned yet")
     sides = [float(side) for side in sensor.gel.size]
-    if collection.symmetries and sides[0] != sides[1]:
-        raise ValueError(f"symmetries=True with gel.size={sides}: only on a square pad is a turned fall a fall")
+    quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(collection))
+    if quarter_turns and sides[0] != sides[1]:
+        raise ValueError(f"symmetries=True with gel.size={sides}: only a square pad is itself after a quarter turn")
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "collection.json", _as_json(collection))
     claim(folder / "sensor.json", jax.tree.map(lambda x: np.asarray(x).tolist(), dataclasses.asdict(sensor)))
@@ -141,6 +160,11 @@ def collect(
         if not shard_path(folder, collection, index).with_suffix(".npz").exists():
             resampled += _make_shard(collection, sensor, folder, index, progress)
     return resampled
+
+
+def symmetries_of(collection: Collection) -> tuple[int, ...]:
+    """In which symmetries of the pad the first and the last frame of each trajectory are rendered; 0 is as it was."""
+    return collection.scenario.symmetries if collection.symmetries else (0,)
 
 
 def shard_path(folder: Path, collection: Collection, index: int) -> Path:
@@ -200,7 +224,7 @@ def _make_shard(
         sensor,
         collection.scenario,
         collection.num_per_object,
-        progress=_report(progress, before, collection.num_trajectories, "drops"),
+        progress=_report(progress, before, collection.num_trajectories, "trajectories"),
     )
     trajectory = jax.tree.map(np.asarray, trajectory)
     frames = _frames_of(collection, first, trajectory)
@@ -225,8 +249,7 @@ def _frames_of(collection: Collection, first_object: int, trajectory: physics.Tr
         rank = repeat * collection.num_objects + first_object + object_index
         full = rank < collection.num_full
         rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
-        if collection.symmetries:
-            rows += [(i, t, symmetry) for symmetry in range(1, SYMMETRIES) for t in (0, last)]
+        rows += [(i, t, symmetry) for symmetry in symmetries_of(collection) if symmetry for t in (0, last)]
     frames = np.array(rows, np.int32)
     # Object by object, its mirror image after it: what is drawn in one call.
     return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
@@ -241,11 +264,11 @@ def _render(
     report: Callable[[int], None],
 ) -> Iterator[records.Images]:
     """Render `frames` in order, a fixed number a call; one thread a core, since a call keeps one core busy."""
-    turned = [
-        tuple(np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench)))
-        for q in range(SYMMETRIES)
-    ]
-    mirrored = [objects.mirror(body) for body in bodies] if collection.symmetries else bodies
+    turned = {
+        q: [np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench))]
+        for q in symmetries_of(collection)
+    }
+    mirrored = [objects.mirror(body) for body in bodies] if max(turned) >= 4 else bodies
 
     def batches() -> Iterator[tuple[objects.Body, np.ndarray, np.ndarray, int]]:
         owner = np.stack([trajectory.body[frames[:, 0]], frames[:, 2] >= 4], 1)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sts_jax.dataset import records
-from sts_jax.dataset.collect import SYMMETRIES, turn
+from sts_jax.dataset.collect import turn, turn_condition
 
 
 class Pairs(NamedTuple):
@@ -20,6 +20,7 @@ class Pairs(NamedTuple):
     segmentation: np.ndarray  # bool (n, 2, height, width)
     pose: np.ndarray  # float32 (n, 2, 7)
     contact: np.ndarray  # bool (n, 2): the pad carries the object
+    condition: np.ndarray  # float32 (n, c): the scenario's input, SI units; turned like the pose
     outcome: np.ndarray  # int32 (n,), physics.Outcome
     object: np.ndarray  # int64 (n,), index of the object in the collection
     trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
@@ -80,24 +81,26 @@ class Dataset:
 
         Args:
             trajectories: Their indices.
-            symmetries: Each also turned and mirrored as the square pad allows, where the collection rendered that.
+            symmetries: Each also turned and mirrored, as the collection rendered it.
         """
         last = self.trajectory["pose"].shape[1] - 1
-        kinds = range(SYMMETRIES) if symmetries and self.collection["symmetries"] else range(1)
+        kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]
         row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
         wanted = [(int(t), kind) for t in trajectories for kind in kinds]
         rows = np.array([[row_of[t, 0, q], row_of[t, last, q]] for t, q in wanted], np.int64).reshape(-1, 2)
         images = [leaf.reshape(-1, 2, *leaf.shape[1:]) for leaf in self.images(rows.ravel())]
         index = np.array([t for t, _ in wanted], np.int64)
-        ends = jnp.asarray(self.trajectory["pose"][:, [0, last]])
+        ends, input = jnp.asarray(self.trajectory["pose"][:, [0, last]]), jnp.asarray(self.trajectory["condition"])
         turned = np.stack([np.asarray(turn(ends, kind)) for kind in kinds])
-        kind_of = np.array([q for _, q in wanted], np.int64)
+        conditions = np.stack([np.asarray(turn_condition(input, kind)) for kind in kinds])
+        place = np.tile(np.arange(len(kinds)), len(trajectories))
         return Pairs(
             visual=images[0],
             tactile=images[1],
             segmentation=images[2],
-            pose=turned[kind_of, index].astype(np.float32),
+            pose=turned[place, index].astype(np.float32),
             contact=self.trajectory["contact"][:, [0, last]][index],
+            condition=conditions[place, index].astype(np.float32),
             outcome=self.trajectory["outcome"][index],
             object=self.trajectory["body"][index],
             trajectory=index,

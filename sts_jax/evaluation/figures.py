@@ -6,7 +6,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import colors
 from matplotlib.axes import Axes
+from PIL import Image, ImageDraw, ImageFont
 
 from sts_jax import physics
 from sts_jax.dataset import Pairs
@@ -15,6 +17,9 @@ from sts_jax.evaluation.report import Predicted
 
 def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, num: int, title: str) -> None:
     """Input, target and predictions of the first `num` held-out trajectories, one row each.
+
+    Where there is a condition, an arrow on the input is the velocity against the pad that the jerk gives what slides
+    freely: a quarter of the picture for 1 m/s.
 
     Args:
         path: The PNG to write.
@@ -39,6 +44,11 @@ def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, 
                 axis.set_title(head, fontsize=7)
         outcome = physics.Outcome(int(test.outcome[row])).name.lower().replace("_", " ")
         axes[row, 0].set_ylabel(f"#{test.trajectory[row]}\n{outcome}", fontsize=7)
+        if test.condition.shape[1]:
+            height, width = test.visual.shape[2:4]
+            middle = np.array([width - 1, height - 1]) / 2
+            tip = middle - test.condition[row, :2] * test.condition[row, 2] * width / 4
+            axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
     figure.suptitle(title, fontsize=9)
     _save(figure, path)
 
@@ -116,6 +126,77 @@ def strip(
     force.grid(alpha=0.3)
     figure.suptitle(title, fontsize=9)
     _save(figure, path)
+
+
+def animation(
+    path: Path,
+    time: np.ndarray,
+    view: np.ndarray,
+    visual: np.ndarray,
+    tactile: np.ndarray,
+    wrench: np.ndarray,
+    gravity: np.ndarray,
+    *,
+    title: str = "",
+    outcome: str = "",
+    slower: float = 2,
+    side: int = 240,
+) -> None:
+    """One trajectory as a moving picture: a view from outside, both streams, and the force so far.
+
+    An arrow on the visual stream is gravity's part along the pad: what the slope, or the jerk of the pad, pulls with.
+
+    Args:
+        path: The GIF to write.
+        time: Of every frame (s), `(frames,)`.
+        view: The scene from outside, `(frames, h, w, 3)` in [0, 1].
+        visual: `(frames, height, width, 3)` in [0, 1].
+        tactile: `(frames, height, width, 3)` in [0, 1].
+        wrench: `(frames, 6)`, N and N m.
+        gravity: `(frames, 3)`, m/s^2, sensor frame.
+        title: Above.
+        outcome: Shown at the end.
+        slower: How many times slower than it happens it is shown.
+        side: Of each of the three pictures (pixels).
+    """
+    low, high = min(float(wrench[:, :3].min()), 0.0), max(float(wrench[:, :3].max()), 1e-3)
+    top, base, width = 44, 44 + side + 96, 3 * side
+    across = np.interp(time, [time[0], max(time[-1], time[0] + 1e-6)], [44, width - 12])
+    heights = base - 12 - (wrench[:, :3] - low) / (high - low) * 76
+    zero = base - 12 + low / (high - low) * 76
+    font, small = (ImageFont.load_default(size=size) for size in (13, 11))
+    pages = []
+    for t in range(len(time)):
+        page = Image.new("RGB", (width, base), "white")
+        draw = ImageDraw.Draw(page)
+        draw.text((6, 5), title, "black", small)
+        said = f"{time[t]:.2f} s, at 1/{slower:g} of its speed" + (f": {outcome}" if t == len(time) - 1 else "")
+        draw.text((6, 23), said, "black", font)
+        for column, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
+            picture = Image.fromarray(np.round(255 * np.clip(images[t], 0, 1)).astype(np.uint8))
+            page.paste(picture.resize((side, side), Image.Resampling.BICUBIC), (column * side, top))
+            draw.text((column * side + 5, top + side - 16), name, "black", small)
+        middle = np.array([1.5 * side, top + side / 2])
+        tip = middle + 0.035 * side * gravity[t, :2]
+        if np.linalg.norm(gravity[t, :2]) > 0.1:
+            along = (tip - middle) / np.linalg.norm(tip - middle)
+            barbs = [tip - 10 * along + sign * 6 * along[::-1] * [-1, 1] for sign in (-1, 1)]
+            draw.text((side + 5, top + 3), "gravity's part along the pad", "red", small)
+            draw.line([*middle, *(tip - 8 * along)], "red", 3)
+            draw.polygon([tuple(tip), *map(tuple, barbs)], "red")
+        draw.line([across[0], zero, across[-1], zero], "lightgray")
+        draw.text((4, base - 94), f"{high:.2g} N", "black", small)
+        draw.text((4, zero - 7), "0 N", "black", small)
+        for k, (name, colour) in enumerate({"Fx": "tab:blue", "Fy": "tab:orange", "Fz": "tab:green"}.items()):
+            ink = colors.to_hex(colour)
+            draw.text((width - 90 + 28 * k, 23), name, ink, small)
+            draw.line([*zip(across[: t + 1], heights[: t + 1, k], strict=True)], ink, 2)
+        pages.append(page)
+    # A GIF counts hundredths of a second.
+    step = 10 * max(round(100 * slower * float(np.mean(np.diff(time)))), 2) if len(time) > 1 else 100
+    path.parent.mkdir(parents=True, exist_ok=True)
+    durations = [step] * (len(pages) - 1) + [1500]
+    pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
 
 
 def line_up(

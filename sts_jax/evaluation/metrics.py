@@ -64,6 +64,15 @@ def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     return 2 * np.arccos(np.minimum(dot, 1))
 
 
+def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Angle between the objects' up axes, radians `(n,)` in [0, pi]: a turn about the own axis, unseen of round things,
+    does not count.
+    """
+    w, x, y, z = (np.stack([predicted, target])[..., i].astype(np.float64) for i in range(3, 7))
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], -1)
+    return np.arctan2(np.linalg.norm(np.cross(up[0], up[1]), axis=-1), (up[0] * up[1]).sum(-1))
+
+
 def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Mean over the classes that occur of the share of each that is predicted rightly."""
     w = np.ones(len(target)) if weight is None else weight

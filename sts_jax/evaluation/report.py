@@ -30,6 +30,7 @@ class Scores(NamedTuple):
     tactile_object: metrics.ImageError | None
     position: np.ndarray | None  # m (n,)
     angle: np.ndarray | None  # rad (n,)
+    axis: np.ndarray | None  # rad (n,), of the up axes
     outcome: np.ndarray | None  # int (n,)
 
 
@@ -42,7 +43,10 @@ def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndar
 
 
 def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
-    """The outcome as an image shows it: fallen off where it is empty, closer to the blank sensor than a threshold."""
+    """The outcome of freefall as an image shows it: off the pad where it is closer to the empty one than a threshold.
+
+    How a thing lies that is still on the pad is not read from images: there is no outcome of other scenarios.
+    """
     empty = emptiness(visual, blank) <= threshold
     return np.where(empty, int(physics.Outcome.FELL_OFF), int(physics.Outcome.RESTS))
 
@@ -55,11 +59,17 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
     """What can be said without learning: the mean target, the input itself, the target of the nearest input.
 
-    The neighbour is the training item whose first visual image is nearest in squared distance.
+    The neighbour is the training item whose first visual image is nearest in squared distance. With a condition, its
+    squared distance counts as much: both are divided by the training set's variance, the condition's number by number.
     """
     inputs = train.visual[:, 0].reshape(len(train.visual), -1).astype(np.float32)
     queries = test.visual[:, 0].reshape(len(test.visual), -1).astype(np.float32)
     distance = (inputs**2).sum(1) - 2 * queries @ inputs.T
+    width = train.condition.shape[1]
+    if width:
+        variance = float(((inputs - inputs.mean(0)) ** 2).sum(1).mean())
+        gap = test.condition[:, None] - train.condition[None]
+        distance = distance / variance + (gap**2 / train.condition.var(0)).sum(-1) / width
     nearest = distance.argmin(1)
     num = len(test.visual)
 
@@ -106,6 +116,7 @@ def score(predicted: Predicted, test: Pairs) -> Scores:
         images(predicted.tactile, test.tactile[:, 1], inside),
         None if pose is None else metrics.position_error(pose, test.pose[:, 1]),
         None if pose is None else metrics.geodesic_angle(pose, test.pose[:, 1]),
+        None if pose is None else metrics.axis_angle(pose, test.pose[:, 1]),
         predicted.outcome,
     )
 
@@ -157,10 +168,11 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
 
 
 # The figures of a predictor: per stream BCE and excess (nats a pixel and channel), skill over all pixels and over the
-# target's object pixels; position (m) and angle (rad) over all items and over those that stayed on the pad.
+# target's object pixels; position (m), angle and angle of the up axes (rad) over all items and over those that stayed
+# on the pad.
 FIGURES = (
     *(f"{s}_{f}{p}" for s in ("visual", "tactile") for f in ("bce", "excess", "skill") for p in ("", "_object")),
-    *("position", "position_on_pad", "angle", "angle_on_pad", "outcome_balanced_accuracy"),
+    *("position", "position_on_pad", "angle", "angle_on_pad", "axis", "axis_on_pad", "outcome_balanced_accuracy"),
 )
 
 
@@ -177,7 +189,7 @@ def _figures(s: Scores, constant: Scores, test: Pairs, stayed: np.ndarray, weigh
         out += [
             float("nan") if e is None else metrics.skill(e, r, weight) for e, r in zip(errors, references, strict=True)
         ]
-    for error in (s.position, s.angle):
+    for error in (s.position, s.angle, s.axis):
         for keep in (np.ones_like(stayed), stayed):
             w = weight * keep
             out.append(float("nan") if error is None or w.sum() == 0 else float((w * error).sum() / w.sum()))
@@ -200,6 +212,8 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
         ("on pad", "position_on_pad", 1e3, 1),
         ("angle (deg)", "angle", 180 / np.pi, 0),
         ("on pad", "angle_on_pad", 180 / np.pi, 0),
+        ("up axis (deg)", "axis", 180 / np.pi, 0),
+        ("on pad", "axis_on_pad", 180 / np.pi, 0),
         ("outcome, balanced", "outcome_balanced_accuracy", 1, 3),
     ]
     outcomes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items())
@@ -216,7 +230,7 @@ def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     for name, row in summary["predictors"].items():
         cells = [_cell(row[key], scale, digits, "skill" in key) for _, key, scale, digits in heads]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    shown = [h for h in heads if "_skill" in h[1] or h[1] in ("position", "angle")]
+    shown = [h for h in heads if "_skill" in h[1] or h[1] in ("position", "angle", "axis")]
     lines += [
         "",
         "Differences from the baselines (skill: positive is better; errors: negative is better):",

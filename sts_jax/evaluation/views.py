@@ -2,13 +2,14 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, ScalarLike
 
-from sts_jax import _math, objects, optics, physics
+from sts_jax import _math, optics, physics
 from sts_jax.dataset import render_uint8
 from sts_jax.objects import Body
 from sts_jax.sensor import Sensor
@@ -21,7 +22,13 @@ _STAND_IN = 0.1  # albedo
 
 @functools.partial(jax.jit, static_argnames=("resolution",))
 def outside(
-    body: Body, pose: Float[Array, "7"], size: Float[Array, "2"], *, resolution: tuple[int, int] = (160, 160)
+    body: Body,
+    pose: Float[Array, "7"],
+    size: Float[Array, "2"],
+    up: Float[Array, "3"] | None = None,
+    wall: ScalarLike = 0.0,
+    *,
+    resolution: tuple[int, int] = (160, 160),
 ) -> Float[Array, "h w 3"]:
     """A picture of the object and the pad from outside, three-quarter view.
 
@@ -29,6 +36,8 @@ def outside(
         body: The object.
         pose: Mesh frame in the sensor frame.
         size: Of the pad along x and y (m), `(2,)`.
+        up: The vertical in the sensor frame, of any length: the pad is shown as tilted as it is; level if not given.
+        wall: Height of a stop wall at the pad's edge of largest y (m).
         resolution: (height, width), pixels.
 
     Returns:
@@ -38,12 +47,20 @@ def outside(
     corners = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)], jnp.float32)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     box = jnp.asarray(np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), jnp.int32)
-    vertices = jnp.concatenate([_math.transform(pose, body.vertices), corners * half])
-    faces = jnp.concatenate([body.faces, box + len(body.vertices)])
+    thick = half[:2] + jnp.array([0.0, 0.003]) * (jnp.asarray(wall) > 0)
+    stop = jnp.stack(
+        [jnp.stack([x * half[0], y, z * wall]) for x in (-1, 1) for y in (half[1], thick[1]) for z in (0, 1)]
+    )
+    vertices = jnp.concatenate([_math.transform(pose, body.vertices), corners * half, stop])
+    faces = jnp.concatenate([body.faces, box + len(body.vertices), box + len(body.vertices) + 8])
     flat = jnp.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], jnp.float32)
-    flat = jnp.broadcast_to(jnp.concatenate([flat, flat])[:, None], (12, 3, 3))
+    flat = jnp.broadcast_to(jnp.tile(flat, (4, 1))[:, None], (24, 3, 3))
     normals = jnp.concatenate([body.normals @ _math.quat_matrix(pose[3:]).T, flat])
-    top = flat[..., 2:] > 0
+    top = (flat[..., 2:] > 0) & (jnp.arange(24) < 12)[:, None, None]
+    if up is not None:
+        axis, along = jnp.cross(up, jnp.array([0.0, 0.0, 1.0])), _math.norm(up)
+        level = _math.quat_from_rotvec(_math.normalize(axis) * jnp.arctan2(_math.norm(axis) / along, up[2] / along))
+        vertices, normals = (x @ _math.quat_matrix(level).T for x in (vertices, normals))
     albedo = body.colors * optics.sample_texture(body.texture, body.uv)
     albedo = jnp.concatenate([albedo, jnp.where(top, _PAD, _HOUSING)])
     return optics.photograph(
@@ -60,29 +77,27 @@ def outside(
 
 
 def stand_ins(
-    sensor: Sensor, category: np.ndarray, poses: np.ndarray, resolution: tuple[int, int]
+    sensor: Sensor, bodies: Sequence[Body], poses: np.ndarray, resolution: tuple[int, int]
 ) -> Float[np.ndarray, "n h w 3"]:
-    """What the sensor would see of a grey sample of a category at predicted poses.
+    """What the sensor would see of other objects, in grey, at predicted poses.
 
-    The sample is the same for all objects of a category, so the picture tells a pose and nothing else of an object. A
-    predicted pose lies a little in the gel or over it: the sample is drawn with its lowest point on the gel, and not
+    Where the same one stands in for all objects of a class, the picture tells a pose and nothing else of an object. A
+    predicted pose lies a little in the gel or over it: the stand-in is drawn with its lowest point on the gel, and not
     at all where the pose is one that fell off.
 
     Args:
         sensor: The sensor.
-        category: Indices into `objects.CATEGORIES`, `(n,)`.
+        bodies: The one that stands in at each pose, `n`.
         poses: Predicted, `(n, 7)`.
         resolution: (height, width), pixels.
 
     Returns:
         Images in [0, 1].
     """
-    if np.any((category < 0) | (category >= len(objects.CATEGORIES))):
-        raise ValueError(f"categories {category.tolist()}: a stand-in is one of the {len(objects.CATEGORIES)} classes")
     images = []
-    for index, where in zip(category, jnp.asarray(poses, jnp.float32), strict=True):
-        body = objects.make(jax.random.key(0), objects.CATEGORIES[index])
-        body = dataclasses.replace(body, colors=jnp.full_like(body.colors, _STAND_IN))
+    for body, where in zip(bodies, jnp.asarray(poses, jnp.float32), strict=True):
+        grey, plain = jnp.full_like(body.colors, _STAND_IN), jnp.ones_like(body.texture)
+        body = dataclasses.replace(body, colors=grey, texture=plain)
         lowest = jnp.min(_math.transform(where, body.vertices)[:, 2])
         height = jnp.where(physics.fell_off(where), -1.0, where[2] - lowest)
         pose = where.at[2].set(height)[None]

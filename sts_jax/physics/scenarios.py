@@ -69,6 +69,10 @@ Variant = Literal["default", "off", "wide-friction", "off-centre"]
 class _Common:
     """What all scenarios have."""
 
+    symmetries: ClassVar[tuple[int, ...]]  # of the square pad, under which the scenario is itself; see `dataset.turn`
+    condition_scale: ClassVar[tuple[float, ...]]  # how large (SI) each number of its condition typically is
+    outcomes: ClassVar[tuple[Outcome, ...]]  # those it knows, the most telling first
+
     rate: float
     frames: int
     fill: tuple[float, float]
@@ -77,7 +81,6 @@ class _Common:
     tilt: float
     contact: Contact
     wall: float = 0.0
-    condition_width: ClassVar[int] = 0
     must_stand: ClassVar[bool] = False
 
     @property
@@ -124,6 +127,10 @@ class Freefall(_Common):
 
     Paper, "Data Collection". Ranges are uniform.
     """
+
+    symmetries = tuple(range(8))
+    condition_scale = ()
+    outcomes = (Outcome.RESTS, Outcome.FELL_OFF)
 
     height: float = 0.05  # m, lowest point of the object above the pad in frame 0
     spread: float = 0.05  # m, radius of the disc from which the object's origin is drawn
@@ -176,6 +183,10 @@ class Perturbed(_Common):
     bottles.
     """
 
+    symmetries = tuple(range(8))
+    condition_scale = (10.0, 10.0, 0.1)  # m/s^2, m/s^2, s
+    outcomes = (Outcome.TOPPLES, Outcome.SLIDES, Outcome.STANDS, Outcome.FELL_OFF)
+
     acceleration: tuple[float, float] = (3.0, 12.0)  # m/s^2, in any direction
     duration: tuple[float, float] = (0.06, 0.12)  # s
     spread: float = 0.02  # m, radius of the disc from which the object's origin is drawn
@@ -186,7 +197,6 @@ class Perturbed(_Common):
     friction: tuple[float, float] = (0.45, 0.65)
     tilt: float = 0.0  # rad, as in `Freefall`
     contact: Contact = SLIDING
-    condition_width: ClassVar[int] = 3
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -229,6 +239,10 @@ class Inclined(_Common):
     Paper, "Data Collection"; ranges are uniform. On the slope weight tells little, and the centre of pressure tells
     where contents lie: they are frozen in any direction.
     """
+
+    symmetries = (0, 6)  # x -> -x
+    condition_scale = ()
+    outcomes = (Outcome.ROLLS, Outcome.SLIDES, Outcome.STICKS, Outcome.FELL_OFF)
 
     slope: float = math.radians(30)  # rad
     wall: float = 0.02  # m, height of the stop wall at the lower edge; 0 is none

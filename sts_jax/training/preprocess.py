@@ -16,7 +16,7 @@ from sts_jax import _math
 
 @dataclasses.dataclass(frozen=True)
 class Preprocessing:
-    """The view a model was trained on, its units of pose, and when a touch counts as one."""
+    """The view a model was trained on, its units of pose and condition, and when a touch counts as one."""
 
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object instead of the whole pad
@@ -27,6 +27,7 @@ class Preprocessing:
     mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is fed, as the paper)
     touch_threshold: float = 3 / 255  # a touch is one where a pixel differs from the blank gel by more than this
     absent: tuple[str, ...] = ()  # modalities that no training input ever had
+    condition_scale: tuple[float, ...] = ()  # SI; each number of the scenario's condition is divided by its own
 
     def __post_init__(self) -> None:
         if self.rotation not in ("matrix", "quaternion"):
@@ -57,6 +58,10 @@ class Preprocessing:
         said = jnp.any(code[..., 3:] != 0, -1, keepdims=True)
         quat = jnp.where(said, quat, jnp.array([1.0, 0, 0, 0]))
         return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
+
+    def encode_condition(self, condition: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
+        """A condition (SI units) as the networks see it."""
+        return condition / jnp.array(self.condition_scale, jnp.float32)
 
     def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:
         """Whether a tactile image shows a contact: differs somewhere from the blank gel."""
@@ -97,4 +102,5 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
     content = json.loads(json.dumps(content))
     content["resolution"] = tuple(content["resolution"])
     content["absent"] = tuple(content["absent"])
+    content["condition_scale"] = tuple(content.get("condition_scale", ()))  # older models have no condition
     return Preprocessing(**content)

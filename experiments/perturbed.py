@@ -1,0 +1,50 @@
+"""A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to what the sensor sees at rest.
+
+    python -m experiments.perturbed                    # about 15 minutes on two CPU cores
+    python -m experiments.perturbed --preset smoke     # about two minutes, for tests
+    python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours; a GPU helps
+    python -m experiments.perturbed --plan             # seconds per stage, measured on a little of each; then stops
+
+Leaves `runs/perturbed/`: config.json, dataset/, models/NAME/, metrics.json, table.md, figures/*.png. Started again on
+the same --workdir it goes on where it stopped, and touches nothing where all is done.
+"""
+
+import dataclasses
+
+from experiments import stages
+from sts_jax import dataset, physics, training
+
+BOTTLES = dataset.Collection(physics.Perturbed(), categories=("bottle",))
+DEFAULT = stages.Config(
+    collection=dataclasses.replace(BOTTLES, num_objects=240, num_per_object=4, num_full=20, seed=2),
+    training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
+    steps=(800, 400, 400, 300),
+)
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    collection=dataclasses.replace(
+        BOTTLES, num_objects=16, num_per_object=2, num_full=4, objects_per_shard=8, symmetries=False
+    ),
+    training=dataclasses.replace(DEFAULT.training, batch_size=8, log_every=2, checkpoint_every=4),
+    steps=(8, 8, 8, 8),
+)
+PAPER = stages.Config(
+    collection=dataclasses.replace(
+        BOTTLES,
+        num_objects=500,
+        num_per_object=5,  # 2,500 trajectories
+        num_full=2500,  # of about 60 frames of both streams
+        symmetries=False,
+        crop=True,
+        objects_per_shard=20,
+    ),
+    training=training.TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
+    targets="own",
+    rotation="quaternion",
+    mask_blank_touch=False,
+    splits=("trajectory", "object"),
+)
+PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
+
+if __name__ == "__main__":
+    stages.command(PRESETS, "runs/perturbed", __doc__)  # collect, train, evaluate: stages.main

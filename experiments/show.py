@@ -1,0 +1,79 @@
+"""A few trajectories to look at: each as a strip of pictures and as an animation, from outside and through the sensor.
+
+    python -m experiments.show perturbed --num 4 --out show    # about a minute on two CPU cores
+
+Writes OUT/SCENARIO-NUMBER.png and .gif, of the first objects of the scenario's default experiment with another seed.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from experiments import freefall, inclined, perturbed, stages
+from sts_jax import dataset, evaluation
+
+SCENARIOS = {
+    "freefall": freefall.DEFAULT.collection,
+    "inclined": inclined.DEFAULT.collection,
+    "perturbed": perturbed.DEFAULT.collection,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What is shown."""
+
+    scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined or perturbed
+    num: int = 4  # trajectories, each of another object
+    seed: int = 0
+    out: Path = Path("show")  # the folder
+    size: int = 128  # pixels, side of the sensor's images
+
+
+def main(config: Config) -> None:
+    """Simulate, look from both sides, draw."""
+    if config.scenario not in SCENARIOS:
+        raise ValueError(f"scenario is {config.scenario!r}: give one of {', '.join(SCENARIOS)}")
+    if config.num < 1:
+        raise ValueError(f"num is {config.num}: give at least 1")
+    sensor = sts.Sensor()
+    collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)
+    names, bodies = dataset.class_names(collection), dataset.make_bodies(collection, np.arange(config.num))
+    trajectories = sts.physics.simulate(jax.random.key(config.seed), bodies, sensor, collection.scenario)
+    for i, (name, body) in enumerate(zip(names, bodies, strict=True)):
+        one = jax.tree.map(lambda x, i=i: np.asarray(x[i]), trajectories)
+        seen = dataset.render_uint8(
+            sensor,
+            body,
+            jnp.asarray(one.pose),
+            jnp.asarray(one.wrench),
+            resolution=(config.size, config.size),
+            crop=False,
+        )
+        visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
+        view = stages.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
+        words = stages.describe(name, one._asdict(), one.hidden._asdict())
+        path = config.out / f"{config.scenario}-{i}.png"
+        evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)
+        evaluation.figures.animation(
+            path.with_suffix(".gif"),
+            one.time,
+            view,
+            visual,
+            tactile,
+            one.wrench,
+            one.gravity,
+            title=words,
+            outcome=sts.physics.Outcome(int(one.outcome)).name.lower().replace("_", " "),
+        )
+        print(f"{path.with_suffix('')}: {words}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))

@@ -1,0 +1,116 @@
+"""The jerked pad through the whole line at the smallest size; and what is shown of it."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import sts_jax as sts
+from experiments import inclined, perturbed, show, stages
+from sts_jax import dataset, physics
+
+TINY = dataclasses.replace(
+    perturbed.SMOKE,
+    collection=dataclasses.replace(
+        perturbed.SMOKE.collection,
+        scenario=physics.Perturbed(frames=6),
+        num_objects=10,
+        num_per_object=1,
+        num_full=1,
+        symmetries=True,
+    ),
+    steps=(2, 2),
+    training=dataclasses.replace(perturbed.SMOKE.training, batch_size=4, checkpoint_every=2),
+    num_shown=2,
+)
+
+
+@pytest.fixture(scope="module")
+def workdir(tmp_path_factory):
+    workdir = tmp_path_factory.mktemp("runs") / "perturbed"
+    with pytest.MonkeyPatch.context() as patch:  # each model is a minute of compilation
+        patch.setattr(stages, "MODELS", {name: stages.MODELS[name] for name in ("mvae", "vae-visual")})
+        stages.main(TINY, workdir)
+    return workdir
+
+
+def test_touch_is_there_and_every_subset_is_asked(workdir):
+    predictors = json.loads((workdir / "metrics.json").read_text())["predictors"]
+    given = {name.removeprefix("MVAE with pose, ") for name in predictors if name.startswith("MVAE with pose")}
+    inputs = ("visual", "tactile", "pose")
+    pairs = ("visual and tactile", "visual and pose", "tactile and pose")
+    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs")}
+    assert predictors["MVAE with pose, from tactile"]["outcome_balanced_accuracy"]["value"] >= 0
+    assert predictors["VAE visual only, from visual"]["outcome_balanced_accuracy"] is None
+    lines = (workdir / "table.md").read_text().splitlines()
+    assert next(line for line in lines if line.startswith("| VAE visual only")).endswith("| - |")
+    assert {path.name for path in (workdir / "figures").glob("*.png")} == {
+        f"{name}.png" for name in ("predictions", "training", "strip", "line_up")
+    }
+
+
+def test_pairs_have_the_condition_turned_like_the_pose(workdir):
+    data = dataset.load(workdir / "dataset")
+    pairs = data.pairs(np.array([1, 0]), symmetries=True)
+    assert pairs.condition.shape == (16, 3)
+    assert pairs.condition.dtype == np.float32
+    np.testing.assert_array_equal(data.pairs(np.array([1, 0])).condition, data.trajectory["condition"][[1, 0]])
+    np.testing.assert_array_equal(pairs.condition[[0, 8]], data.trajectory["condition"][[1, 0]])
+    # The angle from where it stands to where the pad goes stays, but for its sign in a mirror.
+    place, along = (x[..., 0] + 1j * x[..., 1] for x in (pairs.pose[:, 0], pairs.condition))
+    angle = np.angle(along / place).reshape(2, 2, 4)
+    np.testing.assert_allclose(angle[:, 0], np.tile(angle[:, 0, :1], 4), atol=1e-3)
+    np.testing.assert_allclose(angle[:, 1], np.tile(-angle[:, 0, :1], 4), atol=1e-3)
+    assert len(np.unique(np.round(np.angle(along[:8]), 3))) == 8
+
+
+def test_a_model_answers_a_jerk_in_si_units(workdir):
+    data = dataset.load(workdir / "dataset")
+    pairs = data.pairs(np.array([0]))
+    predictor = sts.Predictor.load(workdir / "models/mvae")
+    assert predictor.preprocessing.condition_scale == physics.Perturbed.condition_scale
+    out = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition)
+    other = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition * [-1, -1, 1])
+    assert np.abs(out.pose - other.pose).max() > 1e-4
+    with pytest.raises(ValueError, match=r"condition has shape None; .* needs \(1, 3\)"):
+        predictor(tactile=pairs.tactile[:, 0] / 255)
+
+
+def test_the_slopes_presets_have_the_papers_counts():
+    default, paper = inclined.DEFAULT.collection, inclined.PAPER.collection
+    assert set(dataset.class_names(default)) == set(sts.objects.CATEGORIES)
+    assert len(dataset.split_objects(default)["test"]) >= 24
+    assert (paper.num_trajectories, paper.num_objects, paper.scenario.frames) == (2400, 480, 60)
+    assert (paper.num_full, paper.crop, paper.symmetries) == (2400, True, False)
+
+
+def test_presets_hold_out_what_they_should():
+    default, paper = perturbed.DEFAULT.collection, perturbed.PAPER.collection
+    assert set(dataset.class_names(default)) == set(dataset.class_names(paper)) == {"bottle"}
+    assert default.num_objects >= 120
+    assert len(dataset.split_objects(default)["test"]) >= 24
+    assert (paper.num_trajectories, paper.num_objects, paper.scenario.frames) == (2500, 500, 60)
+    assert (paper.num_full, paper.crop, paper.symmetries) == (2500, True, False)
+    assert len(dataset.split_objects(paper)["test"]) >= 60
+    assert (perturbed.PAPER.targets, perturbed.PAPER.splits[0]) == ("own", "trajectory")
+
+
+def test_what_is_shown_is_a_strip_and_an_animation(tmp_path, monkeypatch):
+    short = dataclasses.replace(perturbed.DEFAULT.collection, scenario=physics.Perturbed(frames=4))
+    monkeypatch.setitem(show.SCENARIOS, "perturbed", short)
+    show.main(show.Config("perturbed", num=1, out=tmp_path, size=32))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["perturbed-0.gif", "perturbed-0.png"]
+    with Image.open(tmp_path / "perturbed-0.gif") as film:
+        assert film.n_frames == 4
+        first = np.asarray(film.convert("RGB")).astype(int)
+        film.seek(2)
+        later = np.asarray(film.convert("RGB")).astype(int)
+
+    def red(page):
+        return int(((page[..., 0] > 200) & (page[..., 1:].max(-1) < 60)).sum())
+
+    assert red(later) > red(first) + 50  # the jerk is on
+    with pytest.raises(ValueError, match="give one of freefall, inclined, perturbed"):
+        show.main(show.Config("sideways", out=tmp_path))
