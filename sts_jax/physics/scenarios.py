@@ -90,13 +90,20 @@ class _Common:
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
         """Draws the hidden values of one trajectory; consumes `key`."""
-        *keys, high, around = jax.random.split(key, 5)
-        ranges = (self.fill, self.shell_scale, self.friction)
-        values = (jax.random.uniform(k, (), minval=a, maxval=b) for k, (a, b) in zip(keys, ranges, strict=True))
-        z = jax.random.uniform(high, minval=math.cos(self.tilt), maxval=1.0)
-        angle = jax.random.uniform(around, maxval=2 * jnp.pi)
+        fill, shell, friction, high, around = jax.random.split(key, 5)
+
+        def draw(key: PRNGKeyArray, limits: tuple[float, float]) -> Float[Array, ""]:
+            return jax.random.uniform(key, minval=limits[0], maxval=limits[1])
+
+        z = draw(high, (math.cos(self.tilt), 1.0))
+        angle = draw(around, (0.0, 2 * math.pi))
         radius = jnp.sqrt(jnp.maximum(1 - z**2, 0))
-        return Hidden(*values, jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]))
+        return Hidden(
+            fill=draw(fill, self.fill),
+            shell_scale=draw(shell, self.shell_scale),
+            friction=draw(friction, self.friction),
+            up=jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]),
+        )
 
     def check(self) -> None:
         """Insists on values that can be simulated.
