@@ -350,7 +350,7 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
         spent: dict[str, list[float]] = {"trajectories": [], "frames": []}
         for seed in (0, 1):
             little = dataclasses.replace(
-                collection, num_objects=many, num_per_object=num // many, num_full=0, symmetries=True, seed=seed
+                dataset.head(collection, many), num_per_object=num // many, num_full=0, symmetries=True, seed=seed
             )
             stamps = {"start": time.perf_counter()}
 
@@ -376,9 +376,7 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
             )
 
         data = dataset.load(Path(name) / "0")
-        tiny = dataclasses.replace(
-            config, collection=dataclasses.replace(collection, num_objects=many), splits=("trajectory",)
-        )
+        tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",))
         pairs = data.pairs(np.arange(num), symmetries=True)
         blank = empty_frame(sensor, collection)
         share = 0.7 if config.splits[0] == "object" else 0.8

@@ -7,6 +7,7 @@ from sts_jax.dataset.collect import Progress as Progress
 from sts_jax.dataset.collect import claim as claim
 from sts_jax.dataset.collect import class_names as class_names
 from sts_jax.dataset.collect import collect as collect
+from sts_jax.dataset.collect import head as head
 from sts_jax.dataset.collect import make_bodies as make_bodies
 from sts_jax.dataset.collect import render_uint8 as render_uint8
 from sts_jax.dataset.collect import sample_of_class as sample_of_class
@@ -33,6 +34,7 @@ __all__ = [
     "claim",
     "class_names",
     "collect",
+    "head",
     "load",
     "make_bodies",
     "render_uint8",

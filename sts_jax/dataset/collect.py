@@ -145,14 +145,22 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
     return [objects.decompose(body) if objects.gaps(body)[1] > objects.HOLLOW else body for body in bodies]
 
 
+def head(collection: Collection, count: int) -> Collection:
+    """The collection of the first objects only."""
+    meshes = collection.meshes
+    if meshes is None:
+        return dataclasses.replace(collection, num_objects=count)
+    few = dataclasses.replace(meshes, names=meshes.names[:count], labels=meshes.labels[:count])
+    return dataclasses.replace(collection, meshes=few, num_objects=len(few.names))
+
+
 def sample_of_class(collection: Collection, name: str) -> objects.Body:
     """Some object of a class: of the procedural ones the same for all collections, it may stand in for any of them."""
-    if name not in class_names(collection):
-        raise ValueError(
-            f"no object of the collection is a {name!r}: its classes are {', '.join(sorted(set(class_names(collection))))}"
-        )
+    names = class_names(collection)
+    if name not in names:
+        raise ValueError(f"no object of the collection is a {name!r}: its classes are {', '.join(sorted(set(names)))}")
     if collection.meshes is not None:
-        return make_bodies(collection, np.array([class_names(collection).index(name)]))[0]
+        return make_bodies(collection, np.array([names.index(name)]))[0]
     return objects.make(jax.random.key(0), name)
 
 
