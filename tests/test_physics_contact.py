@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sts_jax import _math, physics
-from sts_jax.physics import contact, scene
+from sts_jax.physics import contact, roll, scene
 
 PAD = (0.15, 0.15)
 HALF = jnp.array([0.075, 0.075])
@@ -123,3 +123,46 @@ def test_padding_changes_nothing() -> None:
 def test_flat_points_are_refused() -> None:
     with pytest.raises(ValueError, match="no volume"):
         contact.hull(np.random.default_rng(0).normal(size=(1, 32, 3)) * [1, 1, 0])
+
+
+def test_parts_leave_free_what_their_common_hull_fills() -> None:
+    # An arch of two posts and a beam straddles the stop wall: only the beam, 5 mm above it, keeps it from the wall.
+    def box(centre: list[float], size: list[float]) -> np.ndarray:
+        grid = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]), -1).reshape(-1, 3) * size + centre
+        return np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])
+
+    parts = np.stack(
+        [box([0, y, 0], [0.03, 0.01, 0.05]) for y in (-0.02, 0.02)] + [box([0, 0, 0.025], [0.03, 0.05, 0.01])]
+    )
+    _, model, _ = scene.template(PAD, physics.Contact(), 0.02)
+    pose = jnp.array([0, 0.08, 0.0249, 1, 0, 0, 0])
+    arch, filled = (jax.tree.map(jnp.asarray, contact.hull(x)) for x in (parts, parts.reshape(1, -1, 3)))
+    found = roll._contacts(model, arch, pose)
+    assert np.all(found.dist[8:] > 0)
+    assert np.sum(found.dist[:8] < 0) == 4  # the post that stands on the pad; the other is beyond it
+    np.testing.assert_allclose(found.dist[:8].min(), -1e-4, atol=1e-6)
+    assert np.all(found.pos[:8][np.asarray(found.dist[:8] < 0), 1] < 0.066)
+    assert np.min(roll._contacts(model, filled, pose).dist[8:]) < -0.004
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.4, -0.4])
+def test_what_lies_across_the_wall_is_held_by_it_as_in_c(lean: float) -> None:
+    grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.01, 0.05, 0.004]
+    rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])[None]
+    model = scene.compile_scene(rod, PAD, physics.Contact(), 0.02)
+    data = mujoco.MjData(model)
+    quat = np.array([np.cos(lean / 2), np.sin(lean / 2), 0, 0])
+    low, high = 0.02, 0.06  # the height at which it is pushed 0.2 mm into the wall
+    for _ in range(40):
+        middle = (low + high) / 2
+        deep = in_c(model, data, np.array([0.01, 0.082, middle, *quat]))[0] < -2e-4
+        low, high = (middle, high) if deep else (low, middle)
+    pose = np.array([0.01, 0.082, low, *quat])
+    dist, normal, pos = in_c(model, data, pose)
+    _, ours, _ = scene.template(PAD, physics.Contact(), 0.02)
+    found = roll._contacts(ours, jax.tree.map(jnp.asarray, contact.hull(rod)), jnp.asarray(pose, jnp.float32))
+    deepest = int(jnp.argmin(found.dist))
+    np.testing.assert_allclose(found.dist[deepest], dist, atol=2e-6)
+    np.testing.assert_allclose(abs(found.frame[deepest, 0] @ normal), 1, atol=1e-3)
+    assert abs(found.pos[deepest, 1] - pos[1]) < (0.011 if lean == 0 else 1e-3)
+    assert 8 <= deepest < 12

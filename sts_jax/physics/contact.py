@@ -89,8 +89,9 @@ def _rim(ends: Float[Array, "e 2 3"], half: Float[Array, "2"], axis: int, sign: 
     share = out[:, 0] / jnp.where(out[:, 0] == out[:, 1], 1.0, out[:, 0] - out[:, 1])
     crosses = out[:, 0] * out[:, 1] < 0
     point = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
-    # The edge ends above the pad, or inside it nearer to the top than to a side: it came through the top.
+    # The edge ends above the box, or inside it nearer to the top than to a side, or beyond it: it came through the top.
     through_top = -inner[:, 2] <= jnp.maximum(0, jnp.min(half - jnp.abs(inner[:, :2]), axis=1))
+    through_top |= sign * inner[:, axis] < -half[axis]
     rim = jnp.zeros(3).at[1 - axis].set(1.0)
     normal = _math.normalize(jnp.cross(ends[:, 1] - ends[:, 0], rim))
     normal = jnp.where(normal[:, 2:] < 0, -normal, normal)

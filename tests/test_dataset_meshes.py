@@ -1,0 +1,101 @@
+"""Collections of mesh files: what is used, what is left out and said, and that nothing stops them."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import sts_jax as sts
+from sts_jax import dataset, physics
+
+SCENARIO = physics.Perturbed(frames=3)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three boxes, three cans, a leaning one that falls over by itself, a torn file."""
+    for i in range(3):
+        for label, mesh in (
+            ("box", trimesh.creation.box((0.03 + 0.01 * i, 0.04, 0.05))),
+            ("can", trimesh.creation.cylinder(0.02 + 0.005 * i, 0.06, sections=12)),
+        ):
+            (tmp_path / label).mkdir(exist_ok=True)
+            mesh.export(tmp_path / label / f"{i}.stl")
+    leaning = trimesh.creation.box((0.02, 0.02, 0.08))
+    leaning.vertices[:, 0] += 0.8 * leaning.vertices[:, 2]
+    leaning.export(tmp_path / "can" / "leaning.stl")
+    (tmp_path / "box" / "torn.stl").write_bytes((tmp_path / "box" / "0.stl").read_bytes()[:200])
+    return tmp_path
+
+
+def collection(meshes: dataset.Meshes) -> dataset.Collection:
+    return dataset.Collection(
+        SCENARIO, meshes=meshes, num_objects=6, num_per_object=1, num_full=0, symmetries=False, objects_per_shard=3
+    )
+
+
+def test_what_can_be_used_is_collected_and_the_rest_is_said(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+    said: list[str] = []
+    meshes, listing = dataset.survey_meshes(folder, SCENARIO, progress=said.append)
+    assert meshes.names == tuple(f"{label}/{i}.stl" for label in ("box", "can") for i in range(3))
+    assert meshes.labels == ("box",) * 3 + ("can",) * 3
+    assert "box/torn.stl" in listing
+    assert "can/leaning.stl: left out of Perturbed: it does not stand upright" in listing
+    assert len(said) == 8
+    on_slope, _ = dataset.survey_meshes(folder, physics.Inclined())
+    assert "can/leaning.stl" in on_slope.names
+
+    one = collection(meshes)
+    assert dataset.class_names(one) == meshes.labels
+    bodies = dataset.make_bodies(one, np.array([2, 4]))
+    np.testing.assert_allclose(np.ptp(bodies[0].vertices, axis=0), [0.05, 0.04, 0.05], atol=1e-6)
+    np.testing.assert_allclose(np.ptp(bodies[1].vertices, axis=0)[2], 0.06, atol=1e-6)
+    made = dataset.collect(one, sts.Sensor(), tmp_path_factory.mktemp("out") / "dataset")
+    assert made == dataset.Collected(0, ())
+    sample = dataset.sample_of_class(one, "can")
+    np.testing.assert_array_equal(sample.vertices, dataset.make_bodies(one, np.array([3]))[0].vertices)
+    assert dataset.class_names(dataset.head(one, 2)) == ("box", "box")
+
+    (folder / "box" / "1.stl").write_bytes((folder / "box" / "2.stl").read_bytes())
+    assert dataset.survey_meshes(folder, SCENARIO)[0].digest != meshes.digest
+
+
+def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_go_on(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+):
+    one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
+    simulate = physics.simulate
+
+    def stumbles(key, bodies, *args, **kwargs):
+        for index, body in enumerate(bodies):
+            if np.ptp(body.vertices[:, 0]) == pytest.approx(0.04) and np.ptp(body.vertices[:, 2]) < 0.055:
+                raise physics.BodyError(index, "trajectory 0 is non-finite")
+        return simulate(key, bodies, *args, **kwargs)
+
+    monkeypatch.setattr(physics, "simulate", stumbles)
+    out = tmp_path_factory.mktemp("out") / "dataset"
+    made = dataset.collect(one, sts.Sensor(), out)
+    assert made.left_out == ("object 1 (box/1.stl): trajectory 0 is non-finite",)
+    data = dataset.load(out)
+    np.testing.assert_array_equal(data.trajectory["body"], [0, 2, 3, 4, 5])
+    pairs = data.pairs(np.arange(5))
+    for row, number in enumerate(data.trajectory["body"]):
+        body = dataset.make_bodies(one, np.array([number]))[0]
+        shown = dataset.render_uint8(
+            sts.Sensor(), body, pairs.pose[row, :1], data.trajectory["wrench"][row, :1], resolution=(64, 64), crop=False
+        )
+        assert np.mean(np.asarray(shown[0][0]) != pairs.visual[row, 0]) < 0.01
+
+
+def test_a_folder_of_nothing_and_a_wrong_number_are_named(folder: Path, tmp_path: Path):
+    for path in folder.rglob("*.stl"):
+        if "leaning" not in path.name:
+            path.unlink()
+    with pytest.raises(ValueError, match=r"(?s)no object that can be used.*does not stand upright"):
+        dataset.survey_meshes(folder, SCENARIO)
+    meshes = dataset.Meshes(str(folder), ("a.stl",) * 5, ("a",) * 5, "")
+    wrong = dataclasses.replace(collection(meshes), num_objects=4)
+    with pytest.raises(ValueError, match="num_objects=4, but meshes has 5"):
+        dataset.collect(wrong, sts.Sensor(), tmp_path / "out")
