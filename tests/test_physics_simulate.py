@@ -278,7 +278,7 @@ def test_progress_and_resampling(
     assert done[-1] == NUM
     monkeypatch.setattr(module, "SUNK_LIMIT", 0.0)
     monkeypatch.setattr(module, "ATTEMPTS", 1)
-    with pytest.raises(ValueError, match=r"body 0, trajectory 0: .* in 1 draws"):
+    with pytest.raises(ValueError, match=r"body 0: trajectory 0 is .* in 1 draws"):
         physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24)
 
 

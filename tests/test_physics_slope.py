@@ -229,5 +229,5 @@ def test_what_does_not_stand_is_refused_by_name(bodies: list[objects.Body]) -> N
     turned = dataclasses.replace(bodies[0], hulls=bodies[0].hulls[..., ::-1], shell_com=bodies[0].shell_com[::-1])
     leaning = jnp.asarray(bodies[0].hulls) + bodies[0].hulls[..., 2:] * jnp.array([1.5, 0, 0])
     for body in (dataclasses.replace(bodies[0], hulls=leaning), dataclasses.replace(turned, hulls=leaning)):
-        with pytest.raises(ValueError, match="body 1: does not stand upright"):
+        with pytest.raises(ValueError, match="body 1: it does not stand upright"):
             physics.simulate(jax.random.key(0), [bodies[0], body], Sensor(), physics.Perturbed())
