@@ -1,0 +1,146 @@
+"""Endurance: what becomes of very many trajectories of each scenario.
+
+    python -m benchmarks.soak                            # 30,000 trajectories: about two hours on two cores
+    python -m benchmarks.soak --num 300 --only inclined  # about a minute
+
+A new object every eight trajectories: of all classes in turn, bottles under a jerk. Counts the draws that were thrown
+away (non-finite, or deeper in the pad than the limit), outcomes, what had not settled, and holds the wrench at rest
+against the weight, and the energy out of contact against the start's. Done in blocks that `--keep` keeps in a folder:
+started again it goes on where it stopped.
+"""
+
+import argparse
+import functools
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from sts_jax import _math, objects, physics
+from sts_jax.physics.scenarios import G
+from sts_jax.physics.simulate import SUNK_LIMIT
+from sts_jax.sensor import Sensor
+
+SCENARIOS: dict[str, physics.Scenario] = {
+    "freefall": physics.Freefall(),
+    "inclined": physics.Inclined(),
+    "perturbed": physics.Perturbed(),
+}
+NUM = 8  # trajectories of an object
+BLOCK = 504  # trajectories simulated by one call
+
+
+def excess_energy(
+    rigid: tuple[np.ndarray, np.ndarray, np.ndarray], pose: np.ndarray, velocity: np.ndarray, gravity: np.ndarray
+) -> np.ndarray:
+    """Kinetic and potential energy of each frame less the first one's, in units of the weight times 50 mm.
+
+    Args:
+        rigid: mass (n,), centre of mass (n, 3), inertia (n, 3, 3).
+        pose: (n, f, 7).
+        velocity: (n, f, 6).
+        gravity: (3,) m/s^2, constant.
+    """
+    mass, com, inertia = (np.asarray(x, np.float64) for x in rigid)
+    rotation = np.asarray(_math.quat_matrix(jnp.asarray(pose[..., 3:])), np.float64)
+    arm = np.einsum("nfij,nj->nfi", rotation, com)
+    turn = np.einsum("nfji,nfj->nfi", rotation, velocity[..., 3:])
+    speed = velocity[..., :3] + np.cross(velocity[..., 3:], arm)
+    kinetic = 0.5 * mass[:, None] * (speed**2).sum(-1) + 0.5 * np.einsum("nfi,nij,nfj->nf", turn, inertia, turn)
+    energy = kinetic - mass[:, None] * ((pose[..., :3] + arm) @ gravity)
+    return (energy - energy[:, :1]) / (mass[:, None] * np.linalg.norm(gravity) * 0.05)
+
+
+def block(name: str, index: int, count: int) -> dict[str, np.ndarray]:
+    """What became of one block of trajectories."""
+    scenario = SCENARIOS[name]
+    first = index * BLOCK // NUM
+    classes = ("bottle",) if name == "perturbed" else objects.CATEGORIES
+    numbers = np.arange(first, first + -(-count // NUM))
+    items = [objects.make(jax.random.key(int(i)), classes[i % len(classes)]) for i in numbers]
+    key = jax.random.fold_in(jax.random.key(1), index)
+    traj = jax.tree.map(np.asarray, physics.simulate(key, items, Sensor(), scenario, NUM))
+    rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
+    parts = []
+    for number, body in enumerate(items):
+        own = jax.tree.map(lambda x, mine=traj.body == number: x[mine], traj.hidden)
+        parts.append(rigid(body, own.fill, own.shell_scale, own.up))
+    mass, com, inertia = (np.concatenate(x) for x in zip(*parts, strict=True))
+    fell = traj.outcome == physics.Outcome.FELL_OFF
+    gravity = traj.gravity[0, -1].astype(np.float64)
+    carried = -(mass[:, None] * gravity)
+    error = np.linalg.norm(traj.wrench[:, -1, :3] - carried, axis=1) / (mass * G)
+    at_rest = traj.settled & ~fell & ~traj.wall[:, -1]
+    free = excess_energy((mass, com, inertia), traj.pose, traj.velocity, gravity)
+    out_of_contact = ~traj.contact & ~traj.wall & ~fell[:, None]
+    return {
+        "category": np.array([int(items[b].category) for b in traj.body]),
+        "outcome": traj.outcome,
+        "settled": traj.settled,
+        "resampled": traj.resampled,
+        "sunk": traj.sunk,
+        "touches": traj.touches,
+        "wrench_error": np.where(at_rest, error, np.nan),
+        "excess": np.where(out_of_contact, free, -np.inf).max(1) if name != "perturbed" else np.full(len(fell), np.nan),
+    }
+
+
+def report(name: str, found: dict[str, np.ndarray]) -> str:
+    """The figures of one scenario, as lines."""
+    outcome = found["outcome"]
+    shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}
+    lines = [
+        f"{name}: {len(outcome)} trajectories",
+        f"    drawn again (non-finite or deeper than {1e3 * SUNK_LIMIT:.0f} mm)  {found['resampled'].sum()}",
+        f"    deepest: median {1e3 * np.median(found['sunk']):.2f} mm, largest {1e3 * found['sunk'].max():.2f} mm",
+        "    " + ", ".join(f"{key} {100 * share:.1f} %" for key, share in shares.items()),
+        f"    unsettled {100 * np.mean(~found['settled']):.2f} %",
+        f"    touch, part and touch again {100 * np.mean(found['touches'] >= 2):.1f} %",
+        f"    wrench at rest against the weight: error median {100 * np.nanmedian(found['wrench_error']):.3f} %, "
+        f"99 % below {100 * np.nanquantile(found['wrench_error'], 0.99):.2f} %",
+    ]
+    if np.isfinite(found["excess"]).any():
+        lines.append(
+            f"    energy out of contact above the start's: largest {100 * found['excess'].max():.3f} % of the weight "
+            "times 50 mm"
+        )
+    for index in np.unique(found["category"]):
+        own = found["category"] == index
+        lines.append(f"        {objects.CATEGORIES[index]:9s} unsettled {100 * np.mean(~found['settled'][own]):5.2f} %")
+    return "\n".join(lines)
+
+
+def main(num: int, names: list[str], keep: Path) -> None:
+    """All blocks that are not kept yet, then the figures."""
+    for name in names:
+        parts = []
+        for index in tqdm(range(-(-num // BLOCK)), unit="block", desc=name):
+            count = min(BLOCK, num - index * BLOCK)
+            path = keep / f"{name}-{index:04d}-{count}.npz"
+            if not path.exists():
+                found = block(name, index, count)
+                keep.mkdir(parents=True, exist_ok=True)
+                whole = path.with_suffix(".part")
+                with whole.open("wb") as file:
+                    np.savez(file, **found)  # type: ignore[arg-type]
+                whole.rename(path)
+            with np.load(path) as kept:
+                parts.append(dict(kept))
+        print(report(name, {field: np.concatenate([p[field] for p in parts])[:num] for field in parts[0]}), flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--num", type=int, default=10_000, help="trajectories of each scenario")
+    parser.add_argument("--only", choices=list(SCENARIOS), help="one scenario instead of all")
+    parser.add_argument("--keep", type=Path, help="folder that keeps finished blocks")
+    arguments = parser.parse_args()
+    run = functools.partial(main, arguments.num, [arguments.only] if arguments.only else list(SCENARIOS))
+    if arguments.keep is None:
+        with tempfile.TemporaryDirectory() as folder:
+            run(Path(folder))
+    else:
+        run(arguments.keep)
