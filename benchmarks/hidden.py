@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import classify, reader
-from sts_jax import dataset, objects, physics
+from sts_jax import _math, dataset, objects, physics
 from sts_jax.physics import Outcome
 from sts_jax.physics.scenarios import G
 from sts_jax.sensor import Sensor
@@ -65,18 +65,18 @@ class Study:
     """One scenario: what is asked of it."""
 
     scenario: physics.Scenario
-    category: str
+    categories: tuple[str, ...]  # of the objects, in turn
     outcomes: tuple[Outcome, ...]
     reroll: tuple[str, ...]  # hidden values that are drawn again
-    touch: Callable[[Starts], np.ndarray]  # (n, k) what touch tells, exactly
+    touch: Callable[[Starts], np.ndarray]  # (n, k) what touch tells, exactly; nan where nothing touches
     noise: float  # standard deviation of each column of it
     noise_name: str
-    features: Callable[[Sight, Starts, np.ndarray | None], np.ndarray]  # of the classifier, without or with touch
+    features: Callable[[list[objects.Body], Starts, np.ndarray | None], np.ndarray]  # without or with touch
 
 
-def bodies(category: str, count: int, first: int = 0) -> list[objects.Body]:
-    """Objects of one family, each from a key of its own."""
-    return [objects.make(jax.random.key(first + i), category) for i in range(count)]
+def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
+    """Objects of some families in turn, each from a key of its own."""
+    return [objects.make(jax.random.key(first + i), categories[i % len(categories)]) for i in range(count)]
 
 
 @jax.jit
@@ -192,8 +192,9 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
     return np.stack([push * height / (G * base), np.log(np.clip(over, 1e-3, 50))], 1)
 
 
-def shaken(seen: Sight, starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Features of a jerked start; `touch` (n, 1) is the logarithm of the weight's mass."""
+def shaken(items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
+    """Features of a jerked start of lathed things; `touch` (n, 1) is the logarithm of the weight's mass."""
+    seen = sight(items)
     friction = float(np.mean(physics.Perturbed().friction))
     place, push = canonical(starts.pose, starts.condition)
     time, size = starts.condition[:, 2], np.linalg.norm(push, axis=1)
@@ -213,16 +214,53 @@ def shaken(seen: Sight, starts: Starts, touch: np.ndarray | None) -> np.ndarray:
     return np.concatenate(columns, 1)
 
 
+def laid(items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
+    """Features of a start on the slope, of things of any shape; `touch` (n, 2) is the centre of pressure."""
+    rows = []
+    turns = np.asarray(jax.vmap(_math.quat_matrix)(jnp.asarray(starts.pose[:, 3:])))
+    for index, pose, rotation in zip(starts.body, starts.pose, turns, strict=True):
+        body = items[index]
+        points = np.asarray(body.vertices)[np.unique(np.asarray(body.faces))] @ rotation.T
+        low, high = points.min(0), points.max(0)
+        near = points[points[:, 2] < low[2] + 0.001, :2]
+        base = [near.min(0), near.max(0), near.mean(0)]  # what it stands on, seen from its origin
+        rows.append(np.concatenate([pose[:3], rotation.ravel(), low, high, *base, rotation @ body.shell_com]))
+    columns = [np.array(rows)]
+    columns += [
+        np.stack([[int(items[i].category), items[i].shell_mass, items[i].contents_density] for i in starts.body])
+    ]
+    if touch is not None:
+        place = touch - starts.pose[:, :2]
+        columns += [place, place - columns[0][:, 18:20], columns[0][:, 20:22] - place, place - columns[0][:, -3:-1]]
+    return np.concatenate(columns, 1)
+
+
+def pressed(starts: Starts) -> np.ndarray:
+    """Centre of pressure (n, 2) in m, nan without contact: of the normal force, where `-My / Fz, Mx / Fz` lie."""
+    force = np.where(starts.wrench[:, 2] > 0, starts.wrench[:, 2], np.nan)
+    return np.stack([-starts.wrench[:, 4], starts.wrench[:, 3]], 1) / force[:, None]
+
+
 STUDIES = {
     "perturbed": Study(
         scenario=physics.Perturbed(),
-        category="bottle",
+        categories=("bottle",),
         outcomes=(Outcome.STANDS, Outcome.SLIDES, Outcome.TOPPLES, Outcome.FELL_OFF),
         reroll=("fill",),
         touch=lambda starts: np.log(starts.mass)[:, None],
         noise=0.05,
         noise_name="weight to 5 %",
         features=shaken,
+    ),
+    "inclined": Study(
+        scenario=physics.Inclined(),
+        categories=objects.CATEGORIES,
+        outcomes=(Outcome.STICKS, Outcome.SLIDES, Outcome.ROLLS, Outcome.FELL_OFF),
+        reroll=("fill", "up"),
+        touch=pressed,
+        noise=0.001,
+        noise_name="pressure to 1 mm",
+        features=laid,
     ),
 }
 
@@ -242,27 +280,27 @@ def outcomes(study: Study, starts: Starts) -> None:
     print(f"{'another fill, another outcome':30s} {figure} ({len(changed)} starts)", flush=True)
 
 
-def losses(study: Study, seen: Sight, starts: Starts, touch: np.ndarray | None) -> np.ndarray:
+def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
     """Log loss of each start's outcome, of a classifier without or with touch."""
     label = np.searchsorted(np.sort(study.outcomes), starts.outcome)
-    return classify.log_loss(classify.chances(study.features(seen, starts, touch), label, starts.body), label)
+    return classify.log_loss(classify.chances(study.features(items, starts, touch), label, starts.body), label)
 
 
-def gains(study: Study, seen: Sight, starts: Starts, read: np.ndarray | None) -> None:
+def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
     """Prints what the classifiers lose on true states and, where a network `read` touch in pictures, with that."""
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
     interval = functools.partial(classify.interval, groups=starts.body)
     share = np.array([np.mean(starts.outcome == outcome) for outcome in study.outcomes])
-    before, after = losses(study, seen, starts, None), losses(study, seen, starts, rough)
+    before, after = losses(study, items, starts, None), losses(study, items, starts, rough)
     print(f"{'log loss: constant':30s} {-(share * np.log(share)).sum():.3f}")
     print(f"{'log loss: vision':30s} {interval(np.mean, before)}")
     print(f"{'log loss: ' + study.noise_name:30s} {interval(np.mean, after)}")
     print(f"{'gain: ' + study.noise_name:30s} {interval(classify.gain, before, after)}", flush=True)
     if read is None:
         return
-    seen_too = losses(study, seen, starts, read)
-    error = np.sqrt(np.mean((read - exact) ** 2, 0))
+    seen_too = losses(study, items, starts, read)
+    error = np.sqrt(np.nanmean((read - exact) ** 2, 0))
     print(f"{'read in the tactile frame':30s} rms error {' '.join(f'{e:.4g}' for e in error)}")
     print(f"{'gain: pictures':30s} {interval(classify.gain, before, seen_too)}")
     print(f"{'share of the gain kept':30s} {interval(classify.kept, before, after, seen_too)}", flush=True)
@@ -311,22 +349,28 @@ def main(parts: set[str], name: str, counts: tuple[int, int, int, int], steps: i
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         dataset.claim(folder / f"{name}.json", {"scenario": repr(study.scenario), "counts": counts})
-    items = bodies(study.category, num_objects)
+    items = bodies(study.categories, num_objects)
     starts = kept(folder, name, lambda: roll(study, items, num, again, 0))
-    print(f"{study.scenario}\n{len(starts.body)} starts of {num_objects} objects ({study.category})", flush=True)
+    print(
+        f"{study.scenario}\n{len(starts.body)} starts of {num_objects} objects ({', '.join(study.categories)})",
+        flush=True,
+    )
     if "outcomes" in parts:
         outcomes(study, starts)
     read, tactile = None, np.zeros(0)
     still = dataclasses.replace(study, scenario=dataclasses.replace(study.scenario, frames=1))
     if parts & {"pictures", "fill"}:
-        rest = bodies(study.category, others, OTHERS)
+        rest = bodies(study.categories, others, OTHERS)
         learned = roll(still, rest, num, 0, 1)
         _, examples = draw(rest, learned.body, learned.pose, learned.wrench)
         _, tactile = draw(items, starts.body, starts.pose, starts.wrench)
     if "pictures" in parts:
-        read = reader.fit(jax.random.key(0), examples, study.touch(learned), steps=steps)(tactile)
+        told = study.touch(learned)
+        known = np.isfinite(told).all(1)
+        read = reader.fit(jax.random.key(0), examples[known], told[known], steps=steps)(tactile)
+        read = np.where(np.isfinite(study.touch(starts)), read, np.nan)  # an untouched skin is known as such
     if parts & {"truth", "pictures"}:
-        gains(study, sight(items), starts, read)
+        gains(study, items, starts, read)
     if "fill" in parts:
         detect("touch, standing", examples, learned, tactile, starts, steps)
         flying, plain, tinted = aloft(study, rest, num, 2)
@@ -337,7 +381,7 @@ def main(parts: set[str], name: str, counts: tuple[int, int, int, int], steps: i
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", default=PARTS, metavar="PART", help=f"some of {', '.join(PARTS)}")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; all by default")
     parser.add_argument("--scenario", choices=STUDIES, default="perturbed")
     parser.add_argument("--objects", type=int, default=200, help="whose starts are shaken")
     parser.add_argument("--num", type=int, default=16, help="starts of each object")
@@ -346,6 +390,14 @@ if __name__ == "__main__":
     parser.add_argument("--steps", type=int, default=1500, help="of the networks")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep trajectories there, go on from them")
     args = parser.parse_args()
-    if not set(args.parts) <= set(PARTS):
-        parser.error(f"{' '.join(args.parts)}: parts are {', '.join(PARTS)}")
-    main(set(args.parts), args.scenario, (args.objects, args.num, args.again, args.others), args.steps, args.keep)
+    # Full and empty are told apart where containers stand.
+    parts = PARTS if args.scenario == "perturbed" else PARTS[:-1]
+    if not set(args.parts) <= set(parts):
+        parser.error(f"{' '.join(args.parts)}: parts of {args.scenario} are {', '.join(parts)}")
+    main(
+        set(args.parts or parts),
+        args.scenario,
+        (args.objects, args.num, args.again, args.others),
+        args.steps,
+        args.keep,
+    )

@@ -59,7 +59,7 @@ def test_what_the_classifier_is_told_of_a_shake_is_the_same_in_all_symmetries_of
     blank = np.zeros(4)
     starts = hidden.Starts(np.zeros(4, int), pose, np.zeros((4, 6)), condition, *[blank] * 5)
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
-    rows = hidden.shaken(seen, starts, np.full((4, 1), math.log(float(mass))))
+    rows = hidden.shaken([body], starts, np.full((4, 1), math.log(float(mass))))
     np.testing.assert_allclose(rows, rows[[0, 0, 0, 0]], rtol=1e-6)
     # Room to the edge that it is pushed to: 13 mm beyond the middle of y, pushed to -y and a little to +x.
     assert hidden.canonical(pose, condition)[1] == pytest.approx(np.array([[5.0, 3.0]] * 4))
