@@ -25,6 +25,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from benchmarks import classify, reader
 from sts_jax import _math, dataset, objects, physics
@@ -96,7 +97,8 @@ def roll(study: Study, items: list[objects.Body], num: int, again: int, seed: in
     """Simulates `num` starts of each object, and the first `again` of each once more with other fills."""
     key, fresh = jax.random.split(jax.random.key(seed))
     simulate = functools.partial(physics.simulate, key, items, Sensor(), study.scenario)
-    traj = simulate(num)
+    with tqdm(total=len(items) * num, unit="starts") as bar:
+        traj = simulate(num, progress=lambda n: bar.update(n - bar.n))
     outcome = np.asarray(traj.outcome)
     rerolled = np.full(len(outcome), -1)
     if again:
@@ -104,7 +106,8 @@ def roll(study: Study, items: list[objects.Body], num: int, again: int, seed: in
         other = jax.vmap(study.scenario.hidden)(jax.random.split(fresh, len(rows)))
         hidden = jax.tree.map(lambda x: x[rows], traj.hidden)
         hidden = hidden._replace(**{name: getattr(other, name) for name in study.reroll})
-        second = simulate(again, hidden=hidden)
+        with tqdm(total=len(rows), unit="rolled again") as bar:
+            second = simulate(again, hidden=hidden, progress=lambda n: bar.update(n - bar.n))
         same = (np.asarray(traj.resampled)[rows] == 0) & (np.asarray(second.resampled) == 0)
         rerolled[rows[same]] = np.asarray(second.outcome)[same]
     return Starts(
@@ -385,9 +388,9 @@ if __name__ == "__main__":
     parser.add_argument("--scenario", choices=STUDIES, default="perturbed")
     parser.add_argument("--objects", type=int, default=200, help="whose starts are shaken")
     parser.add_argument("--num", type=int, default=16, help="starts of each object")
-    parser.add_argument("--again", type=int, default=6, help="of these, how many with another fill as well")
+    parser.add_argument("--again", type=int, default=8, help="of these, how many with another fill as well")
     parser.add_argument("--others", type=int, default=200, help="objects that networks learn on")
-    parser.add_argument("--steps", type=int, default=1500, help="of the networks")
+    parser.add_argument("--steps", type=int, default=1000, help="of the networks")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep trajectories there, go on from them")
     args = parser.parse_args()
     # Full and empty are told apart where containers stand.
