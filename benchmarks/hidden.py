@@ -29,14 +29,14 @@ from tqdm import tqdm
 
 from benchmarks import classify, reader
 from sts_jax import _math, dataset, objects, physics
-from sts_jax.physics import Outcome
 from sts_jax.physics.scenarios import G
 from sts_jax.sensor import Sensor
 
 PARTS = ("outcomes", "truth", "pictures", "fill")
 FILLS = np.linspace(0, 1, 17)
-TINT, COLOR = 0.1, (0.0, 1.0, 0.0)  # share of the paint in an object's own colour, and the paint (linear light)
+TINT = 0.1  # share of white in the painted ones' own colours (linear light)
 OTHERS = 1_000_000  # keys of objects that networks learn on begin here
+EXAMPLES = 8  # starts of each of those
 
 
 class Starts(NamedTuple):
@@ -67,7 +67,6 @@ class Study:
 
     scenario: physics.Scenario
     categories: tuple[str, ...]  # of the objects, in turn
-    outcomes: tuple[Outcome, ...]
     reroll: tuple[str, ...]  # hidden values that are drawn again
     touch: Callable[[Starts], np.ndarray]  # (n, k) what touch tells, exactly; nan where nothing touches
     noise: float  # standard deviation of each column of it
@@ -248,7 +247,6 @@ STUDIES = {
     "perturbed": Study(
         scenario=physics.Perturbed(),
         categories=("bottle",),
-        outcomes=(Outcome.STANDS, Outcome.SLIDES, Outcome.TOPPLES, Outcome.FELL_OFF),
         reroll=("fill",),
         touch=lambda starts: np.log(starts.mass)[:, None],
         noise=0.05,
@@ -258,7 +256,6 @@ STUDIES = {
     "inclined": Study(
         scenario=physics.Inclined(),
         categories=objects.CATEGORIES,
-        outcomes=(Outcome.STICKS, Outcome.SLIDES, Outcome.ROLLS, Outcome.FELL_OFF),
         reroll=("fill", "up"),
         touch=pressed,
         noise=0.001,
@@ -274,7 +271,7 @@ STUDIES = {
 def outcomes(study: Study, starts: Starts) -> None:
     """Prints the shares of the outcomes, unsettled ones, and starts that end otherwise with another fill."""
     share = functools.partial(classify.interval, np.mean, groups=starts.body)
-    for outcome in study.outcomes:
+    for outcome in study.scenario.outcomes:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
     print(f"{'unsettled':30s} {share(~starts.settled)}")
     rolled = starts.rerolled >= 0
@@ -285,7 +282,7 @@ def outcomes(study: Study, starts: Starts) -> None:
 
 def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
     """Log loss of each start's outcome, of a classifier without or with touch."""
-    label = np.searchsorted(np.sort(study.outcomes), starts.outcome)
+    label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     return classify.log_loss(classify.chances(study.features(items, starts, touch), label, starts.body), label)
 
 
@@ -294,7 +291,7 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
     interval = functools.partial(classify.interval, groups=starts.body)
-    share = np.array([np.mean(starts.outcome == outcome) for outcome in study.outcomes])
+    share = np.array([np.mean(starts.outcome == outcome) for outcome in study.scenario.outcomes])
     before, after = losses(study, items, starts, None), losses(study, items, starts, rough)
     print(f"{'log loss: constant':30s} {-(share * np.log(share)).sum():.3f}")
     print(f"{'log loss: vision':30s} {interval(np.mean, before)}")
@@ -318,8 +315,8 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
 
 
 def painted(body: objects.Body) -> objects.Body:
-    """The body with TINT of a paint in its colours."""
-    return dataclasses.replace(body, colors=(1 - TINT) * body.colors + TINT * jnp.array(COLOR))
+    """The body with TINT of white in its colours."""
+    return dataclasses.replace(body, colors=(1 - TINT) * body.colors + TINT)
 
 
 def aloft(study: Study, items: list[objects.Body], num: int, seed: int) -> tuple[Starts, np.ndarray, np.ndarray]:
@@ -364,7 +361,7 @@ def main(parts: set[str], name: str, counts: tuple[int, int, int, int], steps: i
     still = dataclasses.replace(study, scenario=dataclasses.replace(study.scenario, frames=1))
     if parts & {"pictures", "fill"}:
         rest = bodies(study.categories, others, OTHERS)
-        learned = roll(still, rest, num, 0, 1)
+        learned = roll(still, rest, EXAMPLES, 0, 1)
         _, examples = draw(rest, learned.body, learned.pose, learned.wrench)
         _, tactile = draw(items, starts.body, starts.pose, starts.wrench)
     if "pictures" in parts:
@@ -376,7 +373,7 @@ def main(parts: set[str], name: str, counts: tuple[int, int, int, int], steps: i
         gains(study, items, starts, read)
     if "fill" in parts:
         detect("touch, standing", examples, learned, tactile, starts, steps)
-        flying, plain, tinted = aloft(study, rest, num, 2)
+        flying, plain, tinted = aloft(study, rest, EXAMPLES, 2)
         new, new_plain, new_tinted = aloft(study, items, num, 3)
         detect("seen in the air", plain, flying, new_plain, new, steps)
         detect(f"{TINT:.0%} tint", tinted, flying, new_tinted, new, steps)
@@ -389,7 +386,7 @@ if __name__ == "__main__":
     parser.add_argument("--objects", type=int, default=200, help="whose starts are shaken")
     parser.add_argument("--num", type=int, default=16, help="starts of each object")
     parser.add_argument("--again", type=int, default=8, help="of these, how many with another fill as well")
-    parser.add_argument("--others", type=int, default=200, help="objects that networks learn on")
+    parser.add_argument("--others", type=int, default=400, help="objects that networks learn on")
     parser.add_argument("--steps", type=int, default=1000, help="of the networks")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep trajectories there, go on from them")
     args = parser.parse_args()
