@@ -190,14 +190,14 @@ class Perturbed(_Common):
     condition_scale = (10.0, 10.0, 0.1)  # m/s^2, m/s^2, s
     outcomes = (Outcome.TOPPLES, Outcome.SLIDES, Outcome.STANDS, Outcome.FELL_OFF)
 
-    acceleration: tuple[float, float] = (3.0, 12.0)  # m/s^2, in any direction
+    acceleration: tuple[float, float] = (4.0, 12.0)  # m/s^2, in any direction
     duration: tuple[float, float] = (0.06, 0.12)  # s
     spread: float = 0.02  # m, radius of the disc from which the object's origin is drawn
     rate: float = 31.25  # frames/s
     frames: int = 60
     fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
-    friction: tuple[float, float] = (0.45, 0.65)
+    friction: tuple[float, float] = (0.5, 0.6)
     tilt: float = 0.0  # rad, as in `Freefall`
     contact: Contact = dataclasses.field(default_factory=Contact)
     must_stand: ClassVar[bool] = True
