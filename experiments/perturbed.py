@@ -18,7 +18,7 @@ BOTTLES = dataset.Collection(physics.Perturbed(), categories=("bottle",))
 DEFAULT = stages.Config(
     collection=dataclasses.replace(BOTTLES, num_objects=240, num_per_object=4, num_full=20, seed=2),
     training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
-    steps=(800, 400, 400, 300),
+    steps=(750, 350, 400, 200),
 )
 SMOKE = dataclasses.replace(
     DEFAULT,

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import os
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -17,6 +18,7 @@ import sts_jax as sts
 from experiments.progress import Bar, say
 from sts_jax import dataset, evaluation, mvae, training
 
+CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "sts_jax"  # what is made of mesh files
 # The rows of the paper's Table 1, by the modalities a model has.
 MODELS: dict[str, tuple[str, ...]] = {
     "mvae": ("visual", "tactile", "pose"),
@@ -57,15 +59,35 @@ class Args:
     workdir: Path
     preset: Literal["smoke", "default", "paper"] = "default"
     plan: bool = False  # print seconds per stage from a short measurement, and stop
+    hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
+    objects: Path | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
+    parts: bool = False  # what a hull fits badly collides as convex parts
 
 
 def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
     """An experiment from the command line."""
     args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
+    config = presets[args.preset]
+    scenario = sts.physics.variant(config.collection.scenario, args.hidden)
+    collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)
+    if args.objects is not None:
+        collection = with_meshes(collection, args.objects, args.workdir)
+    config = dataclasses.replace(config, collection=collection)
     if args.plan:
-        print(plan(presets[args.preset]))
+        print(plan(config))
     else:
-        main(presets[args.preset], args.workdir)
+        main(config, args.workdir)
+
+
+def with_meshes(collection: dataset.Collection, folder: Path, workdir: Path) -> dataset.Collection:
+    """A collection of the objects of a folder, with about as many trajectories; lists them in `objects.txt`."""
+    meshes, listing = dataset.survey_meshes(
+        folder, collection.scenario, parts=collection.parts, cache=CACHE / "objects", progress=say
+    )
+    write(workdir / "objects.txt", listing.encode())
+    say(f"{len(meshes.names)} objects can be used; {workdir / 'objects.txt'} has them and what was left out")
+    each = max(collection.num_per_object, round(collection.num_trajectories / len(meshes.names)))
+    return dataclasses.replace(collection, meshes=meshes, num_objects=len(meshes.names), num_per_object=each)
 
 
 def main(config: Config, workdir: Path) -> None:
@@ -86,14 +108,16 @@ def claim(config: Config, workdir: Path) -> None:
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
     """Make what is missing of the dataset and open it."""
     with Bar() as bar:
-        resampled = dataset.collect(
+        made = dataset.collect(
             config.collection,
             sensor,
             workdir / "dataset",
             progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total),
         )
-    if resampled:
-        say(f"collect: {resampled} trajectories went non-finite or sank and were drawn again")
+    for line in made.left_out:
+        say(f"collect: left out {line}")
+    if made.resampled:
+        say(f"collect: {made.resampled} trajectories went non-finite or sank and were drawn again")
     return dataset.load(workdir / "dataset")
 
 
@@ -245,10 +269,10 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         + f"; batch {config.training.batch_size}.",
     ]
     content = (json.dumps({"split": split, **summary}, indent=2) + "\n").encode()
-    _write(workdir / f"metrics{suffix}.json", content)
+    write(workdir / f"metrics{suffix}.json", content)
     title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
     text = evaluation.table(summary, title=title, notes=notes)
-    _write(done, text.encode())
+    write(done, text.encode())
     return text
 
 
@@ -326,7 +350,7 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
         spent: dict[str, list[float]] = {"trajectories": [], "frames": []}
         for seed in (0, 1):
             little = dataclasses.replace(
-                collection, num_objects=many, num_per_object=num // many, num_full=0, symmetries=True, seed=seed
+                dataset.head(collection, many), num_per_object=num // many, num_full=0, symmetries=True, seed=seed
             )
             stamps = {"start": time.perf_counter()}
 
@@ -352,9 +376,7 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
             )
 
         data = dataset.load(Path(name) / "0")
-        tiny = dataclasses.replace(
-            config, collection=dataclasses.replace(collection, num_objects=many), splits=("trajectory",)
-        )
+        tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",))
         pairs = data.pairs(np.arange(num), symmetries=True)
         blank = empty_frame(sensor, collection)
         share = 0.7 if config.splits[0] == "object" else 0.8
@@ -442,7 +464,8 @@ def _read_lines(path: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
-def _write(path: Path, data: bytes) -> None:
+def write(path: Path, data: bytes) -> None:
+    """A whole file or none."""
     dataset.write_whole(path, lambda temporary: _write_bytes(temporary, data))
 
 

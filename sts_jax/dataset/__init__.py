@@ -1,14 +1,18 @@
 """Collections on disk: made shard by shard, read as arrays."""
 
+from sts_jax.dataset.collect import Collected as Collected
 from sts_jax.dataset.collect import Collection as Collection
+from sts_jax.dataset.collect import Meshes as Meshes
 from sts_jax.dataset.collect import Progress as Progress
 from sts_jax.dataset.collect import claim as claim
 from sts_jax.dataset.collect import class_names as class_names
 from sts_jax.dataset.collect import collect as collect
+from sts_jax.dataset.collect import head as head
 from sts_jax.dataset.collect import make_bodies as make_bodies
 from sts_jax.dataset.collect import render_uint8 as render_uint8
 from sts_jax.dataset.collect import sample_of_class as sample_of_class
 from sts_jax.dataset.collect import split_objects as split_objects
+from sts_jax.dataset.collect import survey_meshes as survey_meshes
 from sts_jax.dataset.collect import symmetries_of as symmetries_of
 from sts_jax.dataset.load import Dataset as Dataset
 from sts_jax.dataset.load import Pairs as Pairs
@@ -19,20 +23,24 @@ from sts_jax.dataset.records import write_arrays as write_arrays
 from sts_jax.dataset.records import write_whole as write_whole
 
 __all__ = [
+    "Collected",
     "Collection",
     "Dataset",
     "Images",
+    "Meshes",
     "Pairs",
     "Progress",
     "TornFileError",
     "claim",
     "class_names",
     "collect",
+    "head",
     "load",
     "make_bodies",
     "render_uint8",
     "sample_of_class",
     "split_objects",
+    "survey_meshes",
     "symmetries_of",
     "write_arrays",
     "write_whole",

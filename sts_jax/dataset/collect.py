@@ -3,6 +3,7 @@
 import concurrent.futures
 import dataclasses
 import functools
+import hashlib
 import json
 import math
 import os
@@ -22,7 +23,19 @@ from sts_jax.sensor import Sensor
 
 # Frames rendered by one compiled call.
 RENDER_BATCH = 32
+LEAST_OBJECTS = 4
 SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
+
+
+@dataclasses.dataclass(frozen=True)
+class Meshes:
+    """Objects from files, see `survey_meshes`."""
+
+    folder: str
+    names: tuple[str, ...]  # of the items of `objects.library`
+    labels: tuple[str, ...]  # the class of each
+    digest: str  # of the files
+    cache: str | None = None  # folder, see `objects.library`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +44,8 @@ class Collection:
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
     categories: tuple[str, ...] = objects.CATEGORIES  # of the procedural objects, in turn
+    meshes: Meshes | None = None  # objects from files instead; num_objects is then their number
+    parts: bool = False  # what a hull fits badly collides as convex parts (package coacd, ten seconds an object)
     num_objects: int = 160
     num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
     num_full: int = 20  # trajectories with every frame rendered; of the others the first and the last
@@ -51,6 +66,13 @@ class Collection:
         return math.ceil(self.num_objects / self.objects_per_shard)
 
 
+class Collected(NamedTuple):
+    """What is to be said of the shards made by a call."""
+
+    resampled: int  # trajectories drawn again
+    left_out: tuple[str, ...]  # a line for each object that was left out
+
+
 class Progress(NamedTuple):
     """What a collection reports while it runs."""
 
@@ -59,23 +81,86 @@ class Progress(NamedTuple):
     stage: str  # "trajectories" or "frames"
 
 
+def survey_meshes(
+    folder: str | os.PathLike[str],
+    scenario: physics.Scenario,
+    *,
+    parts: bool = False,
+    cache: str | os.PathLike[str] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Meshes, str]:
+    """The objects of a folder of meshes, or of ShapeNetSem, that a scenario can use.
+
+    Args:
+        folder: See `objects.library`.
+        scenario: What happens to them.
+        parts: Whether what a hull fits badly collides as convex parts.
+        cache: Keeps what is made of the files.
+        progress: Called with a line for each object.
+
+    Returns:
+        The objects, and a listing of them and of what was left out, with the reasons.
+
+    Raises:
+        FileNotFoundError: No such folder.
+        ValueError: It holds no mesh, or none that can be used.
+    """
+    library, listing = objects.survey(objects.library(folder, cache=cache, parts=parts), progress=progress)
+    usable, digest = [], hashlib.sha256()
+    for index, item in enumerate(library.items):
+        reason = physics.refusal(objects.read(library, index).body, scenario)
+        if reason is None:
+            usable.append(item)
+            digest.update(item.name.encode() + hashlib.sha256(item.path.read_bytes()).digest())
+        else:
+            listing += f"{item.name}: left out of {type(scenario).__name__}: {reason}\n"
+    if not usable:
+        raise ValueError(f"{folder}: holds no object that can be used; what was found:\n{listing}")
+    names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
+    return Meshes(str(folder), names, labels, digest.hexdigest(), None if cache is None else str(cache)), listing
+
+
+@functools.lru_cache
+def _library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
+    library = objects.library(meshes.folder, cache=meshes.cache, parts=parts)
+    return library, {item.name: index for index, item in enumerate(library.items)}
+
+
 def class_names(collection: Collection) -> tuple[str, ...]:
     """The class of each object of a collection, `num_objects` names."""
+    if collection.meshes is not None:
+        return collection.meshes.labels
     return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))
 
 
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
-    """The objects of a collection, each from its own key: object i is the same whatever else is made."""
+    """The objects of a collection. A procedural one has its own key: object i is the same whatever else is made."""
+    if collection.meshes is not None:
+        library, where = _library(collection.meshes, collection.parts)
+        return [objects.read(library, where[collection.meshes.names[i]]).body for i in indices]
     key, names = jax.random.key(collection.seed), class_names(collection)
-    return [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
+    bodies = [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
+    if not collection.parts:
+        return bodies
+    return [objects.decompose(body) if objects.gaps(body)[1] > objects.HOLLOW else body for body in bodies]
+
+
+def head(collection: Collection, count: int) -> Collection:
+    """The collection of the first objects only."""
+    meshes = collection.meshes
+    if meshes is None:
+        return dataclasses.replace(collection, num_objects=count)
+    few = dataclasses.replace(meshes, names=meshes.names[:count], labels=meshes.labels[:count])
+    return dataclasses.replace(collection, meshes=few, num_objects=len(few.names))
 
 
 def sample_of_class(collection: Collection, name: str) -> objects.Body:
-    """Some object of a class, the same one for all collections: it may stand in for any of its class."""
-    if name not in collection.categories:
-        raise ValueError(
-            f"no object of the collection is a {name!r}: its classes are {', '.join(collection.categories)}"
-        )
+    """Some object of a class: of the procedural ones the same for all collections, it may stand in for any of them."""
+    names = class_names(collection)
+    if name not in names:
+        raise ValueError(f"no object of the collection is a {name!r}: its classes are {', '.join(sorted(set(names)))}")
+    if collection.meshes is not None:
+        return make_bodies(collection, np.array([names.index(name)]))[0]
     return objects.make(jax.random.key(0), name)
 
 
@@ -86,6 +171,8 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     names = np.array(class_names(collection))
     members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
     blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
+    if len(names) < LEAST_OBJECTS:
+        raise ValueError(f"{len(names)} objects cannot be split by object: at least {LEAST_OBJECTS} are needed")
     cuts = np.round(np.cumsum(list(SPLITS.values()))[:-1] * collection.num_objects).astype(int)
     parts = np.split(np.concatenate(blocks), cuts)
     return {name: np.sort(part).astype(np.int64) for name, part in zip(SPLITS, parts, strict=True)}
@@ -127,7 +214,7 @@ def collect(
     folder: Path,
     *,
     progress: Callable[[Progress], None] | None = None,
-) -> int:
+) -> Collected:
     """Make every shard of a dataset that is not there yet.
 
     Args:
@@ -137,17 +224,20 @@ def collect(
         progress: Called as the work goes on.
 
     Returns:
-        How many trajectories were drawn again because they went non-finite or sank, in the shards made now.
+        How many trajectories were drawn again because they went non-finite or sank, and which objects were left out
+        because they did so in every draw, in the shards made now.
 
     Raises:
         ValueError: The folder holds another collection, the message names the field; or the pad does not have the
-            scenario's symmetries.
+            scenario's symmetries; or no object of a shard can be simulated.
         OSError: The disk is full.
     """
     sides = [float(side) for side in sensor.gel.size]
     quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(collection))
     if quarter_turns and sides[0] != sides[1]:
         raise ValueError(f"symmetries=True with gel.size={sides}: only a square pad is itself after a quarter turn")
+    if collection.meshes is not None and collection.num_objects != len(collection.meshes.names):
+        raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)}")
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "collection.json", _as_json(collection))
     claim(folder / "sensor.json", jax.tree.map(lambda x: np.asarray(x).tolist(), dataclasses.asdict(sensor)))
@@ -155,11 +245,12 @@ def collect(
         folder / "split.json",
         {name: [int(i) for i in part] for name, part in split_objects(collection).items()},
     )
-    resampled = 0
+    made = Collected(0, ())
     for index in range(collection.num_shards):
         if not shard_path(folder, collection, index).with_suffix(".npz").exists():
-            resampled += _make_shard(collection, sensor, folder, index, progress)
-    return resampled
+            new = _make_shard(collection, sensor, folder, index, progress)
+            made = Collected(made.resampled + new.resampled, made.left_out + new.left_out)
+    return made
 
 
 def symmetries_of(collection: Collection) -> tuple[int, ...]:
@@ -212,41 +303,52 @@ def _make_shard(
     folder: Path,
     index: int,
     progress: Callable[[Progress], None] | None,
-) -> int:
+) -> Collected:
     first = index * collection.objects_per_shard
     members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
-    bodies = make_bodies(collection, members)
     before = first * collection.num_per_object
     key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
-    trajectory = physics.simulate(
-        key,
-        bodies,
-        sensor,
-        collection.scenario,
-        collection.num_per_object,
-        progress=_report(progress, before, collection.num_trajectories, "trajectories"),
-    )
+    left_out: list[str] = []
+    while True:
+        bodies = make_bodies(collection, members)
+        try:
+            trajectory = physics.simulate(
+                key,
+                bodies,
+                sensor,
+                collection.scenario,
+                collection.num_per_object,
+                progress=_report(progress, before, collection.num_trajectories, "trajectories"),
+            )
+            break
+        except physics.BodyError as error:  # one bad object does not stop a collection
+            number = int(members[error.body])
+            name = class_names(collection)[number] if collection.meshes is None else collection.meshes.names[number]
+            left_out.append(f"object {number} ({name}): {str(error).partition(': ')[2]}")
+            members = np.delete(members, error.body)
+            if not len(members):
+                raise ValueError(f"{folder}: no object of shard {index} can be simulated: {left_out[-1]}") from error
     trajectory = jax.tree.map(np.asarray, trajectory)
-    frames = _frames_of(collection, first, trajectory)
+    frames = _frames_of(collection, members, trajectory)
     path = shard_path(folder, collection, index)
     report = _report(progress, 0, len(frames), "frames")
     records.write_images(path, _render(collection, sensor, bodies, trajectory, frames, report))
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
-    arrays["trajectory/body"] = arrays["trajectory/body"] + first
+    arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
     arrays["frames"] = frames
     records.write_arrays(path.with_suffix(".npz"), arrays)
-    return int(trajectory.resampled.sum())
+    return Collected(int(trajectory.resampled.sum()), tuple(left_out))
 
 
-def _frames_of(collection: Collection, first_object: int, trajectory: physics.Trajectory) -> np.ndarray:
+def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
     """Which frames are rendered: rows of (trajectory, frame, symmetry), trajectory counted in the shard."""
     num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
     rows = []
     for i in range(num):
         # The full ones are spread over the objects: the first trajectory of each, then the second of each, ...
-        object_index, repeat = divmod(i, collection.num_per_object)
-        rank = repeat * collection.num_objects + first_object + object_index
+        place, repeat = divmod(i, collection.num_per_object)
+        rank = repeat * collection.num_objects + members[place]
         full = rank < collection.num_full
         rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
         rows += [(i, t, symmetry) for symmetry in symmetries_of(collection) if symmetry for t in (0, last)]

@@ -12,7 +12,7 @@ from sts_jax.objects.body import (
     rigid,
     stack,
 )
-from sts_jax.objects.libraries import Entry, Item, Library, bodies, describe, library, read, survey
+from sts_jax.objects.libraries import HOLLOW, Entry, Item, Library, bodies, describe, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
 from sts_jax.objects.solids import decompose, gaps, hull_gap, rest_poses
@@ -20,6 +20,7 @@ from sts_jax.objects.solids import decompose, gaps, hull_gap, rest_poses
 __all__ = [
     "CATEGORIES",
     "FACE_CLASSES",
+    "HOLLOW",
     "HULL_CLASSES",
     "PART_CLASSES",
     "TEXTURE_CLASSES",

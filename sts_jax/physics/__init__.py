@@ -12,9 +12,10 @@ from sts_jax.physics.scenarios import (
     variant,
 )
 from sts_jax.physics.scene import Contact
-from sts_jax.physics.simulate import Trajectory, simulate
+from sts_jax.physics.simulate import BodyError, Trajectory, refusal, simulate
 
 __all__ = [
+    "BodyError",
     "Contact",
     "Freefall",
     "Hidden",
@@ -25,6 +26,7 @@ __all__ = [
     "Trajectory",
     "Variant",
     "fell_off",
+    "refusal",
     "simulate",
     "variant",
 ]

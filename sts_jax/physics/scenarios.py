@@ -16,14 +16,9 @@ from sts_jax.physics.scene import Contact
 G = 9.81  # m/s^2
 FELL_OFF_HEIGHT = -0.005  # m; an object's origin lies inside its hull: on the pad it is above, after leaving below
 MOVED = 0.01  # m; what moved less stayed where it was
-STANDING = 2.3e-5  # m, how deep in the pad a start at rest is: as deep as an object stands with SLIDING's contact
+STANDING = 2.3e-5  # m, how deep in the pad a start at rest is: as deep as an object stands
 CLEARANCE = 0.001  # m; what starts on the slope is at least this far from the stop wall
 TURNED = math.pi / 4  # rad; what leans more lies, what turned more rolled
-
-# Contact of what slides and topples. Rolling friction widens the base that an object topples over by its length, so it
-# must be small beside it; and a contact that is soft at first touch carries what slides, where a stiff one rattles (its
-# friction is then off by up to 10 %, in C MuJoCo too).
-SLIDING = Contact(rolling=0.0002, soft=0.02, width=0.00005)
 
 
 class Outcome(enum.IntEnum):
@@ -90,13 +85,20 @@ class _Common:
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
         """Draws the hidden values of one trajectory; consumes `key`."""
-        *keys, high, around = jax.random.split(key, 5)
-        ranges = (self.fill, self.shell_scale, self.friction)
-        values = (jax.random.uniform(k, (), minval=a, maxval=b) for k, (a, b) in zip(keys, ranges, strict=True))
-        z = jax.random.uniform(high, minval=math.cos(self.tilt), maxval=1.0)
-        angle = jax.random.uniform(around, maxval=2 * jnp.pi)
+        fill, shell, friction, high, around = jax.random.split(key, 5)
+
+        def draw(key: PRNGKeyArray, limits: tuple[float, float]) -> Float[Array, ""]:
+            return jax.random.uniform(key, minval=limits[0], maxval=limits[1])
+
+        z = draw(high, (math.cos(self.tilt), 1.0))
+        angle = draw(around, (0.0, 2 * math.pi))
         radius = jnp.sqrt(jnp.maximum(1 - z**2, 0))
-        return Hidden(*values, jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]))
+        return Hidden(
+            fill=draw(fill, self.fill),
+            shell_scale=draw(shell, self.shell_scale),
+            friction=draw(friction, self.friction),
+            up=jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), z]),
+        )
 
     def check(self) -> None:
         """Insists on values that can be simulated.
@@ -140,7 +142,8 @@ class Freefall(_Common):
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.4, 0.8)
     tilt: float = 0.0  # rad, the contents' up leans by at most this from the object's +z, in any direction
-    contact: Contact = dataclasses.field(default_factory=Contact)
+    # A gel brakes what rolls on it: lathed objects come to rest.
+    contact: Contact = dataclasses.field(default_factory=lambda: Contact(rolling=0.002))
 
     def check(self) -> None:
         """See `_Common.check`."""
@@ -196,7 +199,7 @@ class Perturbed(_Common):
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.45, 0.65)
     tilt: float = 0.0  # rad, as in `Freefall`
-    contact: Contact = SLIDING
+    contact: Contact = dataclasses.field(default_factory=Contact)
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -256,7 +259,7 @@ class Inclined(_Common):
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.35, 0.75)
     tilt: float = math.pi  # rad, as in `Freefall`
-    contact: Contact = SLIDING
+    contact: Contact = dataclasses.field(default_factory=Contact)
 
     def check(self) -> None:
         """See `_Common.check`."""

@@ -56,11 +56,14 @@ class Contact:
     timestep: float = 0.001  # s
     time_constant: float = 0.003  # s, solref; stiff: less than 0.1 mm deep at rest, about 1 mm at impact
     damping_ratio: float = 0.8  # solref; a gel bounces little: most drops still touch, part and touch again
-    soft: float = 0.9  # solimp at first touch; at 0.5 objects with a bump rock on, at 0.95 flat ones can chatter
+    # A contact that is stiff at first touch rattles where something slides on it: its friction is then off by up to
+    # 10 %, in C MuJoCo too.
+    soft: float = 0.02  # solimp at first touch
     hard: float = 0.99  # solimp at `width`
-    width: float = 0.001  # m, solimp
+    width: float = 0.00005  # m, solimp
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
-    rolling: float = 0.002  # m, rolling friction: a gel brakes what rolls on it, lathed objects come to rest
+    # Rolling friction widens the base that an object topples over by its length, so it must be small beside it.
+    rolling: float = 0.0002  # m
     impratio: float = 10.0  # stiffness of friction against the normal force: what holds does not creep
     iterations: int = 8  # Newton iterations of one step
     ls_iterations: int = 8  # line-search iterations of one Newton iteration

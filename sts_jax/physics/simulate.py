@@ -28,6 +28,18 @@ UPRIGHT = math.radians(1)  # what stands leans less
 WORKERS = 2  # chunks under way at once: XLA runs these small steps on one CPU core each
 
 
+class BodyError(ValueError):
+    """One of several bodies cannot be simulated.
+
+    Attributes:
+        body: Its index.
+    """
+
+    def __init__(self, body: int, reason: str):
+        super().__init__(f"body {body}: {reason}")
+        self.body = body
+
+
 class Trajectory(NamedTuple):
     """Trajectories of one or more bodies, body-major; n of them, f frames each."""
 
@@ -104,33 +116,39 @@ def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
     for i, body in enumerate(bodies):
         known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
         if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
-            raise ValueError(
-                f"body {i}: hulls has shape {body.hulls.shape}; expected (p, n, 3), p in {objects.PART_CLASSES}, "
-                f"n in {objects.HULL_CLASSES}"
+            raise BodyError(
+                i,
+                f"hulls has shape {body.hulls.shape}; expected (p, n, 3), p in {objects.PART_CLASSES}, "
+                f"n in {objects.HULL_CLASSES}",
             )
         if not np.isfinite(body.hulls).all():
-            raise ValueError(f"body {i}: hulls has a non-finite vertex")
+            raise BodyError(i, "hulls has a non-finite vertex")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
-            raise ValueError(f"body {i}: shell_mass is {body.shell_mass} kg; it must be positive and finite")
+            raise BodyError(i, f"shell_mass is {body.shell_mass} kg; it must be positive and finite")
+
+
+def refusal(body: Body, scenario: Scenario) -> str | None:
+    """Why an object cannot start as a scenario asks, or None if it can."""
+    rests, _ = _rests(body)
+    if not len(rests):
+        return "its centre of mass lies outside its hull, it rests on no face"
+    if scenario.must_stand and rests[:, 2].max() < math.cos(UPRIGHT):
+        return f"it does not stand upright (+z up), as {type(scenario).__name__} needs"
+    return None
+
+
+def _rests(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
+    return objects.rest_poses(points, np.asarray(body.shell_com, np.float64))
 
 
 def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
-    """What decides the starts of each body, padded to a common size.
-
-    Raises:
-        ValueError: a body has no attitude in which it rests, or does not stand upright where it must; it is named.
-    """
-    found = []
+    """What decides the starts of each body, padded to a common size."""
     for index, body in enumerate(bodies):
-        points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
-        rests, shares = objects.rest_poses(points, np.asarray(body.shell_com, np.float64))
-        if not len(rests):
-            raise ValueError(f"body {index}: its centre of mass lies outside its hull, it rests on no face")
-        if scenario.must_stand and rests[:, 2].max() < math.cos(UPRIGHT):
-            raise ValueError(
-                f"body {index}: does not stand upright (+z up), as {type(scenario).__name__} needs; leave it out"
-            )
-        found.append((points, rests, shares))
+        reason = refusal(body, scenario)
+        if reason is not None:
+            raise BodyError(index, f"{reason}: leave it out")
+    found = [(np.asarray(body.hulls).reshape(-1, 3), *_rests(body)) for body in bodies]
 
     def pad(arrays: Sequence[np.ndarray], mode: Literal["edge", "constant"]) -> np.ndarray:
         size = max(map(len, arrays))
@@ -170,7 +188,7 @@ def _draws(
             try:
                 scene.set_rigid(model, data, mass, com, inertia, friction)
             except ValueError as error:
-                raise ValueError(f"body {index}: {error}") from error
+                raise BodyError(index, str(error)) from error
             fields.append(scene.drawn(model, like))
     return {name: np.stack([f[name] for f in fields]) for name in fields[0]}
 
@@ -206,7 +224,9 @@ def simulate(
         bodies * num trajectories, body-major.
 
     Raises:
-        ValueError: an argument out of range, named; or a trajectory that fails in every attempt.
+        BodyError: a ValueError: a body that cannot start as the scenario asks, has bad values, or a trajectory of which
+            fails in every attempt.
+        ValueError: another argument out of range, named.
     """
     bodies = [body] if isinstance(body, Body) else list(body)
     _check(bodies, scenario, num)
@@ -253,9 +273,10 @@ def simulate(
         attempt[pending] += 1
         if attempt.max() >= ATTEMPTS:
             worst = int(attempt.argmax())
-            raise ValueError(
-                f"body {which[worst]}, trajectory {nth[worst]}: non-finite or sunken deeper than {SUNK_LIMIT} m in "
-                f"{ATTEMPTS} draws; is its hull too thin or its mass out of scale?"
+            raise BodyError(
+                int(which[worst]),
+                f"trajectory {nth[worst]} is non-finite or sunken deeper than {SUNK_LIMIT} m in {ATTEMPTS} draws; is "
+                "its hull too thin or its mass out of scale?",
             )
 
     last, records = jax.tree.map(lambda *x: jnp.stack(x), *(rows[i] for i in range(count)))
