@@ -157,7 +157,7 @@ def worlds(count: int, frames: int) -> tuple[Any, Any, Any]:
     fields = inner._draws([body], index, hidden, pad, scenario.contact, scenario.wall)
     fields, start = jax.tree.map(lambda x: np.resize(x, (count, *x.shape[1:])), (fields, start))
     hull = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), contact.hull(np.asarray(body.hulls)))
-    gravity = np.broadcast_to(np.float32([0, 0, -G]), (count, frames, scenario.steps, 3))
+    gravity = np.broadcast_to(np.array([0, 0, -G], np.float32), (count, frames, scenario.steps, 3))
     _, model, data = scene.template(pad, scenario.contact, scenario.wall)
     return inner._Worlds(fields, hull, start, gravity), model, data
 
@@ -191,7 +191,7 @@ def scaling(frames: int = 4, chunk: int = 32) -> None:
         seconds = np.median(in_turn(at_once, in_chunks, rollout, repeats=3), axis=0)
         row = [float(count), *(count * steps / seconds).tolist()]
         rows.append(row)
-        print(f"{count:6d} worlds: {row[1]:12,.0f} at once {row[2]:12,.0f} in chunks {row[3]:12,.0f} C")
+        print(f"{count:6d} worlds: {row[1]:12,.0f} at once {row[2]:12,.0f} in chunks {row[3]:12,.0f} C", flush=True)
     write_scaling(np.array(rows), jax.devices()[0].device_kind, chunk)
 
 
@@ -226,6 +226,7 @@ def first_call(name: str, count: int) -> None:
     begin = time.perf_counter()
     physics.simulate(jax.random.key(0), items[0], sensor, scenario)
     again = time.perf_counter() - begin
+    jax.clear_caches()
     physics.simulate(jax.random.key(0), items, sensor, scenario)
     programs = {f: getattr(inner, f)._cache_size() for f in ("_roll", "_draw", "_rigid", "_gravity")}
     print(json.dumps({"seconds": first - again, "objects": len(items), "programs": programs}))
