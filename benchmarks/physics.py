@@ -1,31 +1,55 @@
-"""Physics: steps per second beside C MuJoCo, and what becomes of many drops.
+"""Physics: steps per second beside C MuJoCo, compilation, and what becomes of many drops.
 
     python -m benchmarks.physics             # about 2 minutes
+    python -m benchmarks.physics --scaling   # about 10 minutes on two cores; writes benchmarks/results/physics/
+    python -m benchmarks.physics --compile   # about 8 minutes on two cores
     python -m benchmarks.physics --soak 3000 # about 10 minutes on two cores
     python -m benchmarks.physics --reroll 6  # about 2 minutes
 
-The first steps the same objects from the same starts for a whole trajectory, in both engines. The second drops
-objects of all categories (a new one every eight drops) and counts. The third rolls the same starts again with other
+The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in both engines, C MuJoCo's
+batch (`mujoco.rollout`) on all cores, measured in turn. `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU).
+`--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in fresh
+processes: first with an empty cache of compiled programs, then with what the first left there. `--soak` drops
+objects of all categories (a new one every eight drops) and counts. `--reroll` rolls the same starts again with other
 hidden values: how far the end is decided by what cannot be seen.
 """
 
 import argparse
+import concurrent.futures
+import copy
+import dataclasses
 import functools
-import statistics
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import mujoco.rollout
 import numpy as np
 from tqdm import tqdm
 
 from sts_jax import _math, objects, physics
-from sts_jax.physics import scene
+from sts_jax.physics import contact, scene
 from sts_jax.physics.scenarios import G
-from sts_jax.physics.simulate import SUNK_LIMIT
+from sts_jax.physics.simulate import SUNK_LIMIT, WORKERS
 from sts_jax.sensor import Sensor
+
+inner = importlib.import_module("sts_jax.physics.simulate")  # the package gives this name to the function
+RESULTS = Path(__file__).parent / "results" / "physics"
+SCENARIOS: dict[str, physics.Scenario] = {
+    "freefall": physics.Freefall(),
+    "perturbed": physics.Perturbed(),
+    "inclined": physics.Inclined(),
+}
 
 
 def bodies(count: int) -> list[objects.Body]:
@@ -34,54 +58,192 @@ def bodies(count: int) -> list[objects.Body]:
     return [objects.make(jax.random.key(i), names[i % len(names)]) for i in range(count)]
 
 
-def median_seconds(run: Callable[[], object], repeats: int = 3) -> float:
-    """Median wall time of a call, after one that is not counted."""
-    run()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - begin)
-    return statistics.median(times)
-
-
 def mass_properties(body: objects.Body, hidden: physics.Hidden) -> list[tuple[float, np.ndarray, np.ndarray]]:
     """Mass, centre of mass and inertia of each draw."""
     rigid = jax.vmap(functools.partial(objects.rigid, body))(hidden.fill, hidden.shell_scale, hidden.up)
     return list(zip(*(np.asarray(x, np.float64) for x in rigid), strict=True))
 
 
-def speed(num: int) -> None:
-    """Steps per second of both engines, on the drops of eight objects."""
-    sensor, scenario, items = Sensor(), physics.Freefall(), bodies(8)
-    pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
-    steps = round(scenario.frames / scenario.rate / scenario.contact.timestep)
-    traj = physics.simulate(jax.random.key(0), items, sensor, scenario, num)
+def rod() -> objects.Body:
+    """A solid rod of 16 sides, 30 mm thick and 100 mm long: one hull of 32 vertices."""
+    turn, mass, radius, length = np.arange(16) * np.pi / 8, 0.05, 0.015, 0.1
+    ring = radius * np.stack([np.cos(turn), np.sin(turn)], 1)
+    points = np.concatenate([np.c_[ring, np.full(16, z)] for z in (-length / 2, length / 2)])
+    across = mass * (radius**2 / 4 + length**2 / 12)
+    return dataclasses.replace(
+        objects.make(jax.random.key(0), "fork"),  # solid; only what collides and weighs matters here
+        hulls=jnp.asarray(points[None], jnp.float32),
+        shell_mass=jnp.float32(mass),
+        shell_com=jnp.zeros(3),
+        shell_inertia=jnp.asarray(np.diag([across, across, mass * radius**2 / 2]), jnp.float32),
+    )
 
-    def in_mjx() -> None:
-        physics.simulate(jax.random.key(0), items, sensor, scenario, num)
 
-    worlds = []
+def in_c(items: list[objects.Body], traj: physics.Trajectory, contact: physics.Contact) -> tuple[list, np.ndarray]:
+    """C MuJoCo's model and first state of each trajectory."""
+    gel, models, states = Sensor().gel.size, [], []
     for index, body in enumerate(items):
+        compiled = scene.compile_scene(np.asarray(body.hulls), (float(gel[0]), float(gel[1])), contact)
         own = np.flatnonzero(np.asarray(traj.body) == index)
         hidden = jax.tree.map(lambda x, own=own: x[own], traj.hidden)
         for row, rigid, friction in zip(own, mass_properties(body, hidden), hidden.friction, strict=True):
-            model = scene.compile_scene(np.asarray(body.hulls), pad, scenario.contact)
+            model = copy.copy(compiled)
             data = mujoco.MjData(model)
             scene.set_rigid(model, data, *rigid, float(friction))
-            worlds.append((model, data, np.asarray(traj.pose[row, 0])))
+            data.qpos[:] = traj.pose[row, 0]
+            state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+            mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            models.append(model)
+            states.append(state)
+    return models, np.array(states)
 
-    def in_c() -> None:
-        for model, data, pose in worlds:
-            mujoco.mj_resetData(model, data)
-            data.qpos[:] = pose
-            mujoco.mj_step(model, data, nstep=steps)
 
-    count = len(worlds) * steps
-    ours, theirs = count / median_seconds(in_mjx), count / median_seconds(in_c)
-    print(f"simulate (MJX)   {ours:10,.0f} steps/s, two threads, all costs but compilation")
-    print(f"C MuJoCo         {theirs:10,.0f} steps/s, one thread")
-    print(f"ratio            {ours / theirs:10.4f} (1/{theirs / ours:.0f})")
+def in_turn(*runs: Callable[[], object], repeats: int = 5) -> np.ndarray:
+    """Seconds of calls made in turn, after one of each that is not counted: (repeats, calls)."""
+    for run in runs:
+        run()
+    seconds = np.empty((repeats, len(runs)))
+    for row in seconds:
+        for i, run in enumerate(runs):
+            begin = time.perf_counter()
+            run()
+            row[i] = time.perf_counter() - begin
+    return seconds
+
+
+def speed(num: int) -> None:
+    """Steps per second of both engines, on drops of one hull of 32 vertices and of eight objects."""
+    compare_speed("one hull of 32 vertices", [rod()], 8 * num)
+    compare_speed("eight objects, up to 64 vertices", bodies(8), num)
+
+
+def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
+    """Print steps per second of both engines, `num` drops of each object."""
+    sensor, scenario = Sensor(), physics.Freefall()
+    simulate = functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num)
+    traj, steps = simulate(), scenario.frames * scenario.steps
+    models, states = in_c(items, traj, scenario.contact)
+    batches = [(np.array(m, object), s) for m, s in grouped(models, states)]
+    data = [[mujoco.MjData(m[0]) for _ in range(os.cpu_count() or 1)] for m, _ in batches]
+
+    def rollout() -> None:
+        for (batch, state), own in zip(batches, data, strict=True):
+            mujoco.rollout.rollout(list(batch), own, state, nstep=steps, persistent_pool=True)
+
+    seconds = in_turn(simulate, rollout)
+    ours, theirs = len(models) * steps / np.median(seconds, axis=0)
+    ratio = float(np.median(seconds[:, 1] / seconds[:, 0]))
+    print(f"{name}: {len(models)} drops of {steps} steps")
+    print(f"    simulate (MJX)   {ours:10,.0f} steps/s, {WORKERS} threads, all costs but compilation")
+    print(f"    C MuJoCo         {theirs:10,.0f} steps/s, rollout on {os.cpu_count()} threads")
+    print(f"    ratio            {ratio:10.4f} (1/{1 / ratio:.1f}), median of pairs")
+
+
+def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
+    """Models and states by the size of the mesh: a rollout is of models of one size."""
+    sizes = np.array([model.nmeshvert for model in models])
+    return [([m for m, n in zip(models, sizes, strict=True) if n == k], states[sizes == k]) for k in np.unique(sizes)]
+
+
+def worlds(count: int, frames: int) -> tuple[Any, Any, Any]:
+    """What `simulate` hands to MJX for drops of the rod from 2 mm: worlds, model, data."""
+    scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
+    pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # drawn once, then repeated
+    index = np.zeros(some, np.int32)
+    shapes = inner._shapes([body], scenario)
+    start, hidden = inner._draw(
+        jax.random.key(0), index, np.arange(some, dtype=np.int32), index, shapes, scenario=scenario, pad=pad
+    )
+    fields = inner._draws([body], index, hidden, pad, scenario.contact, scenario.wall)
+    fields, start = jax.tree.map(lambda x: np.resize(x, (count, *x.shape[1:])), (fields, start))
+    hull = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), contact.hull(np.asarray(body.hulls)))
+    gravity = np.broadcast_to(np.array([0, 0, -G], np.float32), (count, frames, scenario.steps, 3))
+    _, model, data = scene.template(pad, scenario.contact, scenario.wall)
+    return inner._Worlds(fields, hull, start, gravity), model, data
+
+
+def scaling(frames: int = 4, chunk: int = 32) -> None:
+    """Steps per second against the number of worlds; a table and a plot."""
+    gpu = jax.default_backend() != "cpu"
+    counts = [4**k for k in range(9 if gpu else 7)]
+    scenario = physics.Freefall(height=0.002, frames=frames)
+    rows: list[list[float]] = []
+    steps = frames * scenario.steps
+    for count in counts:
+        full, model, data = worlds(count, frames)
+        split = [jax.tree.map(lambda x, i=i: x[i : i + chunk], full) for i in range(0, count, chunk)]
+        traj = physics.simulate(jax.random.key(0), rod(), Sensor(), scenario, min(count, 256))
+        models, states = in_c([rod()], traj, scenario.contact)
+        models, states = [models[i % len(models)] for i in range(count)], np.resize(states, (count, states.shape[1]))
+        own = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
+        on_device = jax.device_put(full)
+
+        def at_once(full: Any = on_device, model: Any = model, data: Any = data) -> None:
+            jax.block_until_ready(inner._roll(full, model, data))
+
+        def in_chunks(split: list = split, model: Any = model, data: Any = data) -> None:
+            with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
+                list(pool.map(lambda part: jax.block_until_ready(inner._roll(part, model, data)), split))
+
+        def rollout(models: list = models, own: list = own, states: np.ndarray = states) -> None:
+            mujoco.rollout.rollout(models, own, states, nstep=steps, persistent_pool=True)
+
+        seconds = np.median(in_turn(at_once, in_chunks, rollout, repeats=3), axis=0)
+        row = [float(count), *(count * steps / seconds).tolist()]
+        rows.append(row)
+        print(f"{count:6d} worlds: {row[1]:12,.0f} at once {row[2]:12,.0f} in chunks {row[3]:12,.0f} C", flush=True)
+    write_scaling(np.array(rows), jax.devices()[0].device_kind, chunk)
+
+
+def write_scaling(rows: np.ndarray, device: str, chunk: int) -> None:
+    """`scaling.md` and `scaling.png` of rows (worlds, steps/s at once, in chunks, of C)."""
+    from matplotlib.figure import Figure
+
+    names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    lines = [f"| worlds | {' | '.join(names)} |", "|---|---|---|---|"]
+    lines += [f"| {row[0]:,.0f} | {row[1]:,.0f} | {row[2]:,.0f} | {row[3]:,.0f} |" for row in rows]
+    title = f"Steps per second, one hull of 32 vertices ({device}, {os.cpu_count()} cores)"
+    (RESULTS / "scaling.md").write_text("\n".join([title, "", *lines, ""]))
+    figure = Figure(figsize=(5, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for name, column in zip(names, rows[:, 1:].T, strict=True):
+        axes.loglog(rows[:, 0], column, "o-", label=name)
+    axes.set(xlabel="worlds", ylabel="steps per second", title=title)
+    axes.title.set_fontsize(9)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+    figure.savefig(RESULTS / "scaling.png", dpi=150)
+
+
+def first_call(name: str, count: int) -> None:
+    """In a fresh process: print seconds before the first step, and how often `count` objects compiled, as JSON."""
+    scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(count)
+    items = [body for body in items if physics.refusal(body, scenario) is None]
+    begin = time.perf_counter()
+    physics.simulate(jax.random.key(0), items[0], sensor, scenario)
+    first = time.perf_counter() - begin
+    begin = time.perf_counter()
+    physics.simulate(jax.random.key(0), items[0], sensor, scenario)
+    again = time.perf_counter() - begin
+    jax.clear_caches()
+    physics.simulate(jax.random.key(0), items, sensor, scenario)
+    programs = {f: getattr(inner, f)._cache_size() for f in ("_roll", "_draw", "_rigid", "_gravity")}
+    print(json.dumps({"seconds": first - again, "objects": len(items), "programs": programs}))
+
+
+def compilation(count: int = 100) -> None:
+    """Seconds of compilation of each scenario, without and with what an earlier process compiled."""
+    for name in SCENARIOS:
+        with tempfile.TemporaryDirectory() as folder:
+            environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder, "TF_CPP_MIN_LOG_LEVEL": "3"}
+            for kind in ("nothing kept", "kept      "):
+                command = [sys.executable, "-m", "benchmarks.physics", "--first-call", name, "--count", str(count)]
+                told = json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE).stdout)
+                print(
+                    f"{name:9s} {kind}  {told['seconds']:5.1f} s before the first step; {told['objects']} objects: "
+                    + ", ".join(f"{f} {n}" for f, n in told["programs"].items())
+                )
 
 
 def excess_energy(body: objects.Body, hidden: physics.Hidden, pose: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -161,8 +323,18 @@ if __name__ == "__main__":
     parser.add_argument("--soak", type=int, default=0, metavar="N", help="drop N objects and count")
     parser.add_argument("--reroll", type=int, default=0, metavar="N", help="roll the same starts N times (N > 1)")
     parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
+    parser.add_argument("--scaling", action="store_true", help="steps per second against the number of worlds")
+    parser.add_argument("--compile", action="store_true", help="seconds and number of compilations")
+    parser.add_argument("--count", type=int, default=100, help="objects of which compilations are counted")
+    parser.add_argument("--first-call", choices=SCENARIOS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.soak:
+    if arguments.first_call:
+        first_call(arguments.first_call, arguments.count)
+    elif arguments.compile:
+        compilation(arguments.count)
+    elif arguments.scaling:
+        scaling()
+    elif arguments.soak:
         soak(arguments.soak)
     elif arguments.reroll:
         if arguments.reroll < 2:

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed, stages
+from experiments import compilation, freefall, inclined, perturbed, stages
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -76,4 +76,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
+    compilation.keep()
     main(tyro.cli(Config, description=__doc__))

@@ -15,6 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
+from experiments import compilation
 from experiments.progress import Bar, say
 from sts_jax import dataset, evaluation, mvae, training
 
@@ -67,6 +68,7 @@ class Args:
 def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
     """An experiment from the command line."""
     args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
+    compilation.keep()
     config = presets[args.preset]
     scenario = sts.physics.variant(config.collection.scenario, args.hidden)
     collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)

@@ -1,0 +1,265 @@
+"""Rest poses and outcomes do not depend on the step, the engine or the hand: shares beside those of three other sides.
+
+    python -m benchmarks.invariance             # 4,000 runs a side: about 40 minutes on two quiet cores
+    python -m benchmarks.invariance --num 300   # about 4 minutes
+
+A box and a bottle released 20 mm above the pad in any orientation (which face is down), and bottles on the jerked pad
+(the scenario's outcomes). The sides: `simulate` as it ships; half its step; the mirror image (start, jerk and object);
+C MuJoCo, which finds the contacts itself; and C MuJoCo with every vertex a contact. Of a mesh that stands on a face C
+keeps four contacts, so that a round base is a square to it, narrower by up to 30 %, and rocks and walks more; where
+each vertex of the hull is a point of its own, and the mesh stays for the rims, it has the contacts that ours has.
+
+All sides have the same starts and hidden values, so that the interval of a difference is that of paired shares
+(Agresti and Min 2005: 95 %, half a count added to each cell).
+"""
+
+import argparse
+import concurrent.futures
+import copy
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from tqdm import tqdm
+
+from sts_jax import _math, objects, physics
+from sts_jax.dataset.collect import turn, turn_condition
+from sts_jax.physics import scene
+from sts_jax.physics.scenarios import Shape, Start
+from sts_jax.sensor import Sensor
+
+MARGIN = 0.05  # by how much a share may differ
+BOX = (0.06, 0.04, 0.025)  # m
+DROP = physics.Freefall(height=0.02, spread=0.02, frames=36)  # m, m; 1.1 s, after which few still move
+SHAKE = physics.Perturbed(frames=36)
+POINT = 1e-6  # m, radius of a vertex that is a contact
+MESH_GAP = 0.001  # m; beside such vertices the mesh pushes only where it is this deep: at rims, where no vertex is
+UP = math.cos(math.radians(20))  # what leans less rests on the face that is named
+
+
+class MirroredFreefall(physics.Freefall):
+    """The mirror image of each fall, for `objects.mirror` of its object."""
+
+    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
+        """See `Freefall.start`."""
+        return mirror(super().start(key, mirror_shape(shape), pad))
+
+
+class MirroredPerturbed(physics.Perturbed):
+    """The mirror image of each start and jerk, for `objects.mirror` of its object."""
+
+    def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
+        """See `Perturbed.start`."""
+        return mirror(super().start(key, mirror_shape(shape), pad))
+
+
+def mirror(start: Start) -> Start:
+    """A start and its condition in the mirror: y becomes -y."""
+    return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
+
+
+def mirror_shape(shape: Shape) -> Shape:
+    """The shape of `objects.mirror`'s body."""
+    flip = np.array([1, -1, 1], np.float32)
+    return shape._replace(points=shape.points * flip, rests=shape.rests * flip)
+
+
+class Case(NamedTuple):
+    """Runs of one kind, and what their ends are called."""
+
+    name: str
+    scenario: physics.Freefall | physics.Perturbed
+    mirrored: physics.Freefall | physics.Perturbed
+    bodies: list[objects.Body]
+    labels: tuple[str, ...]
+    label: Callable[[Float[Array, "7"], Float[Array, "7"]], Array]  # of the poses of the first and the last frame
+
+
+def box() -> objects.Body:
+    """A solid box of 500 kg/m3."""
+    corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * np.array(BOX) / 2
+    mass = 500 * math.prod(BOX)
+    x, y, z = np.square(BOX)
+    return dataclasses.replace(
+        objects.make(jax.random.key(0), "fork"),  # solid; looks and category do not matter here
+        hulls=jnp.asarray(np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None], jnp.float32),
+        shell_mass=jnp.float32(mass),
+        shell_com=jnp.zeros(3),
+        shell_inertia=jnp.asarray(mass / 12 * np.diag([y + z, x + z, x + y]), jnp.float32),
+    )
+
+
+def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
+    """0, 1, 2: the axis that is vertical at the end; 3: none; 4: it fell off."""
+    del first
+    vertical = jnp.abs(_math.quat_matrix(_math.normalize(last[3:]))[2])
+    face = jnp.where(jnp.max(vertical) > UP, jnp.argmax(vertical), 3)
+    return jnp.where(physics.fell_off(last), 4, face)
+
+
+def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
+    """0: stands, 1: on its head, 2: lies, 3: it fell off."""
+    del first
+    up = _math.quat_matrix(_math.normalize(last[3:]))[2, 2]
+    side = jnp.where(up > UP, 0, jnp.where(up < -UP, 1, 2))
+    return jnp.where(physics.fell_off(last), 3, side)
+
+
+def cases() -> list[Case]:
+    """The box, the bottle, the shaken bottles."""
+    bottles = [objects.make(jax.random.key(i), "bottle") for i in range(4)]
+    squat = objects.make(jax.random.key(27), "bottle")  # 101 mm high, 44 mm wide
+    small, middle, large = (f"on {1e3 * a:.0f} x {1e3 * b:.0f} mm" for a, b in ((BOX[1], BOX[2]), BOX[::2], BOX[:2]))
+    mirrored = MirroredFreefall(**dataclasses.asdict(DROP) | {"contact": DROP.contact})
+    shaken = MirroredPerturbed(**dataclasses.asdict(SHAKE) | {"contact": SHAKE.contact})
+    names = ("box", "bottle", "jerked bottles")
+    return [
+        Case(names[0], DROP, mirrored, [box()], (small, middle, large, "on no face", "fell off"), box_face),
+        Case(names[1], DROP, mirrored, [squat], ("stands", "on its head", "lies", "fell off"), bottle_side),
+        Case(names[2], SHAKE, shaken, bottles, tuple(o.name.lower() for o in physics.Outcome), SHAKE.outcome),
+    ]
+
+
+def roll(
+    case: Case,
+    num: int,
+    *,
+    bodies: Sequence[objects.Body] | None = None,
+    scenario: physics.Scenario | None = None,
+    seed: int = 0,
+) -> Any:
+    """`num` runs of a case, a `Trajectory` of NumPy arrays; its own bodies and scenario unless others are given."""
+    items = list(case.bodies if bodies is None else bodies)
+    each = -(-num // len(items))
+    with tqdm(total=each * len(items), desc=case.name, leave=False, disable=None) as bar:
+        traj = physics.simulate(
+            jax.random.key(seed),
+            items,
+            Sensor(),
+            case.scenario if scenario is None else scenario,
+            each,
+            progress=lambda n: bar.update(n - bar.n),
+        )
+    return jax.tree.map(np.asarray, traj)
+
+
+def halved(scenario: physics.Freefall | physics.Perturbed) -> physics.Freefall | physics.Perturbed:
+    """The scenario with half the time step."""
+    return dataclasses.replace(
+        scenario, contact=dataclasses.replace(scenario.contact, timestep=scenario.contact.timestep / 2)
+    )
+
+
+def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool) -> mujoco.MjModel:
+    """The scene for C MuJoCo, with its own contacts of the mesh, or with every vertex of the hull a contact."""
+    gel, parts = Sensor().gel.size, np.asarray(body.hulls)
+    spec = mujoco.MjSpec.from_string(scene.scene_xml(parts, (float(gel[0]), float(gel[1])), contact))
+    if every_vertex:
+        owner = spec.body("object")
+        mesh = owner.geoms[0]
+        mesh.gap = MESH_GAP
+        for point in np.unique(parts.reshape(-1, 3), axis=0):
+            owner.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[POINT, 0, 0], pos=point, friction=mesh.friction)
+    return spec.compile()
+
+
+def last_in_c(case: Case, traj: Any, *, every_vertex: bool = False) -> np.ndarray:
+    """The last poses of trajectories that C MuJoCo steps from their first frames, under the same gravity."""
+    scenario = case.scenario
+    times = np.arange(scenario.steps * (scenario.frames - 1)) * scenario.contact.timestep
+    gravities = jax.jit(jax.vmap(jax.vmap(scenario.gravity, (0, None)), (None, 0)))
+    compiled = [c_model(body, scenario.contact, every_vertex) for body in case.bodies]
+    rigid = jax.jit(jax.vmap(objects.rigid, (None, 0, 0, 0)))
+
+    def one(model: mujoco.MjModel, pose: np.ndarray, velocity: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:3] = pose, velocity[:3]
+        mujoco.mju_rotVecQuat(data.qvel[3:], velocity[3:], pose[3:] * [1, -1, -1, -1])
+        changes = np.flatnonzero(np.any(np.diff(gravity, axis=0), axis=1)) + 1
+        for part in np.split(gravity, changes):
+            model.opt.gravity[:] = part[0]
+            mujoco.mj_step(model, data, nstep=len(part))
+        return np.array(data.qpos)
+
+    ends: list[np.ndarray] = []
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        for index, body in enumerate(case.bodies):
+            own = traj.body == index
+            hidden = jax.tree.map(lambda x, own=own: x[own], traj.hidden)
+            properties = [np.asarray(x, np.float64) for x in rigid(body, hidden.fill, hidden.shell_scale, hidden.up)]
+            models = []
+            for mass, com, inertia, friction in zip(*properties, hidden.friction, strict=True):
+                models.append(copy.copy(compiled[index]))
+                scene.set_rigid(models[-1], mujoco.MjData(models[-1]), mass, com, inertia, float(friction))
+            starts = (traj.pose[own, 0].astype(np.float64), traj.velocity[own, 0].astype(np.float64))
+            gravity = np.asarray(gravities(times, traj.condition[own]), np.float64)
+            ends += pool.map(one, models, *starts, gravity)
+    return np.array(ends, np.float32)
+
+
+def named(case: Case, first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """The index of each run's label."""
+    return np.asarray(jax.vmap(case.label)(jnp.asarray(first), jnp.asarray(last)))
+
+
+def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Middle and half width of the 95 % interval of the share of b less that of a, of the same runs."""
+    gained, lost, count = np.sum(b & ~a) + 0.5, np.sum(a & ~b) + 0.5, len(a) + 2
+    middle = (gained - lost) / count
+    return middle, 1.96 * math.sqrt((gained + lost) / count - middle**2) / math.sqrt(count)
+
+
+def sides(case: Case, num: int) -> dict[str, np.ndarray]:
+    """The labels of every run on each side; the first side is ours."""
+    ours = roll(case, num)
+    half = roll(case, num, scenario=halved(case.scenario))
+    flipped = roll(case, num, scenario=case.mirrored, bodies=[objects.mirror(body) for body in case.bodies])
+    first = ours.pose[:, 0]
+    print(
+        f"{case.name}: {len(first)} runs a side; unsettled {100 * np.mean(~ours.settled):.1f} %, drawn again "
+        f"{', '.join(str(int(t.resampled.sum())) for t in (ours, half, flipped))} (ours, half, mirrored)"
+    )
+    return {
+        "ours": named(case, first, ours.pose[:, -1]),
+        "half step": named(case, half.pose[:, 0], half.pose[:, -1]),
+        "mirrored": named(case, flipped.pose[:, 0], flipped.pose[:, -1]),
+        "C MuJoCo": named(case, first, last_in_c(case, ours)),
+        "C, every vertex": named(case, first, last_in_c(case, ours, every_vertex=True)),
+    }
+
+
+def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
+    """Print every outcome's shares and whether its difference lies within the margin; return whether all do."""
+    ours, within = found["ours"], True
+    for side, theirs in list(found.items())[1:]:
+        print(f"    {side}: {100 * np.mean(ours == theirs):.1f} % of the runs end alike")
+        for index in np.union1d(ours, theirs):
+            a, b = ours == index, theirs == index
+            middle, half = difference(a, b)
+            inside = abs(middle) + half < margin
+            within &= inside
+            print(
+                f"        {labels[index]:16s} {100 * a.mean():5.1f} % and {100 * b.mean():5.1f} %, difference "
+                f"{100 * middle:+5.2f} [{100 * (middle - half):+5.2f}, {100 * (middle + half):+5.2f}]"
+                f"{'' if inside else '   OUTSIDE'}"
+            )
+    return within
+
+
+def main(num: int) -> None:
+    """All cases."""
+    within = [compare(sides(case, num), case.labels) for case in cases()]
+    print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--num", type=int, default=4000, help="runs a side")
+    main(parser.parse_args().num)
