@@ -166,3 +166,14 @@ def test_what_lies_across_the_wall_is_held_by_it_as_in_c(lean: float) -> None:
     np.testing.assert_allclose(abs(found.frame[deepest, 0] @ normal), 1, atol=1e-3)
     assert abs(found.pos[deepest, 1] - pos[1]) < (0.011 if lean == 0 else 1e-3)
     assert 8 <= deepest < 12
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1e-7, 1e-5, 1e-3])
+def test_edges_all_but_parallel_to_a_rim_take_no_contact_away(yaw: float) -> None:
+    pose = jnp.array([0.03, -0.01, 0.02 - 3e-5, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+    box = points("box")[:, :, [0, 2, 1]]  # lies on its side, 60 x 80 mm
+    found = contact.collide(jax.tree.map(jnp.asarray, contact.hull(box)), pose, HALF)
+    there = np.asarray(found.pos)[np.asarray(found.dist) < 0]
+    np.testing.assert_allclose(np.unique(there[:, 0].round(3)), [0.0, 0.06])
+    np.testing.assert_allclose(np.unique(there[:, 1].round(3)), [-0.05, 0.03])
+    assert len(there) == 4

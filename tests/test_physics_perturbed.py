@@ -67,8 +67,9 @@ def test_the_condition_is_the_jerk_and_the_future_does_not_leak(
 
 def test_gravity_holds_the_whole_impulse_and_ends() -> None:
     condition = jnp.array([3.0, -4.0, 0.0754])
+    scenario = dataclasses.replace(SCENARIO, contact=physics.Contact(timestep=0.001))
     time = jnp.arange(-32, 300) * 1e-3
-    gravity = jax.vmap(lambda t: SCENARIO.gravity(t, condition))(time)
+    gravity = jax.vmap(lambda t: scenario.gravity(t, condition))(time)
     np.testing.assert_allclose(gravity[:, 2], -G, rtol=1e-6)
     np.testing.assert_array_equal(gravity[:32, :2], 0)
     np.testing.assert_allclose(gravity[32:, :2].sum(0) * 1e-3, [-3 * 0.0754, 4 * 0.0754], rtol=1e-4)
@@ -90,7 +91,8 @@ def driven(body: objects.Body, mass: float, com: np.ndarray, inertia: np.ndarray
 
 
 def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
-    # Compared to the end of the jerk, while it stands or slides: afterwards small things decide, in one engine too.
+    # Compared to the end of the jerk, until one side of the base lifts off (it stands 10 um deep): then small things
+    # decide, in one engine too.
     told, ours, same = [], [], []
     for row in range(2 * NUM):
         body, friction = bottles[shaken.body[row]], float(shaken.hidden.friction[row])
@@ -111,7 +113,7 @@ def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shak
             mujoco.mj_step(moving, a)
             mujoco.mj_step(fixed, b)
             touching &= a.ncon > 0
-            rocks |= upright(b.qpos[3:]) < np.cos(np.radians(1))
+            rocks |= upright(b.qpos[3:]) < np.cos(np.radians(0.05))
             if touching and not rocks and time < condition[2]:
                 told.append(np.linalg.norm(a.qpos[2:5] - [*a.qpos[:2], 0] - b.qpos[:3]))
         last = jnp.asarray(a.qpos[2:] - [*a.qpos[:2], 0, 0, 0, 0, 0], jnp.float32)
@@ -159,9 +161,10 @@ def test_a_tall_prism_topples_at_g_b_over_h(shape: str) -> None:
     for factor, falls in ((0.97, False), (1.03, True)):
         size = factor * G * reach / (height / 2)
         gravity = np.stack([size * np.cos(ANGLES), size * np.sin(ANGLES), np.full(8, -G)], axis=-1)
-        still = np.tile([0, 0, -G], (8, 1, 50, 1))
-        pulled = np.tile(gravity[:, None, None], (1, 14, 50, 1))
-        pulled[:, :2, :, :2] *= np.linspace(0, 1, 100).reshape(2, 50, 1)  # sustained, not a blow
+        steps = round(0.05 / SCENARIO.contact.timestep)
+        still = np.tile([0, 0, -G], (8, 1, steps, 1))
+        pulled = np.tile(gravity[:, None, None], (1, 20, steps, 1))
+        pulled[:, :8, :, :2] *= np.linspace(0, 1, 8 * steps).reshape(8, steps, 1)  # sustained, not a blow
         last, _ = ROLL(own, data, hull, state, jnp.asarray(np.concatenate([still, pulled], axis=1), jnp.float32))
         lean = np.degrees(np.arccos(np.asarray(jax.vmap(upright)(last.qpos[:, 3:]))))
         assert np.all((lean > 20) == falls), (factor, lean)

@@ -17,11 +17,11 @@ from sts_jax.sensor import Sensor
 PAD = (0.15, 0.15)
 SLOPE = np.radians(30)
 AZIMUTHS = np.radians([0, 22.5, 45, 90, 200])
-STEPS = 50
 ROLL = jax.jit(jax.vmap(roll.roll, in_axes=(None, None, None, 0, 0)))
 
 
 SCENARIO = physics.Inclined()
+STEPS = round(0.05 / SCENARIO.contact.timestep)  # a record every 50 ms
 CORNERS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.03, 0.02, 0.01]
 INERTIA = 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4])
 
@@ -45,7 +45,7 @@ def slide(friction: float, constants: physics.Contact, frames: int) -> roll.Reco
 
 def test_below_the_friction_angle_it_holds() -> None:
     found = slide(float(np.tan(SLOPE) / 0.97), physics.Inclined().contact, 10)
-    creep = np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 6, :2], axis=1) / (5 * STEPS * 1e-3)
+    creep = np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 6, :2], axis=1) / (5 * 0.05)
     assert np.all(creep < 1e-3), creep
 
 
@@ -54,7 +54,7 @@ def test_above_it_slides_with_what_friction_leaves(friction: float) -> None:
     found = slide(friction, physics.Inclined().contact, 10)
     down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
     speed = np.einsum("nfi,ni->nf", found.velocity[..., :2], down)
-    gained = (speed[:, 4] - speed[:, 2]) / (2 * STEPS * 1e-3)
+    gained = (speed[:, 4] - speed[:, 2]) / (2 * 0.05)
     expected = G * (np.sin(SLOPE) - friction * np.cos(SLOPE))
     np.testing.assert_allclose(gained, expected, rtol=0.02)
     across = np.abs(found.velocity[:, 4, 0] * down[:, 1] - found.velocity[:, 4, 1] * down[:, 0])
@@ -87,7 +87,7 @@ def test_a_ball_rolls_with_five_sevenths_of_the_pull() -> None:
     model.opt.gravity[:] = G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
     data.qpos[:] = [0, -0.05, radius, 1, 0, 0, 0]
     ours = scene.mjx.put_model(model)
-    step = jax.jit(lambda d: jax.lax.fori_loop(0, 100, lambda _, d: scene.mjx.step(ours, d), d))
+    step = jax.jit(lambda d: jax.lax.fori_loop(0, 2 * STEPS, lambda _, d: scene.mjx.step(ours, d), d))
     speeds = [0.0]
     state = scene.mjx.put_data(model, data)
     for _ in range(2):

@@ -25,6 +25,7 @@ from sts_jax import _math
 
 PAD_CONTACTS, WALL_CONTACTS = 8, 4  # MJX reserves four for each pair of boxes
 STEEP = 5.0  # depth against extent in the choice of points
+APART = 0.001  # m, between the two deepest points
 SKIN = 0.001  # m; points this much higher than the deepest one may still belong to the support
 
 
@@ -86,8 +87,8 @@ def _vertices(points: Float[Array, "h 3"], half: Float[Array, "2"]) -> tuple[Arr
 def _rim(ends: Float[Array, "e 2 3"], half: Float[Array, "2"], axis: int, sign: float) -> tuple[Array, Array, Array]:
     out = sign * ends[..., axis] - half[axis]
     inner = jnp.where((out[:, 0] < out[:, 1])[:, None], ends[:, 0], ends[:, 1])
-    share = out[:, 0] / jnp.where(out[:, 0] == out[:, 1], 1.0, out[:, 0] - out[:, 1])
     crosses = out[:, 0] * out[:, 1] < 0
+    share = jnp.where(crosses, out[:, 0] / jnp.where(crosses, out[:, 0] - out[:, 1], 1.0), 0.0)
     point = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
     # The edge ends above the box, or inside it nearer to the top than to a side, or beyond it: it came through the top.
     through_top = -inner[:, 2] <= jnp.maximum(0, jnp.min(half - jnp.abs(inner[:, :2]), axis=1))
@@ -113,15 +114,23 @@ def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Arra
 
 
 def _spread(depth: Float[Array, "c"], across: Float[Array, "c 2"], num: int) -> Int[Array, "k"]:
+    """Which points to take: the two deepest, over which it would tip, and those that reach farthest around them."""
     deepest = jnp.max(depth)
-    candidate = jnp.where(depth > jnp.maximum(0, deepest - SKIN), 0.0, -1e3)
+    candidate = depth > jnp.maximum(0, deepest - SKIN)
+
+    def best(score: Float[Array, "s c"]) -> Int[Array, "s"]:
+        # XLA's argmax is slow on CPU: the largest value, then the first place where it stands.
+        score = jnp.where(candidate, score, -jnp.inf)
+        places = jnp.where(score == jnp.max(score, axis=1, keepdims=True), jnp.arange(len(depth)), len(depth) - 1)
+        return jnp.min(places, axis=1)
+
+    first = best(depth[None])
+    elsewhere = jnp.sum((across - across[first[0]]) ** 2, axis=1) > APART**2
     # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
-    angle = 0.4 + 2 * np.pi * np.arange(num - 1) / (num - 1)
+    angle = 0.4 + 2 * np.pi * np.arange(num - 2) / (num - 2)
     reach = [x * across[:, 0] + y * across[:, 1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
-    score = jnp.stack([depth, *(r + STEEP * depth for r in reach)]) + candidate
-    # XLA's argmax is slow on CPU: the largest value, then the first place where it stands.
-    places = jnp.where(score == jnp.max(score, axis=1, keepdims=True), jnp.arange(len(depth)), len(depth) - 1)
-    return jnp.min(places, axis=1)
+    others = jnp.stack([jnp.where(elsewhere, depth, -1.0), *(r + STEEP * depth for r in reach)])
+    return jnp.concatenate([first, best(others)])
 
 
 def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -139,7 +148,8 @@ def collide(
 ) -> Contacts:
     """The contacts of an object with a box whose top is centred in the origin.
 
-    The deepest point is always among them; the others, within SKIN of its depth, reach farthest in fixed directions.
+    The two deepest points are always among them; the others, within SKIN of the deepest, reach farthest in fixed
+    directions.
 
     Args:
         body: its convex parts.

@@ -53,14 +53,15 @@ _SCENE = """
 class Contact:
     """The contact and solver constants of every scenario (MuJoCo's names and meanings)."""
 
-    timestep: float = 0.001  # s
+    timestep: float = 0.0005  # s
     time_constant: float = 0.003  # s, solref; stiff: less than 0.1 mm deep at rest, about 1 mm at impact
     damping_ratio: float = 0.8  # solref; a gel bounces little: most drops still touch, part and touch again
-    # A contact that is stiff at first touch rattles where something slides on it: its friction is then off by up to
-    # 10 %, in C MuJoCo too.
+    # A contact that is stiff at first touch, or whose `width` is short for the time step, rattles under what slides: its
+    # friction is then off by up to 10 %. Where `width` is long, what leans over an edge sinks in and tips early. Both are
+    # so in C MuJoCo too.
     soft: float = 0.02  # solimp at first touch
     hard: float = 0.99  # solimp at `width`
-    width: float = 0.00005  # m, solimp
+    width: float = 0.00002  # m, solimp
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
     # Rolling friction widens the base that an object topples over by its length, so it must be small beside it.
     rolling: float = 0.0002  # m
