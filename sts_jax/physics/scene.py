@@ -56,9 +56,9 @@ class Contact:
     timestep: float = 0.0005  # s
     time_constant: float = 0.003  # s, solref; stiff: less than 0.1 mm deep at rest, about 1 mm at impact
     damping_ratio: float = 0.8  # solref; a gel bounces little: most drops still touch, part and touch again
-    # A contact that is stiff at first touch, or whose `width` is short for the time step, rattles under what slides: its
-    # friction is then off by up to 10 %. Where `width` is long, what leans over an edge sinks in and tips early. Both are
-    # so in C MuJoCo too.
+    # A contact that is stiff at first touch, or whose `width` is short for the time step, rattles under what slides,
+    # and its friction is then off by up to 10 %. Where `width` is long, what leans over an edge sinks in and tips
+    # early. Both are so in C MuJoCo too.
     soft: float = 0.02  # solimp at first touch
     hard: float = 0.99  # solimp at `width`
     width: float = 0.00002  # m, solimp
