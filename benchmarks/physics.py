@@ -1,16 +1,14 @@
-"""Physics: steps per second beside C MuJoCo, compilation, and what becomes of many drops.
+"""Physics: steps per second beside C MuJoCo, compilation, and what hidden values decide.
 
     python -m benchmarks.physics             # about 2 minutes
     python -m benchmarks.physics --scaling   # about 10 minutes on two cores; writes benchmarks/results/physics/
     python -m benchmarks.physics --compile   # about 8 minutes on two cores
-    python -m benchmarks.physics --soak 3000 # about 10 minutes on two cores
     python -m benchmarks.physics --reroll 6  # about 2 minutes
 
 The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in both engines, C MuJoCo's
 batch (`mujoco.rollout`) on all cores, measured in turn. `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU).
 `--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in fresh
-processes: first with an empty cache of compiled programs, then with what the first left there. `--soak` drops
-objects of all categories (a new one every eight drops) and counts. `--reroll` rolls the same starts again with other
+processes: first with an empty cache of compiled programs, then with what the first left there. `--reroll` rolls the same starts again with other
 hidden values: how far the end is decided by what cannot be seen.
 """
 
@@ -35,12 +33,11 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
-from tqdm import tqdm
 
-from sts_jax import _math, objects, physics
+from sts_jax import objects, physics
 from sts_jax.physics import contact, scene
 from sts_jax.physics.scenarios import G
-from sts_jax.physics.simulate import SUNK_LIMIT, WORKERS
+from sts_jax.physics.simulate import WORKERS
 from sts_jax.sensor import Sensor
 
 inner = importlib.import_module("sts_jax.physics.simulate")  # the package gives this name to the function
@@ -246,56 +243,6 @@ def compilation(count: int = 100) -> None:
                 )
 
 
-def excess_energy(body: objects.Body, hidden: physics.Hidden, pose: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Kinetic and potential energy of each frame over frame 0's, less 1; height is counted from the pad."""
-    energies = []
-    for (mass, com, inertia), p, v in zip(mass_properties(body, hidden), pose, velocity, strict=True):
-        rotation = np.asarray(_math.quat_matrix(jnp.asarray(p[:, 3:])), np.float64)
-        arm, turn = rotation @ com, v[:, 3:]
-        speed_of_com = v[:, :3] + np.cross(turn, arm)
-        own_turn = np.einsum("fji,fj->fi", rotation, turn)
-        kinetic = 0.5 * mass * (speed_of_com**2).sum(1) + 0.5 * np.einsum("fi,ij,fj->f", own_turn, inertia, own_turn)
-        energies.append(kinetic + mass * G * (p[:, 2] + arm[:, 2]))
-    energy = np.array(energies)
-    return energy / energy[:, :1] - 1
-
-
-def soak(count: int) -> None:
-    """Drops `count` objects and prints what became of them."""
-    sensor, scenario, num = Sensor(), physics.Freefall(), 8
-    items = bodies(-(-count // num))
-    with tqdm(total=len(items) * num, unit="drops") as bar:
-        traj = physics.simulate(
-            jax.random.key(1), items, sensor, scenario, num, progress=lambda n: bar.update(n - bar.n)
-        )
-    traj = jax.tree.map(np.asarray, traj)
-    fell = traj.outcome == physics.Outcome.FELL_OFF
-    weight, excess = np.zeros(len(fell)), np.zeros(len(fell))
-    for index, body in enumerate(items):
-        own = np.flatnonzero(traj.body == index)
-        hidden = jax.tree.map(lambda x, own=own: x[own], traj.hidden)
-        weight[own] = [G * mass for mass, _, _ in mass_properties(body, hidden)]
-        free = excess_energy(body, hidden, traj.pose[own], traj.velocity[own])
-        excess[own] = np.max(np.where(traj.contact[own] | fell[own][:, None], -1, free), axis=1)
-    resting = traj.settled & ~fell
-    error = np.abs(traj.wrench[resting, -1, 2] / weight[resting] - 1)
-    category = np.array([int(items[b].category) for b in traj.body])
-    print(f"{len(fell)} drops of {len(items)} objects")
-    print(f"drawn again (non-finite or deeper than {1e3 * SUNK_LIMIT:.0f} mm)  {traj.resampled.sum()}")
-    print(f"deepest into the pad: median {1e3 * np.median(traj.sunk):.2f} mm, largest {1e3 * traj.sunk.max():.2f} mm")
-    print(f"rests {100 * np.mean(~fell):.1f} %, fell off {100 * np.mean(fell):.1f} %")
-    print(
-        f"touch, part and touch again  {100 * np.mean(traj.touches >= 2):.1f} % (median {np.median(traj.touches):.0f})"
-    )
-    print(f"unsettled  {100 * np.mean(~traj.settled):.2f} %")
-    for index, name in enumerate(objects.CATEGORIES):
-        own = category == index
-        unsettled, left = 100 * np.mean(~traj.settled[own]), 100 * np.mean(fell[own])
-        print(f"    {name:9s} unsettled {unsettled:5.2f} %, fell {left:5.2f} %")
-    print(f"wrench at rest against the weight: error {100 * np.median(error):.3f} %, largest {100 * error.max():.2f} %")
-    print(f"energy out of contact above the start's: largest {100 * excess.max():.3f} %")
-
-
 def reroll(times: int, *, num_objects: int = 48, num: int = 4) -> None:
     """Drops the same starts several times with fresh fill, shell and friction and prints how the ends differ."""
     sensor, scenario, items = Sensor(), physics.Freefall(), bodies(num_objects)
@@ -320,7 +267,6 @@ def reroll(times: int, *, num_objects: int = 48, num: int = 4) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--soak", type=int, default=0, metavar="N", help="drop N objects and count")
     parser.add_argument("--reroll", type=int, default=0, metavar="N", help="roll the same starts N times (N > 1)")
     parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
     parser.add_argument("--scaling", action="store_true", help="steps per second against the number of worlds")
@@ -334,8 +280,6 @@ if __name__ == "__main__":
         compilation(arguments.count)
     elif arguments.scaling:
         scaling()
-    elif arguments.soak:
-        soak(arguments.soak)
     elif arguments.reroll:
         if arguments.reroll < 2:
             parser.error(f"--reroll {arguments.reroll}: ends are compared, roll at least twice")
