@@ -8,8 +8,8 @@
 The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in both engines, C MuJoCo's
 batch (`mujoco.rollout`) on all cores, measured in turn. `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU).
 `--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in fresh
-processes: first with an empty cache of compiled programs, then with what the first left there. `--reroll` rolls the same starts again with other
-hidden values: how far the end is decided by what cannot be seen.
+processes: first with an empty cache of compiled programs, then with what the first left there. `--reroll` rolls the
+same starts again with other hidden values: how far the end is decided by what cannot be seen.
 """
 
 import argparse
