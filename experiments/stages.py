@@ -20,6 +20,7 @@ from experiments.progress import Bar, say
 from sts_jax import dataset, evaluation, mvae, training
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "sts_jax"  # what is made of mesh files
+LEAST_OBJECTS = 10  # of a folder, so that whole ones can be held out to validate and to test
 # The rows of the paper's Table 1, by the modalities a model has.
 MODELS: dict[str, tuple[str, ...]] = {
     "mvae": ("visual", "tactile", "pose"),
@@ -88,6 +89,8 @@ def with_meshes(collection: dataset.Collection, folder: Path, workdir: Path) -> 
     )
     write(workdir / "objects.txt", listing.encode())
     say(f"{len(meshes.names)} objects can be used; {workdir / 'objects.txt'} has them and what was left out")
+    if len(meshes.names) < LEAST_OBJECTS:
+        raise ValueError(f"{folder}: {len(meshes.names)} objects are too few to hold some out: give {LEAST_OBJECTS}")
     each = max(collection.num_per_object, round(collection.num_trajectories / len(meshes.names)))
     return dataclasses.replace(collection, meshes=meshes, num_objects=len(meshes.names), num_per_object=each)
 

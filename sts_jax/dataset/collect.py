@@ -23,7 +23,6 @@ from sts_jax.sensor import Sensor
 
 # Frames rendered by one compiled call.
 RENDER_BATCH = 32
-LEAST_OBJECTS = 4
 SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
 
 
@@ -158,7 +157,9 @@ def sample_of_class(collection: Collection, name: str) -> objects.Body:
     """Some object of a class: of the procedural ones the same for all collections, it may stand in for any of them."""
     names = class_names(collection)
     if name not in names:
-        raise ValueError(f"no object of the collection is a {name!r}: its classes are {', '.join(sorted(set(names)))}")
+        raise ValueError(
+            f"no object of the collection is a {name!r}: its classes are {', '.join(dict.fromkeys(names))}"
+        )
     if collection.meshes is not None:
         return make_bodies(collection, np.array([names.index(name)]))[0]
     return objects.make(jax.random.key(0), name)
@@ -171,8 +172,6 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     names = np.array(class_names(collection))
     members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
     blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
-    if len(names) < LEAST_OBJECTS:
-        raise ValueError(f"{len(names)} objects cannot be split by object: at least {LEAST_OBJECTS} are needed")
     cuts = np.round(np.cumsum(list(SPLITS.values()))[:-1] * collection.num_objects).astype(int)
     parts = np.split(np.concatenate(blocks), cuts)
     return {name: np.sort(part).astype(np.int64) for name, part in zip(SPLITS, parts, strict=True)}
