@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from sts_jax import _math, objects, physics
+from sts_jax import _math, dataset, objects, physics
 from sts_jax.physics.scenarios import G
 from sts_jax.physics.simulate import SUNK_LIMIT
 from sts_jax.sensor import Sensor
@@ -123,10 +123,7 @@ def main(num: int, names: list[str], keep: Path) -> None:
             if not path.exists():
                 found = block(name, index, count)
                 keep.mkdir(parents=True, exist_ok=True)
-                whole = path.with_suffix(".part")
-                with whole.open("wb") as file:
-                    np.savez(file, **found)  # type: ignore[arg-type]
-                whole.rename(path)
+                dataset.write_arrays(path, found)
             with np.load(path) as kept:
                 parts.append(dict(kept))
         print(report(name, {field: np.concatenate([p[field] for p in parts])[:num] for field in parts[0]}), flush=True)

@@ -9,8 +9,6 @@ Leaves `runs/freefall/`: config.json, dataset/, models/NAME/, metrics.json, tabl
 the same --workdir it goes on where it stopped, and touches nothing where all is done.
 """
 
-import dataclasses
-
 from experiments import stages
 from sts_jax import dataset, physics, training
 
@@ -19,30 +17,8 @@ DEFAULT = stages.Config(
     training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(1500, 600, 600, 100),
 )
-SMOKE = dataclasses.replace(
-    DEFAULT,
-    collection=dataset.Collection(
-        physics.Freefall(), num_objects=16, num_per_object=2, num_full=1, objects_per_shard=8, symmetries=False
-    ),
-    training=dataclasses.replace(DEFAULT.training, batch_size=8, log_every=2, checkpoint_every=4),
-    steps=(8, 8, 8, 8),
-)
-PAPER = stages.Config(
-    collection=dataset.Collection(
-        physics.Freefall(),
-        num_objects=340,
-        num_per_object=5,  # 1,700 trajectories
-        num_full=1700,  # of about 60 frames of both streams
-        symmetries=False,
-        crop=True,
-        objects_per_shard=20,
-    ),
-    training=training.TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
-    targets="own",
-    rotation="quaternion",
-    mask_blank_touch=False,
-    splits=("trajectory", "object"),
-)
+SMOKE = stages.smoke(DEFAULT)
+PAPER = stages.paper(dataset.Collection(physics.Freefall()), num_objects=340, num_per_object=5)  # 1,700 trajectories
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
 if __name__ == "__main__":

@@ -20,30 +20,8 @@ DEFAULT = stages.Config(
     training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
-SMOKE = dataclasses.replace(
-    DEFAULT,
-    collection=dataclasses.replace(
-        OBJECTS, num_objects=16, num_per_object=2, num_full=4, objects_per_shard=8, symmetries=False
-    ),
-    training=dataclasses.replace(DEFAULT.training, batch_size=8, log_every=2, checkpoint_every=4),
-    steps=(8, 8, 8, 8),
-)
-PAPER = stages.Config(
-    collection=dataclasses.replace(
-        OBJECTS,
-        num_objects=480,
-        num_per_object=5,  # 2,400 trajectories
-        num_full=2400,  # of about 60 frames of both streams
-        symmetries=False,
-        crop=True,
-        objects_per_shard=20,
-    ),
-    training=training.TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
-    targets="own",
-    rotation="quaternion",
-    mask_blank_touch=False,
-    splits=("trajectory", "object"),
-)
+SMOKE = stages.smoke(DEFAULT)
+PAPER = stages.paper(OBJECTS, num_objects=480, num_per_object=5)  # 2,400 trajectories
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
 if __name__ == "__main__":

@@ -54,6 +54,35 @@ class Config:
     num_shown: int = 8  # held-out trajectories in the figures
 
 
+def smoke(default: Config) -> Config:
+    """An experiment for tests: every stage, a little of each."""
+    collection = dataclasses.replace(
+        default.collection, num_objects=16, num_per_object=2, num_full=4, objects_per_shard=8, symmetries=False, seed=0
+    )
+    schedule = dataclasses.replace(default.training, batch_size=8, log_every=2, checkpoint_every=4)
+    return dataclasses.replace(default, collection=collection, training=schedule, steps=(8, 8, 8, 8))
+
+
+def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
+    """The paper's schedule and choices, on all frames of so many trajectories."""
+    return Config(
+        collection=dataclasses.replace(
+            collection,
+            num_objects=num_objects,
+            num_per_object=num_per_object,
+            num_full=num_objects * num_per_object,  # of about 60 frames of both streams
+            symmetries=False,
+            crop=True,
+            objects_per_shard=20,
+        ),
+        training=training.TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
+        targets="own",
+        rotation="quaternion",
+        mask_blank_touch=False,
+        splits=("trajectory", "object"),
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class Args:
     """What the command line of an experiment says."""

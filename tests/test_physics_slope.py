@@ -213,7 +213,7 @@ def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
     assert wide.max() > 0.88
     assert physics.variant(physics.Perturbed(), "off-centre").tilt == np.pi
     with pytest.raises(ValueError, match="unknown variant 'none'"):
-        physics.variant(SCENARIO, "none")  # type: ignore[arg-type]
+        physics.variant(SCENARIO, "none")
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,10 @@ def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
 
 def refusal(body: Body, scenario: Scenario) -> str | None:
     """Why an object cannot start as a scenario asks, or None if it can."""
-    rests, _ = _rests(body)
+    return _refusal(_rests(body)[0], scenario)
+
+
+def _refusal(rests: np.ndarray, scenario: Scenario) -> str | None:
     if not len(rests):
         return "its centre of mass lies outside its hull, it rests on no face"
     if scenario.must_stand and rests[:, 2].max() < math.cos(UPRIGHT):
@@ -144,11 +147,11 @@ def _rests(body: Body) -> tuple[np.ndarray, np.ndarray]:
 
 def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
     """What decides the starts of each body, padded to a common size."""
-    for index, body in enumerate(bodies):
-        reason = refusal(body, scenario)
+    found = [(np.asarray(body.hulls).reshape(-1, 3), *_rests(body)) for body in bodies]
+    for index, (_, rests, _) in enumerate(found):
+        reason = _refusal(rests, scenario)
         if reason is not None:
             raise BodyError(index, f"{reason}: leave it out")
-    found = [(np.asarray(body.hulls).reshape(-1, 3), *_rests(body)) for body in bodies]
 
     def pad(arrays: Sequence[np.ndarray], mode: Literal["edge", "constant"]) -> np.ndarray:
         size = max(map(len, arrays))
