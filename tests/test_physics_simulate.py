@@ -151,9 +151,9 @@ def test_states_are_c_mujoco_s_before_and_shortly_after_the_first_touch(
                 break
     assert len(after) == 4 * NUM
     assert np.max(before) < 2e-5
-    # Within one frame of a touch at 1 m/s: nearly all drops strike with a single point.
-    assert np.median(after) < 1e-4
-    assert np.mean(np.array(after) < 1e-3) >= 0.8
+    # Within one frame of a touch at 1 m/s: nearly all drops strike with one or two points, which C finds too.
+    assert np.median(after) < 1e-6
+    assert np.mean(np.array(after) < 1e-3) >= 0.9
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
@@ -221,7 +221,8 @@ def test_what_comes_later_leaves_frame_0_bit_identical() -> None:
 def test_gravity_may_change_with_time() -> None:
     gravity = jnp.zeros((3, 100, 3)).at[0, :10, 1].set(3.0)
     _, record = ROLL(*block(0.1), released(1.0), gravity)
-    np.testing.assert_allclose(record.velocity[:, :3], [[0, 0.03, 0]] * 3, atol=1e-6)
+    speed = 3.0 * 10 * physics.Contact().timestep
+    np.testing.assert_allclose(record.velocity[:, :3], [[0, speed, 0]] * 3, atol=1e-6)
 
 
 def test_same_key_same_bytes_and_independent_of_number(bodies: list[objects.Body], drops: physics.Trajectory) -> None:

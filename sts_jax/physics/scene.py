@@ -11,8 +11,11 @@ contacts. `compile_scene` is the same scene with the object's mesh, for C MuJoCo
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import io
+from types import ModuleType
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
@@ -25,6 +28,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, another 
 PAD_DEPTH = 0.2  # m; what leaves the pad slides down its side and never gets beneath it
 WALL_DEPTH = 0.01  # m, thickness of the stop wall
 WALL_OVERHANG = 0.05  # m, how far the wall reaches beyond the pad to either side
+SMALLEST_SLIP = 1e-6  # of |u|^2, what |u + alpha v|^2 is at least in the line search: more than float32's rounding
 CONDIM = 6  # rows of the solver a contact: normal, two of sliding, one of torsion, two of rolling
 
 _SCENE = """
@@ -180,6 +184,31 @@ def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 
 
+def _sound_solver() -> ModuleType:
+    """A copy of MJX 3.17's solver whose line search never meets NaN.
+
+    At each step length alpha it takes the root of |u + alpha v|^2, as uu + alpha (2 uv + alpha vv). In float32 that may
+    come out below zero where the tangential part is zero, which is so in free fall; the search then gives up. Of the
+    first touches of drops without spin, one in six stopped short of the contact's force, up to 0.15 m/s wrong.
+    """
+    spec = importlib.util.find_spec("mujoco.mjx._src.solver")
+    assert spec is not None
+    assert spec.loader is not None
+    solver = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(solver)
+    create = solver._LSPoint.create
+
+    def point(m, d, ctx, alpha, jv, quad, quad_gauss, uu, v0, uv, vv):  # type: ignore[no-untyped-def]
+        short = SMALLEST_SLIP * uu - (uu + alpha * (2 * uv + alpha * vv))
+        return create(m, d, ctx, alpha, jv, quad, quad_gauss, uu + jnp.maximum(0, short), v0, uv, vv)
+
+    solver._LSPoint.create = point
+    return solver
+
+
+_SOLVER = _sound_solver()
+
+
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
     """The position stage of `mjx.forward`, with given contacts in place of those of the stand-in box."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
@@ -193,7 +222,7 @@ def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
     """`mjx.step` (semi-implicit Euler) with given contacts."""
     data = mjx.fwd_velocity(model, position(model, data, contacts))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    return mjx.euler(model, mjx.solve(model, data))
+    return mjx.euler(model, _SOLVER.solve(model, data))
 
 
 def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:
