@@ -214,8 +214,8 @@ def line_up(
     """A test for fresh eyes: a prediction, and two last moments of which one is its own.
 
     The other candidate is the target of a held-out trajectory of another object of the same category. Where there is
-    one, its object has no row of its own: rows must not tell of one another. Which side is right is written to
-    `key_path` only.
+    one, its object has no row of its own: rows must not tell of one another; nor do both candidates show an empty
+    sensor. Which side is right is written to `key_path` only.
 
     Args:
         path: The PNG to write.
@@ -237,10 +237,7 @@ def line_up(
     shown = np.isin(test.object, test.object[rows])
     answers = []
     for place, own in enumerate(rows):
-        others = test.object != test.object[own]
-        same = others & (category == category[own])
-        choices = [same & ~shown, same, others, np.arange(len(shown)) != own]
-        other = int(rng.choice(np.flatnonzero(next(c for c in choices if c.any()))))
+        other = int(rng.choice(_candidates(test, category, shown, own)))
         right = int(rng.integers(2))
         answers.append("AB"[right])
         a, b = (own, other) if right == 0 else (other, own)
@@ -259,6 +256,15 @@ def line_up(
         axes[place, 0].set_ylabel(str(place + 1), fontsize=9, rotation=0, labelpad=12)
     _save(figure, path)
     key_path.write_text(json.dumps(answers) + "\n")
+
+
+def _candidates(test: Pairs, category: np.ndarray, shown: np.ndarray, own: int) -> np.ndarray:
+    others = test.object != test.object[own]
+    same = others & (category == category[own])
+    empty = test.outcome == physics.Outcome.FELL_OFF
+    differ = ~(empty & empty[own])
+    choices = [same & ~shown & differ, same & differ, same, others, np.arange(len(shown)) != own]
+    return np.flatnonzero(next(choice for choice in choices if choice.any()))
 
 
 def _show(axis: Axes, image: np.ndarray) -> None:
