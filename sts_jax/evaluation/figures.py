@@ -236,7 +236,7 @@ def line_up(
     figure, axes = plt.subplots(len(rows), 8, figsize=(12.5, 1.5 * len(rows) + 0.6), squeeze=False)
     shown = np.isin(test.object, test.object[rows])
     answers = []
-    for place, own in enumerate(rows):
+    for place, own in enumerate(rows.tolist()):
         other = int(rng.choice(_candidates(test, category, shown, own)))
         right = int(rng.integers(2))
         answers.append("AB"[right])
