@@ -29,7 +29,7 @@ class State(NamedTuple):
     slow: Int[Array, ""]  # consecutive slow steps
     apart: Int[Array, ""]  # consecutive steps without contact
     touches: Int[Array, ""]  # contacts begun after PARTED_TIME without
-    sunk: Float[Array, ""]  # m, deepest any hull vertex has been inside the pad
+    sunk: Float[Array, ""]  # m, deepest any hull vertex or contact has been
     finite: Bool[Array, ""]  # no state so far was non-finite
     impulse: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
     loaded: Int[Array, ""]  # number of those steps
@@ -121,7 +121,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         slow=jnp.where(slow, old.slow + 1, 0),
         apart=jnp.where(touched, 0, old.apart + 1),
         touches=old.touches + begun,
-        sunk=jnp.maximum(old.sunk, _depth(points, model)),
+        sunk=jnp.maximum(old.sunk, jnp.maximum(_depth(points, model), -jnp.min(contacts.dist))),
         finite=old.finite & jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)),
         impulse=jnp.where(contact, old.impulse + wrench, 0),
         loaded=jnp.where(contact, old.loaded + 1, 0),

@@ -1,7 +1,7 @@
 """The one scene of all scenarios, as MuJoCo and as MJX models: a fixed pad and one free object above it.
 
-The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope a stop wall stands on it, just beyond
-the gel's lower edge (y high). The object's body frame is its mesh frame (its inertia is given about an explicit centre
+The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope a stop wall, as deep as the pad, stands
+just beyond the gel's lower edge (y high). The object's body frame is its mesh frame (its inertia is given about an explicit centre
 of mass), so `qpos` is the object's pose.
 
 MJX steps one template model for all objects (`step`, `template`): what differs between two is a few arrays and the
@@ -27,7 +27,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, another 
 
 PAD_DEPTH = 0.2  # m; what leaves the pad slides down its side and never gets beneath it
 WALL_DEPTH = 0.01  # m, thickness of the stop wall
-WALL_OVERHANG = 0.05  # m, how far the wall reaches beyond the pad to either side
+WALL_OVERHANG = 0.5  # m, how far the wall reaches beyond the pad to either side: nothing gets to its ends
 SMALLEST_SLIP = 1e-6  # of |u|^2, what |u + alpha v|^2 is at least in the line search: more than float32's rounding
 CONDIM = 6  # rows of the solver a contact: normal, two of sliding, one of torsion, two of rolling
 
@@ -79,7 +79,8 @@ def boxes(pad: tuple[float, float], wall: float) -> list[tuple[np.ndarray, np.nd
     beneath = WALL_DEPTH if wall else 0.0  # the pad goes on beneath the wall
     found = [([0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2])]
     if wall:
-        found.append(([0, (pad[1] + WALL_DEPTH) / 2, wall / 2], [pad[0] / 2 + WALL_OVERHANG, WALL_DEPTH / 2, wall / 2]))
+        middle = [0, (pad[1] + WALL_DEPTH) / 2, (wall - PAD_DEPTH) / 2]
+        found.append((middle, [pad[0] / 2 + WALL_OVERHANG, WALL_DEPTH / 2, (wall + PAD_DEPTH) / 2]))
     return [(np.array(centre), np.array(half)) for centre, half in found]
 
 
