@@ -186,6 +186,25 @@ def test_pad_and_wall_together_are_all_that_pushes() -> None:
         np.testing.assert_allclose(np.ptp(box, 0), np.ptp(state.contact.pos[theirs], 0), atol=5e-4)
 
 
+def test_what_falls_beside_the_pad_gains_no_energy_at_the_wall() -> None:
+    model, like, data = scene.template(PAD, SCENARIO.contact, 0.02)
+    model = copy.copy(model)
+    scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
+    own = like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like)))
+    hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None]))
+    across = np.linspace(0.08, 0.16, 48)  # over the pad's side, and past it
+    turn = np.random.default_rng(0).normal(size=(48, 4))
+    pose = np.concatenate([np.c_[across, np.full((48, 1), 0.03), np.full((48, 1), 0.03)], turn], axis=1)
+    pose[:, 3:] /= np.linalg.norm(turn, axis=1, keepdims=True)
+    start = jax.vmap(lambda pose: roll.initial(pose, jnp.zeros(6)))(jnp.asarray(pose, jnp.float32))
+    gravity = G * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
+    steps = jnp.broadcast_to(jnp.asarray(gravity, jnp.float32), (48, 40, 20, 3))
+    _, record = jax.tree.map(np.asarray, ROLL(own, data, hull, start, steps))
+    lost = (record.pose[..., :3] - pose[:, None, :3]) @ gravity
+    assert record.wall.any(1).mean() > 0.5
+    assert np.all(0.5 * np.sum(record.velocity[..., :3] ** 2, axis=-1) <= lost + 0.02)
+
+
 def test_outcomes_are_read_from_the_poses() -> None:
     first = jnp.array([0.01, -0.02, 0.05, 1, 0, 0, 0])
     turn = jnp.array([jnp.cos(0.5), 0, 0, jnp.sin(0.5)])  # 57 degrees
