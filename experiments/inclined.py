@@ -16,7 +16,7 @@ from sts_jax import dataset, physics, training
 
 OBJECTS = dataset.Collection(physics.Inclined())
 DEFAULT = stages.Config(
-    collection=dataclasses.replace(OBJECTS, num_objects=320, num_per_object=4, num_full=20, seed=2),
+    collection=dataclasses.replace(OBJECTS, num_objects=240, num_per_object=4, num_full=20, seed=2),
     training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
