@@ -1,8 +1,8 @@
 """The one scene of all scenarios, as MuJoCo and as MJX models: a fixed pad and one free object above it.
 
 The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope a stop wall, as deep as the pad, stands
-just beyond the gel's lower edge (y high). The object's body frame is its mesh frame (its inertia is given about an explicit centre
-of mass), so `qpos` is the object's pose.
+just beyond the gel's lower edge (y high). The object's body frame is its mesh frame (its inertia is given about an
+explicit centre of mass), so `qpos` is the object's pose.
 
 MJX steps one template model for all objects (`step`, `template`): what differs between two is a few arrays and the
 contacts. `compile_scene` is the same scene with the object's mesh, for C MuJoCo.
