@@ -199,6 +199,7 @@ def _sound_solver() -> ModuleType:
     spec.loader.exec_module(solver)
     create = solver._LSPoint.create
 
+    # MJX's own signature; it has no public types.
     def point(m, d, ctx, alpha, jv, quad, quad_gauss, uu, v0, uv, vv):  # type: ignore[no-untyped-def]
         short = SMALLEST_SLIP * uu - (uu + alpha * (2 * uv + alpha * vv))
         return create(m, d, ctx, alpha, jv, quad, quad_gauss, uu + jnp.maximum(0, short), v0, uv, vv)
