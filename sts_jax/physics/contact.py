@@ -30,11 +30,14 @@ SKIN = 0.001  # m; points this much higher than the deepest one may still belong
 
 
 class Hull(NamedTuple):
-    """The convex parts of an object in the mesh frame, padded to their class by repetition."""
+    """The convex parts of an object in the mesh frame, padded to their class by repetition.
 
-    vertices: Float[Array | np.ndarray, "*n p h 3"]  # m
-    edges: Float[Array | np.ndarray, "*n p e 2 3"]  # m, both ends; diagonals of flat faces do no harm among them
-    planes: Float[Array | np.ndarray, "*n p f 4"]  # outward unit normal, offset (m): inside is normal . x < offset
+    Coordinates come before points: XLA makes vector instructions of what runs along the last axis.
+    """
+
+    vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m
+    edges: Float[Array | np.ndarray, "*n 2 3 p e"]  # m, both ends; diagonals of flat faces do no harm among them
+    planes: Float[Array | np.ndarray, "*n 4 p f"]  # outward unit normal, offset (m): inside is normal . x < offset
 
 
 class Contacts(NamedTuple):
@@ -54,7 +57,7 @@ def hull(parts: np.ndarray) -> Hull:
     Raises:
         ValueError: the points of a part span no volume.
     """
-    return Hull(*(np.stack(x) for x in zip(*(_part(part) for part in parts), strict=True)))
+    return Hull(*(np.stack(x, axis=-2) for x in zip(*(_part(part) for part in parts), strict=True)))
 
 
 def _part(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,52 +71,72 @@ def _part(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     planes = found.equations * [1, 1, 1, -1]
 
     def pad(x: np.ndarray, count: int) -> np.ndarray:
-        return np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)]).astype(np.float32)
+        padded = np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)])
+        return np.moveaxis(padded, 0, -1).astype(np.float32)
 
     n = len(points)
     return pad(points, n), pad(edges, 3 * n - 6), pad(planes, 2 * n - 4)
 
 
-def _vertices(points: Float[Array, "h 3"], half: Float[Array, "2"]) -> tuple[Array, Array, Array]:
-    across = half - jnp.abs(points[:, :2])
-    depths = jnp.concatenate([-points[:, 2:], across], axis=1)
-    nearest = jnp.argmin(depths, axis=1)
-    outward = jnp.where(points[:, :2] < 0, -1.0, 1.0)
-    axis = jax.nn.one_hot(nearest, 3)
-    normal = jnp.concatenate([axis[:, 1:] * outward, axis[:, :1]], axis=1)
-    return jnp.min(depths, axis=1), points, normal
+# Candidates of one kind: depth (c,) in m, place (3, c) in m, normal (3, c).
+_Candidates = tuple[Float[Array, "c"], Float[Array, "3 c"], Float[Array, "3 c"]]
 
 
-def _rim(ends: Float[Array, "e 2 3"], half: Float[Array, "2"], axis: int, sign: float) -> tuple[Array, Array, Array]:
-    out = sign * ends[..., axis] - half[axis]
-    inner = jnp.where((out[:, 0] < out[:, 1])[:, None], ends[:, 0], ends[:, 1])
-    crosses = out[:, 0] * out[:, 1] < 0
-    share = jnp.where(crosses, out[:, 0] / jnp.where(crosses, out[:, 0] - out[:, 1], 1.0), 0.0)
-    point = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
+def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 3 h"]) -> Float[Array, "*n 3 h"]:
+    """`rotation @ points`, without the small matrix product that XLA is slow at on a CPU."""
+    x, y, z = points[..., :1, :], points[..., 1:2, :], points[..., 2:, :]
+    return rotation[:, :1] * x + rotation[:, 1:2] * y + rotation[:, 2:] * z
+
+
+def _vertices(points: Float[Array, "3 h"], half: Float[Array, "2"]) -> _Candidates:
+    x, y, z = points
+    side_x, side_y = half[0] - jnp.abs(x), half[1] - jnp.abs(y)
+    top = -z <= jnp.minimum(side_x, side_y)
+    through_x, through_y = ~top & (side_x <= side_y), ~top & (side_x > side_y)
+    normal = [jnp.where(through_x, jnp.where(x < 0, -1.0, 1.0), 0.0)]
+    normal += [jnp.where(through_y, jnp.where(y < 0, -1.0, 1.0), 0.0), jnp.where(top, 1.0, 0.0)]
+    return jnp.minimum(-z, jnp.minimum(side_x, side_y)), points, jnp.stack(normal)
+
+
+def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: float) -> _Candidates:
+    along = ends[1] - ends[0]
+    out = sign * ends[:, axis] - half[axis]
+    crosses = out[0] * out[1] < 0
+    share = jnp.where(crosses, out[0] / jnp.where(crosses, out[0] - out[1], 1.0), 0.0)
+    point = ends[0] + share * along
     # The edge ends above the box, or inside it nearer to the top than to a side, or beyond it: it came through the top.
-    through_top = -inner[:, 2] <= jnp.maximum(0, jnp.min(half - jnp.abs(inner[:, :2]), axis=1))
-    through_top |= sign * inner[:, axis] < -half[axis]
-    rim = jnp.zeros(3).at[1 - axis].set(1.0)
-    normal = _math.normalize(jnp.cross(ends[:, 1] - ends[:, 0], rim))
-    normal = jnp.where(normal[:, 2:] < 0, -normal, normal)
+    inner = jnp.where(out[0] < out[1], ends[0], ends[1])
+    inside = jnp.minimum(half[0] - jnp.abs(inner[0]), half[1] - jnp.abs(inner[1]))
+    through_top = (-inner[2] <= jnp.maximum(0, inside)) | (sign * inner[axis] < -half[axis])
+    # Normal to the edge and to the rim, which runs along the other axis.
+    across, up = along[2], -along[axis]
+    length = jnp.sqrt(across**2 + up**2)
+    scale = jnp.where(up < 0, -1.0, 1.0) / jnp.where(length > 0, length, 1.0)
+    across, up = scale * across, scale * up
     # A lower inner end is itself the contact; the rim then only supports from below.
-    normal = jnp.where(sign * normal[:, axis : axis + 1] < 0, jnp.array([0.0, 0.0, 1.0]), normal)
-    on_rim = jnp.abs(point[:, 1 - axis]) < half[1 - axis]
-    depth = -point[:, 2] * normal[:, 2]
-    return jnp.where(crosses & through_top & on_rim, depth, -1.0), point, normal
+    tilted = sign * across >= 0
+    across, up = jnp.where(tilted, across, 0.0), jnp.where(tilted, up, 1.0)
+    on_rim = jnp.abs(point[1 - axis]) < half[1 - axis]
+    depth = jnp.where(crosses & through_top & on_rim, -point[2] * up, -1.0)
+    none = jnp.zeros_like(up)
+    return depth, point, jnp.stack([across, none, up] if axis == 0 else [none, across, up])
 
 
-def _corners(planes: Float[Array, "f 4"], half: Float[Array, "2"]) -> tuple[Array, Array, Array]:
-    corners = jnp.array([[1.0, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) * jnp.append(half, 0.0)
-    inside = planes[:, 3] - corners @ planes[:, :3].T
-    below = jnp.where(planes[:, 2] < 0, inside, 1.0)
-    nearest = jnp.argmin(below, axis=1)
-    depth = jnp.where(jnp.all(inside > 0, axis=1), jnp.min(below, axis=1), -1.0)
-    normal = -planes[nearest, :3]
-    return depth, corners - depth[:, None] * normal, normal
+def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidates:
+    found = []
+    for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        corner = jnp.stack([x * half[0], y * half[1], jnp.zeros(())])
+        inside = planes[3] - corner[0] * planes[0] - corner[1] * planes[1]
+        below = jnp.where(planes[2] < 0, inside, 1.0)
+        nearest = jnp.argmin(below)
+        depth = jnp.where(jnp.all(inside > 0), below[nearest], -1.0)
+        normal = -planes[:3, nearest]
+        found.append((depth, corner - depth * normal, normal))
+    depths, corners, normals = zip(*found, strict=True)
+    return jnp.stack(depths), jnp.stack(corners, axis=1), jnp.stack(normals, axis=1)
 
 
-def _spread(depth: Float[Array, "c"], across: Float[Array, "c 2"], num: int) -> Int[Array, "k"]:
+def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> Int[Array, "k"]:
     """Which points to take: the two deepest, over which it would tip, and those that reach farthest around them."""
     deepest = jnp.max(depth)
     candidate = depth > jnp.maximum(0, deepest - SKIN)
@@ -125,10 +148,10 @@ def _spread(depth: Float[Array, "c"], across: Float[Array, "c 2"], num: int) -> 
         return jnp.min(places, axis=1)
 
     first = best(depth[None])
-    elsewhere = jnp.sum((across - across[first[0]]) ** 2, axis=1) > APART**2
+    elsewhere = jnp.sum((across - across[:, first]) ** 2, axis=0) > APART**2
     # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
     angle = 0.4 + 2 * np.pi * np.arange(num - 2) / (num - 2)
-    reach = [x * across[:, 0] + y * across[:, 1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
+    reach = [x * across[0] + y * across[1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
     others = jnp.stack([jnp.where(elsewhere, depth, -1.0), *(r + STEEP * depth for r in reach)])
     return jnp.concatenate([first, best(others)])
 
@@ -158,17 +181,18 @@ def collide(
         num: how many contacts.
         plane: the axes of the plane in which they are to reach far.
     """
-    rotation = _math.quat_matrix(pose[3:])
-    points = jnp.reshape(body.vertices, (-1, 3)) @ rotation.T + pose[:3]
-    ends = jnp.reshape(body.edges, (-1, 2, 3)) @ rotation.T + pose[:3]
-    normals = body.planes[..., :3] @ rotation.T
-    planes = jnp.concatenate([normals, (body.planes[..., 3] + normals @ pose[:3])[..., None]], axis=-1)
+    rotation, place = _math.quat_matrix(pose[3:]), pose[:3, None]
+    points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place
+    ends = turned(rotation, jnp.reshape(body.edges, (2, 3, -1))) + place
+    normals = turned(rotation, jnp.reshape(body.planes[:3], (3, -1)))
+    offsets = jnp.reshape(body.planes[3], (1, -1)) + jnp.sum(normals * place, axis=0)
+    planes = jnp.reshape(jnp.concatenate([normals, offsets]), body.planes.shape)
     rims = [_rim(ends, half, axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)]
-    corners = [_corners(part, half) for part in planes]
+    corners = [_corners(planes[:, part], half) for part in range(planes.shape[1])]
     kinds = [_vertices(points, half), *rims, *corners]
-    depth, points, normal = (jnp.concatenate(x) for x in zip(*kinds, strict=True))
-    chosen = _spread(depth, points[:, jnp.array(plane)], num)
+    depth, points, normal = (jnp.concatenate(x, axis=-1) for x in zip(*kinds, strict=True))
+    chosen = _spread(depth, points[jnp.array(plane)], num)
     new = jnp.sum(jnp.tril(chosen == chosen[:, None]), axis=1) == 1
-    depth, points, normal = depth[chosen], points[chosen], normal[chosen]
+    depth, points, normal = depth[chosen], points[:, chosen].T, normal[:, chosen].T
     dist = jnp.where(new & (depth > 0), -depth, 1.0)
     return Contacts(dist, points + 0.5 * depth[:, None] * normal, jax.vmap(_frame)(normal))

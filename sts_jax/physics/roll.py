@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import _math
 from sts_jax.physics import scene
-from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide
+from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide, turned
 from sts_jax.physics.scene import mjx
 
 SLOW_SPEED = 0.005  # m/s; slower than this ...
@@ -81,13 +81,13 @@ def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
-def _depth(points: Float[Array, "n 3"], model: mjx.Model) -> Float[Array, ""]:
+def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
     """How deep (m) the deepest point is in the pad or the wall."""
     depths = []
     for top, half in _fixed(model):
-        inside = points - top
-        depths.append(jnp.minimum(-inside[:, 2], jnp.min(half - jnp.abs(inside[:, :2]), axis=1)))
-    return jnp.max(jnp.concatenate(depths), initial=0.0)
+        x, y, z = points - top[:, None]
+        depths.append(jnp.minimum(-z, jnp.minimum(half[0] - jnp.abs(x), half[1] - jnp.abs(y))))
+    return jnp.max(jnp.stack(depths), initial=0.0)
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
@@ -108,7 +108,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
     contact = jnp.any(push != 0)
     wall = jnp.any(scene.push(new, slice(PAD_CONTACTS, len(contacts.dist))) != 0)
 
-    points = jnp.reshape(hull.vertices, (-1, 3)) @ _math.quat_matrix(new.qpos[3:]).T + new.qpos[:3]
+    points = turned(_math.quat_matrix(new.qpos[3:]), jnp.reshape(hull.vertices, (3, -1))) + new.qpos[:3, None]
     timestep = model.opt.timestep
     slow = (_math.norm(new.qvel[:3]) < SLOW_SPEED) & (_math.norm(new.qvel[3:]) < SLOW_TURN)
     touched = contact | wall
@@ -117,7 +117,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         qpos=new.qpos,
         qvel=new.qvel,
         warmstart=new.qacc_warmstart,
-        gone=jnp.max(points[:, 2]) < -GONE_DEPTH,
+        gone=jnp.max(points[2]) < -GONE_DEPTH,
         slow=jnp.where(slow, old.slow + 1, 0),
         apart=jnp.where(touched, 0, old.apart + 1),
         touches=old.touches + begun,
