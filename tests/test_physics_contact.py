@@ -177,3 +177,30 @@ def test_edges_all_but_parallel_to_a_rim_take_no_contact_away(yaw: float) -> Non
     np.testing.assert_allclose(np.unique(there[:, 0].round(3)), [0.0, 0.06])
     np.testing.assert_allclose(np.unique(there[:, 1].round(3)), [-0.05, 0.03])
     assert len(there) == 4
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.02, 0.1])
+def test_an_edge_across_a_corner_is_held_by_both_rims_where_its_ends_are_lower(lean: float) -> None:
+    """A rod on one of its long edges, whose ends lie beyond two sides of the pad; it leans along its length."""
+    grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.06, 0.005, 0.005]
+    rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)]).astype(np.float32)[None]
+    turn = jnp.array([jnp.array([0, 0, -np.pi / 4]), jnp.array([0, lean, 0]), jnp.array([np.pi / 4, 0, 0])])
+    yaw, pitch, edge_on = _math.quat_from_rotvec(turn.astype(jnp.float32))
+    quat = np.asarray(_math.quat_multiply(yaw, _math.quat_multiply(pitch, edge_on)))
+    away = 0.007  # m, the middle of the lowest edge from either side; it crosses the rims 14 mm from the corner
+    deep = 0.0002  # m, the lower of the two crossings; both ends are lower still, or one is
+    reach, thick = away * np.sqrt(2), 0.005 * np.sqrt(2)
+    low = np.array([0.075 - away, 0.075 - away, np.tan(lean) * reach - deep])
+    middle = low + thick * np.array([np.sin(lean) / np.sqrt(2), -np.sin(lean) / np.sqrt(2), np.cos(lean)])
+    pose = np.concatenate([middle, quat])
+    model = scene.compile_scene(rod, PAD, physics.Contact())
+    dist, _, _ = in_c(model, mujoco.MjData(model), pose)
+    hull = jax.tree.map(jnp.asarray, contact.hull(rod))
+    found = contact.collide(hull, jnp.asarray(pose, jnp.float32), HALF)
+    assert dist < -0.5 * deep
+    np.testing.assert_allclose(found.dist.min(), dist, atol=5e-6)
+    there = np.asarray(found.pos)[np.asarray(found.dist) < -0.5 * deep]
+    expected = [[0.061, 0.075], [0.075, 0.061]] if lean == 0 else [[0.075, 0.061]]
+    np.testing.assert_allclose(np.unique(there[:, :2].round(3), axis=0), expected, atol=1.1e-3)
+    beneath = contact.collide(hull, jnp.asarray(pose - [0, 0, 0.05, 0, 0, 0, 0], jnp.float32), HALF)
+    assert beneath.dist.min() > -deep  # far below the top nothing lifts it over

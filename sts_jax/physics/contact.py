@@ -104,9 +104,16 @@ def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: 
     crosses = out[0] * out[1] < 0
     share = jnp.where(crosses, out[0] / jnp.where(crosses, out[0] - out[1], 1.0), 0.0)
     point = ends[0] + share * along
-    # The edge ends above the box, or inside it nearer to the top than to a side, or beyond it: it came through the top.
-    inner = jnp.where(out[0] < out[1], ends[0], ends[1])
-    inside = jnp.minimum(half[0] - jnp.abs(inner[0]), half[1] - jnp.abs(inner[1]))
+    # Where the edge ends over the box, or leaves it at a side next to the rim, across a corner.
+    inner, other = jnp.where(out[0] < out[1], ends[0], ends[1]), 1 - axis
+    beyond = jnp.abs(inner[other]) > half[other]
+    to_corner = jnp.where(inner[other] < 0, -half[other], half[other]) - point[other]
+    whole = jnp.where(beyond & (inner[other] != point[other]), inner[other] - point[other], 1.0)
+    inner = jnp.where(beyond, point + to_corner / whole * (inner - point), inner)
+    # It ends above the box, or inside it nearer to the top than to a side, or beyond it: it came through the top.
+    cut = jnp.abs(sign * half[axis] - inner[axis])
+    aside = jnp.abs(to_corner) * cut / jnp.sqrt(jnp.maximum(to_corner**2 + cut**2, 1e-12))
+    inside = jnp.where(beyond, aside, jnp.minimum(half[0] - jnp.abs(inner[0]), half[1] - jnp.abs(inner[1])))
     through_top = (-inner[2] <= jnp.maximum(0, inside)) | (sign * inner[axis] < -half[axis])
     # Normal to the edge and to the rim, which runs along the other axis.
     across, up = along[2], -along[axis]
@@ -116,7 +123,7 @@ def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: 
     # A lower inner end is itself the contact; the rim then only supports from below.
     tilted = sign * across >= 0
     across, up = jnp.where(tilted, across, 0.0), jnp.where(tilted, up, 1.0)
-    on_rim = jnp.abs(point[1 - axis]) < half[1 - axis]
+    on_rim = jnp.abs(point[other]) < half[other]
     depth = jnp.where(crosses & through_top & on_rim, -point[2] * up, -1.0)
     none = jnp.zeros_like(up)
     return depth, point, jnp.stack([across, none, up] if axis == 0 else [none, across, up])
