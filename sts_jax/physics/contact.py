@@ -3,14 +3,15 @@
 MJX's own test of a mesh against a box was tried and left: beside a face it counts every pair of edges, so a small
 object lying on a pad much larger than itself is pushed by contacts between its edges and the pad's distant rims (it
 never comes to rest, and some are thrown off), and every mesh compiles anew. The pad is a box
-whose sides face along the axes (the stop wall of the slope is another), so its contacts with a convex hull are three
-kinds only:
+whose sides face along the axes (the stop wall of the slope is another), so its contacts with a convex hull are of
+three kinds:
 
 - a vertex of the hull inside the box: the nearest of the top and the four sides pushes it out;
 - an edge of the hull across a rim of the top: pushed along the common normal of the two lines;
 - a corner of the top inside the hull: pushed along the normal of the nearest of the hull's lower faces.
 
-Each holds the true distance along its own normal. C MuJoCo with a mesh is the truth it is tested against.
+Each holds the true distance along its own normal. A fourth is left out: an edge across one of the box's upright edges,
+below the top, which only things that have fallen off can meet; they pass through it. C MuJoCo with a mesh is the truth it is tested against.
 """
 
 from typing import NamedTuple
