@@ -11,7 +11,8 @@ three kinds:
 - a corner of the top inside the hull: pushed along the normal of the nearest of the hull's lower faces.
 
 Each holds the true distance along its own normal. A fourth is left out: an edge across one of the box's upright edges,
-below the top, which only things that have fallen off can meet; they pass through it. C MuJoCo with a mesh is the truth it is tested against.
+below the top, which only things that have fallen off can meet; they pass through it. C MuJoCo with a mesh is the truth
+that this is tested against.
 """
 
 from typing import NamedTuple
