@@ -3,6 +3,7 @@
     python -m benchmarks.hidden                 # the jerked pad, about 25 minutes on two CPU cores
     python -m benchmarks.hidden outcomes truth  # some of: outcomes truth pictures fill
     python -m benchmarks.hidden --keep FOLDER   # keep what was simulated and drawn there, and go on from it
+    python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # of what `benchmarks.soak` kept
 
 `outcomes`: shares of the outcomes, and how many starts end otherwise when the fill alone is drawn again. `truth`: a
 classifier of the outcome that knows shape, start and shake exactly loses so much; one that is also told what touch
@@ -27,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks import classify, reader
@@ -40,7 +42,10 @@ TINT = 0.1  # share of white in the painted ones' own colours (linear light)
 OTHERS = 1_000_000  # keys of objects that networks learn on begin here
 EXAMPLES = 8  # starts of each of those
 SEEN = (0.0001, 0.0017)  # m, rad: how well sight tells a pose on the slope, standard deviations
-LOWEST = 0.0005  # m; points this much higher than the lowest may still support
+DRAWS = 128  # of contents, by which sight judges a start on the slope, ...
+FRICTIONS = 8  # ... each with as many frictions
+LEVELS = (0.0001, 0.001)  # m; what is so much higher than the lowest point supports at once, or after rocking
+SNAP = 0.9986  # cosine; what leans less than 3 degrees from a face that it may rest on is seen to lie on it
 
 
 class Starts(NamedTuple):
@@ -220,9 +225,9 @@ def shaken(items: list[objects.Body], starts: Starts, touch: np.ndarray | None) 
     return np.concatenate(columns, 1)
 
 
-def support(points: np.ndarray) -> np.ndarray:
-    """The corners (k, 2), in turn, of what the lowest of an object's points (n, 3) span on the pad."""
-    low = np.unique(points[points[:, 2] < points[:, 2].min() + LOWEST, :2].round(7), axis=0)
+def support(points: np.ndarray, level: float) -> np.ndarray:
+    """The corners (k, 2), in turn, of what an object's points (n, 3) span that are within a level of the lowest."""
+    low = np.unique(points[points[:, 2] < points[:, 2].min() + level, :2].round(7), axis=0)
     try:
         return low[ConvexHull(low).vertices]
     except (QhullError, ValueError):  # an edge or a corner
@@ -243,32 +248,92 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
     return [inside.min(), inside[edge], length[edge], outward[edge, 1]]
 
 
+def balance(
+    corners: np.ndarray, centre: np.ndarray, friction: np.ndarray, slope: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What statics says of bodies that differ in what is hidden: tips (0), slides (1) or sticks (2), and the centre of
+    pressure.
+
+    Args:
+        corners: (k, 2) m, of what supports them.
+        centre: (m, 3) m, of mass, over the pad.
+        friction: (m,).
+        slope: rad, towards +y.
+
+    Returns:
+        (m,) and (m, 2) m; what tips presses on the edge that it tips over.
+    """
+    grip = np.minimum(friction, math.tan(slope))
+    pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])
+    along = np.roll(corners, -1, 0) - corners
+    outward = np.stack([along[:, 1], -along[:, 0]], 1)
+    tips = (((pressure[:, None] - corners) * outward).sum(-1) > 0).any(1)
+    share = ((pressure[:, None] - corners) * along).sum(-1) / ((along**2).sum(1) + 1e-12)
+    nearest = corners + np.clip(share, 0, 1)[..., None] * along
+    edge = ((pressure[:, None] - nearest) ** 2).sum(-1).argmin(1)
+    pressure = np.where(tips[:, None], nearest[np.arange(len(edge)), edge], pressure)
+    return np.where(tips, 0, np.where(friction < math.tan(slope), 1, 2)), pressure
+
+
+def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
+    """Centres of mass (DRAWS, 3) of a body with what may be hidden in it."""
+    if not body.contents_density:
+        return np.tile(np.asarray(body.shell_com), (DRAWS, 1))
+    hidden = jax.vmap(scenario.hidden)(jax.random.split(jax.random.key(0), DRAWS))
+    return np.asarray(_rigid(body, {"fill": hidden.fill, "shell_scale": hidden.shell_scale, "up": hidden.up})[1])
+
+
+def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) seen, or the nearest with one of the directions (k, 3) of an object up, if that is near."""
+    up = rotation @ ups[(ups @ rotation[2]).argmax()]
+    if up[2] < SNAP:
+        return rotation
+    return Rotation.align_vectors([[0.0, 0, 1]], [up])[0].as_matrix() @ rotation
+
+
 def laid(items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
     """Features of a start on the slope, of things of any shape; `touch` (n, 2) is the centre of pressure.
 
-    Sight tells the pose as well as SEEN: a pose to the last bit tells, by micrometres, what has begun to slip.
+    Among them what `balance` says of DRAWS of what is hidden, all alike to sight; touch tells which are likely. Sight
+    tells the pose as well as SEEN: a pose to the last bit tells, by micrometres, what has begun to slip.
     """
+    scenario, noise = STUDIES["inclined"].scenario, STUDIES["inclined"].noise
+    assert isinstance(scenario, physics.Inclined)
+    centres = [np.tile(drawn_centres(body, scenario), (FRICTIONS, 1)) for body in items]
+    friction = np.repeat(np.linspace(*scenario.friction, 2 * FRICTIONS + 1)[1::2], DRAWS)
     rng = np.random.default_rng(1)
     seen = starts.pose + np.array([*[SEEN[0]] * 3, *[SEEN[1] / 2] * 4]) * rng.normal(size=starts.pose.shape)
     turns = np.asarray(jax.vmap(_math.quat_matrix)(_math.normalize(jnp.asarray(seen[:, 3:], jnp.float32))))
-    full = [_rigid(b, {"fill": jnp.ones(1), "shell_scale": jnp.ones(1)})[1][0] for b in items]
-    downhill, pad = np.array([0, math.tan(physics.Inclined().slope)]), float(Sensor().gel.size[1])
+    full = [np.asarray(_rigid(b, {"fill": jnp.ones(1), "shell_scale": jnp.ones(1)})[1][0]) for b in items]
+    hulls = [np.asarray(b.hulls, float).reshape(-1, 3) for b in items]
+    ups = [objects.rest_poses(hull, np.asarray(b.shell_com, float))[0] for hull, b in zip(hulls, items, strict=True)]
+    downhill, pad = np.array([0, math.tan(scenario.slope)]), float(Sensor().gel.size[1])
     rows = []
-    for row, (index, pose, rotation) in enumerate(zip(starts.body, seen, turns, strict=True)):
-        body = items[index]
-        points = np.asarray(body.hulls).reshape(-1, 3) @ rotation.T
-        low, high, corners = points.min(0), points.max(0), support(points)
+    for row, (index, pose, turn) in enumerate(zip(starts.body, seen, turns, strict=True)):
+        body, rotation = items[index], levelled(turn, ups[index])
+        points = hulls[index] @ rotation.T
+        low, high = points.min(0), points.max(0)
+        face, wide = (support(points, height) for height in LEVELS)
         columns = [*pose[:2], *low[:2], *high, high[2] - low[2], pad / 2 - pose[1] - high[1]]
-        columns += [int(body.category), body.shell_mass, body.contents_density, *np.ptp(corners, axis=0), len(corners)]
-        columns += [*rotation[2], *np.abs(rotation[:, 2]), np.abs(rotation[1]).max()]
+        columns += [int(body.category), body.shell_mass, body.contents_density, *np.ptp(face, axis=0), len(face)]
+        columns += [*np.ptp(wide, axis=0), *rotation[2], *np.abs(rotation[:, 2]), np.abs(rotation[1]).max()]
+        felt = None if touch is None else touch[row] - pose[:2]
+        (end, pressure), (rocked, _) = (
+            balance(corners, centres[index] @ rotation.T - [0, 0, low[2]], friction, scenario.slope)
+            for corners in (face, wide)
+        )
+        likely = np.ones(len(friction))
+        if felt is not None and np.isfinite(felt).all():
+            likely = np.exp(-((felt - pressure) ** 2).sum(1) / 2 / noise**2) + 1e-9
+        columns += [*np.bincount(end, likely, 3) / likely.sum(), *np.bincount(rocked, likely, 3) / likely.sum()]
         for com in (body.shell_com, full[index]):
-            centre = rotation @ np.asarray(com)
+            centre = rotation @ com
             beneath = centre[:2] + (centre[2] - low[2]) * downhill  # where its weight meets the pad
-            columns += [*margins(corners, beneath), centre[2] - low[2]]
-            if touch is not None:
-                columns += list(touch[row] - pose[:2] - beneath)
-        if touch is not None:
-            columns += [*(touch[row] - pose[:2]), *margins(corners, touch[row] - pose[:2])]
+            columns += [*margins(face, beneath), *margins(wide, beneath), centre[2] - low[2]]
+            if felt is not None:
+                columns += list(felt - beneath)
+        if felt is not None:
+            columns += [*felt, *margins(face, felt), *margins(wide, felt)]
         rows.append(columns)
     return np.array(rows, float)
 
@@ -311,6 +376,8 @@ def outcomes(study: Study, starts: Starts) -> None:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
     print(f"{'unsettled':30s} {share(~starts.settled)}")
     rolled = starts.rerolled >= 0
+    if not rolled.any():
+        return
     changed = (starts.rerolled != starts.outcome)[rolled]
     figure = classify.interval(np.mean, changed, groups=starts.body[rolled])
     print(f"{'another fill, another outcome':30s} {figure} ({len(changed)} starts)", flush=True)
@@ -378,15 +445,40 @@ def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
     return starts
 
 
-def main(parts: set[str], name: str, counts: tuple[int, int, int, int], steps: int, folder: Path | None) -> None:
+def soaked(folder: Path, name: str) -> Starts:
+    """What the kept blocks of `benchmarks.soak` began with and how they ended; nothing was rolled again."""
+    paths = sorted(folder.glob(f"{name}-*.npz"))
+    if not paths:
+        raise FileNotFoundError(f"{folder} holds no block {name}-*.npz: run python -m benchmarks.soak --keep {folder}")
+    parts = []
+    for path in paths:
+        with np.load(path) as block:
+            known = {field: block[field] for field in Starts._fields if field != "rerolled"}
+            parts.append(Starts(**known, rerolled=np.full(len(block["body"]), -1)))
+    return Starts(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def main(
+    parts: set[str],
+    name: str,
+    counts: tuple[int, int, int, int],
+    steps: int,
+    folder: Path | None,
+    soak: Path | None = None,
+) -> None:
     """Simulates what is needed and prints the parts."""
     study = STUDIES[name]
     num_objects, num, again, others = counts
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         dataset.claim(folder / f"{name}.json", {"scenario": repr(study.scenario), "counts": counts})
-    items = bodies(study.categories, num_objects)
-    starts = kept(folder, name, lambda: roll(study, items, num, again, 0))
+    if soak is None:
+        items = bodies(study.categories, num_objects)
+        starts = kept(folder, name, lambda: roll(study, items, num, again, 0))
+    else:
+        starts = soaked(soak, name)
+        num_objects = int(starts.body.max()) + 1
+        items = bodies(study.categories, num_objects)
     print(
         f"{study.scenario}\n{len(starts.body)} starts of {num_objects} objects ({', '.join(study.categories)})",
         flush=True,
@@ -425,6 +517,7 @@ if __name__ == "__main__":
     parser.add_argument("--others", type=int, default=400, help="objects that networks learn on")
     parser.add_argument("--steps", type=int, default=1000, help="of the networks")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep trajectories there, go on from them")
+    parser.add_argument("--soaked", type=Path, metavar="FOLDER", help="blocks of benchmarks.soak instead of --objects")
     args = parser.parse_args()
     # Full and empty are told apart where containers stand.
     parts = PARTS if args.scenario == "perturbed" else PARTS[:-1]
@@ -436,4 +529,5 @@ if __name__ == "__main__":
         (args.objects, args.num, args.again, args.others),
         args.steps,
         args.keep,
+        args.soaked,
     )

@@ -68,7 +68,7 @@ def mirror(start: Start) -> Start:
 def mirror_shape(shape: Shape) -> Shape:
     """The shape of `objects.mirror`'s body."""
     flip = np.array([1, -1, 1], np.float32)
-    return shape._replace(points=shape.points * flip, rests=shape.rests * flip)
+    return shape._replace(points=shape.points * flip, rests=shape.rests * flip, coms=shape.coms * flip)
 
 
 class Case(NamedTuple):

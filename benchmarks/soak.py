@@ -6,7 +6,7 @@
 A new object every eight trajectories: of all classes in turn, bottles under a jerk. Counts the draws that were thrown
 away (non-finite, or deeper in the pad than the limit), outcomes, what had not settled, and holds the wrench at rest
 against the weight, and the energy out of contact against the start's. Done in blocks that `--keep` keeps in a folder:
-started again it goes on where it stopped.
+started again it goes on where it stopped. `benchmarks.hidden --soaked` asks what decides those trajectories.
 """
 
 import argparse
@@ -77,6 +77,12 @@ def block(name: str, index: int, count: int) -> dict[str, np.ndarray]:
     free = excess_energy((mass, com, inertia), traj.pose, traj.velocity, gravity)
     out_of_contact = ~traj.contact & ~traj.wall & ~fell[:, None]
     return {
+        "body": first + traj.body,
+        "pose": traj.pose[:, 0],
+        "wrench": traj.wrench[:, 0],
+        "condition": traj.condition,
+        "fill": traj.hidden.fill,
+        "mass": mass,
         "category": np.array([int(items[b].category) for b in traj.body]),
         "outcome": traj.outcome,
         "settled": traj.settled,

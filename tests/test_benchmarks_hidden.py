@@ -77,6 +77,31 @@ def test_tipping_begins_at_g_b_over_h():
     assert energy[1] > 0  # more than enough
 
 
+def test_balance_of_a_block_on_the_slope():
+    # 20 x 40 mm of support; the centre of mass 10 mm above its middle, then so high that it tips, then off centre.
+    corners = np.array([[-0.01, -0.02], [0.01, -0.02], [0.01, 0.02], [-0.01, 0.02]])
+    slope = math.radians(30)
+    high = 0.02 / math.tan(slope)
+    centre = np.array([[0, 0, 0.01], [0, 0, 0.01], [0, 0, 1.01 * high], [0, 0, 0.99 * high], [0.011, 0, 0.01]])
+    end, pressure = hidden.balance(corners, centre, np.array([0.7, 0.5, 0.7, 0.7, 0.7]), slope)
+    assert end.tolist() == [2, 1, 0, 2, 0]
+    ahead = 0.01 * math.tan(slope)
+    expected = [[0, ahead], [0, 0.005], [0, 0.02], [0, 0.99 * 0.02], [0.01, ahead]]
+    np.testing.assert_allclose(pressure, expected, atol=1e-9)
+
+
+def test_soaked_blocks_are_read_in_turn(tmp_path):
+    rng = np.random.default_rng(4)
+    blocks = [{f: rng.normal(size=(3, 2)) for f in hidden.Starts._fields if f != "rerolled"} for _ in range(2)]
+    for index, block in enumerate(blocks):
+        np.savez(tmp_path / f"inclined-{index:04d}-3.npz", **block, sunk=np.zeros(3))
+    starts = hidden.soaked(tmp_path, "inclined")
+    np.testing.assert_array_equal(starts.pose, np.concatenate([b["pose"] for b in blocks]))
+    assert set(starts.rerolled) == {-1}
+    with pytest.raises(FileNotFoundError, match="no block freefall"):
+        hidden.soaked(tmp_path, "freefall")
+
+
 def test_reader_reads_a_faint_blob_and_its_presence():
     rng = np.random.default_rng(3)
     size = rng.uniform(0, 1, 400)

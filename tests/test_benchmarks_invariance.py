@@ -31,7 +31,8 @@ def test_outcomes_of_shakes_are_c_mujoco_s() -> None:
 
 def test_a_mirrored_start_is_the_mirror_image() -> None:
     case = invariance.cases()[2]
-    shape = physics.scenarios.Shape(np.float32([[0.01, 0.02, -0.03], [0, -0.04, 0.05]]), np.eye(3), np.ones(3) / 3)
+    points = np.float32([[0.01, 0.02, -0.03], [0, -0.04, 0.05]])
+    shape = physics.scenarios.Shape(points, np.eye(3), np.ones(3) / 3, np.float32([[0, 0.01, 0]]))
     key, pad = jax.random.key(3), (0.15, 0.15)
     seen = case.scenario.start(key, shape, pad)
     mirrored = case.mirrored.start(key, invariance.mirror_shape(shape), pad)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import scipy
 
 from sts_jax import _math, objects, physics
 from sts_jax.physics import contact, roll, scene
@@ -103,7 +104,8 @@ def bodies() -> list[objects.Body]:
 
 @pytest.fixture(scope="module")
 def slid(bodies: list[objects.Body]) -> physics.Trajectory:
-    return jax.tree.map(np.asarray, physics.simulate(jax.random.key(1), bodies, Sensor(), SCENARIO, 8))
+    varied = dataclasses.replace(SCENARIO, friction=(0.35, 0.75), resting=0.8, tries=1)  # so that much slides
+    return jax.tree.map(np.asarray, physics.simulate(jax.random.key(1), bodies, Sensor(), varied, 8))
 
 
 def points(bodies: list[objects.Body], slid: physics.Trajectory, row: int, frame: int) -> np.ndarray:
@@ -137,6 +139,32 @@ def test_starts_rest_on_a_face_or_hang_just_above_and_never_in_the_wall(
             assert 0.001 - 1e-6 <= lowest <= 0.01 + 1e-6
             np.testing.assert_array_equal(slid.velocity[row, 0], 0)
     assert 0.6 <= resting / len(slid.pose) <= 0.95
+
+
+def test_at_rest_it_is_laid_where_its_contents_decide_whether_it_tips(bodies: list[objects.Body]) -> None:
+    keys = jax.random.split(jax.random.key(5), 300)
+    rng = np.random.default_rng(0)
+    for body in bodies[0], bodies[2]:
+        corners, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
+        coms = com + 0.01 * rng.normal(size=(16, 3))
+        shape = physics.scenarios.Shape(*map(jnp.asarray, (corners, *objects.rest_poses(corners, com), coms)))
+        undecided = []
+        for tries in (1, 16):
+            scenario = dataclasses.replace(SCENARIO, resting=1.0, tries=tries)
+            start = jax.jit(jax.vmap(lambda key, s=scenario, x=shape: s.start(key, x, PAD).pose))
+            rows = []
+            for pose in np.asarray(start(keys), np.float64):
+                turn = scipy.spatial.transform.Rotation.from_quat(pose[3:], scalar_first=True)
+                laid, centres = turn.apply(corners), turn.apply(coms)
+                low = laid[:, 2].min()
+                face = scipy.spatial.ConvexHull(laid[laid[:, 2] < low + 1e-3, :2]).equations
+                meets = centres[:, :2] + (centres[:, 2:] - low) * np.array([0, np.tan(SLOPE)])
+                margin = -(meets @ face[:, :2].T + face[:, 2]).max(1)
+                rows.append(min(np.maximum(margin, 0).mean(), np.maximum(-margin, 0).mean()))
+            undecided.append(np.array(rows))
+        one, widest = undecided
+        for share in (0.75, 0.9):  # all of sixteen draws are below it with a chance of share^16
+            assert np.mean(widest > np.quantile(one, share)) == pytest.approx(1 - share**16, abs=0.1)
 
 
 def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], slid: physics.Trajectory) -> None:
@@ -226,7 +254,7 @@ def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
     np.testing.assert_allclose(up.T @ up / len(up), np.eye(3) / 3, atol=0.03)
     off = jax.vmap(physics.variant(SCENARIO, "off").hidden)(keys)
     np.testing.assert_allclose(off.up, np.tile([0.0, 0, 1], (2000, 1)), atol=1e-6)
-    np.testing.assert_allclose(off.friction, 0.55, rtol=1e-6)
+    np.testing.assert_allclose(off.friction, np.mean(SCENARIO.friction), rtol=1e-6)
     wide = jax.vmap(physics.variant(SCENARIO, "wide-friction").hidden)(keys).friction
     assert wide.min() < 0.32
     assert wide.max() > 0.88
@@ -237,7 +265,15 @@ def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"slope": np.pi / 2}, {"slope": 30.0}, {"friction": (0.0, 0.5)}, {"wall": -0.1}, {"resting": 1.5}, {"tilt": 4.0}],
+    [
+        {"slope": np.pi / 2},
+        {"slope": 30.0},
+        {"friction": (0.0, 0.5)},
+        {"wall": -0.1},
+        {"resting": 1.5},
+        {"tilt": 4.0},
+        {"tries": 0},
+    ],
 )
 def test_bad_fields_are_named(bodies: list[objects.Body], change: dict) -> None:
     with pytest.raises(ValueError, match=f"scenario.{next(iter(change))}"):

@@ -25,6 +25,7 @@ class State(NamedTuple):
     qpos: Float[Array, "7"]  # m, quaternion: the pose
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
     warmstart: Float[Array, "6"]  # acceleration from which the solver starts
+    held: Int[Array, ""]  # steps until it is let go: everything is frozen
     gone: Bool[Array, ""]  # has left the pad: everything is frozen
     slow: Int[Array, ""]  # consecutive slow steps
     apart: Int[Array, ""]  # consecutive steps without contact
@@ -46,14 +47,15 @@ class Record(NamedTuple):
     wall: Bool[Array, ""]
 
 
-def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"]) -> State:
-    """The state of an object released with a pose and a velocity (m/s, rad/s, sensor frame)."""
+def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:
+    """The state of an object with a pose and a velocity (m/s, rad/s, sensor frame), let go after some steps."""
     turn = velocity[3:] @ _math.quat_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
     return State(
         qpos=pose,
         qvel=jnp.concatenate([velocity[:3], turn]),
         warmstart=jnp.zeros(6),
+        held=jnp.asarray(held, jnp.int32),
         gone=jnp.zeros((), bool),
         slow=zero,
         apart=jnp.full((), 2**20, jnp.int32),
@@ -117,6 +119,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         qpos=new.qpos,
         qvel=new.qvel,
         warmstart=new.qacc_warmstart,
+        held=old.held,
         gone=jnp.max(points[2]) < -GONE_DEPTH,
         slow=jnp.where(slow, old.slow + 1, 0),
         apart=jnp.where(touched, 0, old.apart + 1),
@@ -129,7 +132,8 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
     )
     nothing = jax.tree.map(jnp.zeros_like, old)
     frozen = old._replace(qvel=nothing.qvel, impulse=nothing.impulse, loaded=nothing.loaded, wall=nothing.wall)
-    return jax.tree.map(lambda a, b: jnp.where(old.gone, a, b), frozen, now)
+    frozen = frozen._replace(held=jnp.maximum(old.held - 1, 0))
+    return jax.tree.map(lambda a, b: jnp.where(old.gone | (old.held > 0), a, b), frozen, now)
 
 
 def _record(state: State) -> Record:

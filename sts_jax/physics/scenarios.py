@@ -17,6 +17,9 @@ G = 9.81  # m/s^2
 FELL_OFF_HEIGHT = -0.005  # m; an object's origin lies inside its hull: on the pad it is above, after leaving below
 MOVED = 0.01  # m; what moved less stayed where it was
 STANDING = 1.04e-5  # m, how deep in the pad a start at rest is: as deep as an object stands
+LEVEL = 0.001  # m; what an object stands on is at most so far above its lowest point: it may rock by a facet
+DIRECTIONS = 120  # in which what it stands on is measured
+LET_GO = 0.008  # s before frame 0; what tips leans by 0.1 degree then, and touch has felt it
 CLEARANCE = 0.001  # m; what starts on the slope is at least this far from the stop wall
 TURNED = math.pi / 4  # rad; what leans more lies, what turned more rolled
 
@@ -48,13 +51,14 @@ class Shape(NamedTuple):
     points: Float[Array | np.ndarray, "*n h 3"]  # m, of its convex hull, mesh frame; padded by repetition
     rests: Float[Array | np.ndarray, "*n k 3"]  # unit vectors in the mesh frame that point up while it rests; padded
     shares: Float[Array | np.ndarray, "*n k"]  # of each rest, see `objects.rest_poses`; 0 for padding
+    coms: Float[Array | np.ndarray, "*n m 3"]  # m, mesh frame: centres of mass, of some contents or empty
 
 
 class Start(NamedTuple):
-    """Where an object is released, at rest, and the input the scenario applies."""
+    """Where an object is held, when it is let go, and the input the scenario applies."""
 
     pose: Float[Array, "7"]
-    held: Bool[Array, ""]  # it hangs weightless until frame 0; or it feels gravity one interval before
+    held: Int[Array, ""]  # steps that it is still held for, of the interval that ends with frame 0
     condition: Float[Array, "c"]
 
 
@@ -77,6 +81,7 @@ class _Common:
     contact: Contact
     wall: float = 0.0
     must_stand: ClassVar[bool] = False
+    by_contents: ClassVar[bool] = False  # starts are chosen by what may be hidden in an object
 
     @property
     def steps(self) -> int:
@@ -163,7 +168,7 @@ class Freefall(_Common):
         turn, radius, angle = jax.random.split(key, 3)
         quat = _math.random_quat(turn)
         pose = _above(_in_disc(radius, angle, self.spread), quat, shape, self.height)
-        return Start(pose, jnp.ones((), bool), jnp.zeros(0))
+        return Start(pose, jnp.asarray(self.steps), jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
         """Gravity in the sensor frame (m/s^2) in the step that begins at a time (s, 0 is frame 0)."""
@@ -218,7 +223,7 @@ class Perturbed(_Common):
         along = jax.random.uniform(heading, maxval=2 * jnp.pi)
         lasts = jax.random.uniform(time, minval=self.duration[0], maxval=self.duration[1])
         condition = jnp.stack([size * jnp.cos(along), size * jnp.sin(along), lasts])
-        return Start(pose, jnp.zeros((), bool), condition)
+        return Start(pose, jnp.asarray(0), condition)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
         """As `Freefall.gravity`; a step in which the jerk ends has the share of it that falls into the step."""
@@ -240,7 +245,8 @@ class Inclined(_Common):
     """An object laid on the tilted pad, or let go just above it; downhill is +y, where a stop wall stands at the edge.
 
     Paper, "Data Collection"; ranges are uniform. On the slope weight tells little, and the centre of pressure tells
-    where contents lie: they are frozen in any direction.
+    where contents lie: they are frozen in any direction. What lies flat holds whatever is in it, and what stands high
+    tips: an object is laid so that its contents decide.
     """
 
     symmetries = (0, 6)  # x -> -x
@@ -249,17 +255,19 @@ class Inclined(_Common):
 
     slope: float = math.radians(30)  # rad
     wall: float = 0.02  # m, height of the stop wall at the lower edge; 0 is none
-    resting: float = 0.8  # share of the starts at rest on a stable face; the others are in any orientation ...
+    resting: float = 0.9  # share of the starts at rest on a stable face; the others are in any orientation ...
     gap: tuple[float, float] = (0.001, 0.01)  # m, ... and this far above the pad
+    tries: int = 16  # faces and turns; a start at rest has the one where contents decide most whether it tips; 1: any
     across: float = 0.04  # m, the object's origin starts within this of the middle
     along: tuple[float, float] = (-0.05, 0.03)  # m, y of the origin
     rate: float = 31.25  # frames/s
     frames: int = 60
-    fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
+    fill: tuple[float, float] = (0.2, 0.6)  # share of the interior's volume
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
-    friction: tuple[float, float] = (0.35, 0.75)
+    friction: tuple[float, float] = (0.56, 0.76)
     tilt: float = math.pi  # rad, as in `Freefall`
     contact: Contact = dataclasses.field(default_factory=Contact)
+    by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
         """See `_Common.check`."""
@@ -274,6 +282,8 @@ class Inclined(_Common):
         _check_range("gap", self.gap, positive=False)
         if not (math.isfinite(sum(self.along)) and self.along[0] <= self.along[1]):
             raise ValueError(f"scenario.along is {self.along}; it must be (low, high), finite")
+        if self.tries < 1:
+            raise ValueError(f"scenario.tries is {self.tries}; at least one is needed")
         if not 0 <= self.resting <= 1:
             raise ValueError(f"scenario.resting is {self.resting}; a share is from 0 to 1")
 
@@ -281,8 +291,12 @@ class Inclined(_Common):
         """Draws one start; consumes `key`. Arguments as for `Freefall.start`; nothing starts in the wall."""
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting
-        up = shape.rests[jax.random.categorical(face, jnp.log(shape.shares))]
-        quat = jnp.where(rests, _math.quat_multiply(_yaw(turn), _upright(up)), _math.random_quat(free))
+        faces = shape.rests[jax.random.categorical(face, jnp.log(shape.shares), shape=(self.tries,))]
+        turns = jax.vmap(_yaw)(jax.random.split(turn, self.tries))
+        laid = jax.vmap(_math.quat_multiply)(turns, jax.vmap(_upright)(faces))
+        margin = jax.lax.map(lambda quat: _margins(quat, shape, self.slope), laid)  # one by one: memory
+        undecided = jnp.minimum(jnp.maximum(margin, 0).mean(axis=1), jnp.maximum(-margin, 0).mean(axis=1))
+        quat = jnp.where(rests, laid[jnp.argmax(undecided)], _math.random_quat(free))
         lower_end = jnp.max(shape.points @ _math.quat_matrix(quat)[1])
         place = jnp.stack(
             [
@@ -294,7 +308,8 @@ class Inclined(_Common):
             ]
         )
         height = jnp.where(rests, -STANDING, jax.random.uniform(gap, minval=self.gap[0], maxval=self.gap[1]))
-        return Start(_above(place, _math.quat_canonical(quat), shape, height), ~rests, jnp.zeros(0))
+        held = jnp.where(rests, self.steps - round(LET_GO / self.contact.timestep), self.steps)
+        return Start(_above(place, _math.quat_canonical(quat), shape, height), held, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
         """As `Freefall.gravity`."""
@@ -347,6 +362,21 @@ def _above(
     """The pose with its origin over a place and its lowest point at a height (m)."""
     lowest = jnp.min(shape.points @ _math.quat_matrix(quat)[2])
     return jnp.concatenate([place, jnp.stack([height - lowest]), quat])
+
+
+def _margins(quat: Float[Array, "4"], shape: Shape, slope: float) -> Float[Array, "m"]:
+    """How far (m) inside what an object stands on its weight meets a slope towards +y, for each centre of mass.
+
+    Where it is negative the object tips.
+    """
+    rotation = _math.quat_matrix(quat)
+    points, coms = shape.points @ rotation.T, shape.coms @ rotation.T
+    low = jnp.min(points[:, 2])
+    meets = coms[:, :2] + (coms[:, 2:] - low) * math.tan(slope) * jnp.array([0.0, 1.0])
+    angle = jnp.arange(DIRECTIONS) * (2 * jnp.pi / DIRECTIONS)
+    outward = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    reach = jnp.max(jnp.where((points[:, 2] < low + LEVEL)[:, None], points[:, :2] @ outward, -jnp.inf), axis=0)
+    return jnp.min(reach - meets @ outward, axis=1)
 
 
 def _yaw(key: PRNGKeyArray) -> Float[Array, "4"]:

@@ -22,8 +22,11 @@ from sts_jax.physics.scenarios import Hidden, Scenario, Shape, Start
 from sts_jax.physics.scene import Contact, mjx
 from sts_jax.sensor import Sensor
 
-SUNK_LIMIT = 0.003  # m; a trajectory in which the object went deeper into the pad is drawn again
+# m, the paper's gel is as thick; a trajectory in which the object went deeper is drawn again. Contacts are found once a
+# step: what turns fast and hits with a corner, at 3 m/s, is 3 mm deep before they push.
+SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before giving up
+CONTENTS = 16  # of each body, by which a start may be chosen
 UPRIGHT = math.radians(1)  # what stands leans less
 WORKERS = 2  # chunks under way at once: XLA runs these small steps on one CPU core each
 
@@ -98,8 +101,8 @@ def _gravity(condition: Float[Array, "n c"], time: Float[Array, "f s"], scenario
 def _roll(worlds: _Worlds, model: mjx.Model, data: mjx.Data) -> tuple[State, Record]:
     def one(world: _Worlds) -> tuple[State, Record]:
         own = model.tree_replace(world.fields)
-        gravity = world.gravity.at[0].multiply(jnp.where(world.start.held, 0.0, 1.0))
-        return roll(own, data, world.hull, initial(world.start.pose, jnp.zeros(6)), gravity)
+        state = initial(world.start.pose, jnp.zeros(6), world.start.held)
+        return roll(own, data, world.hull, state, world.gravity)
 
     return jax.vmap(one)(worlds)
 
@@ -159,7 +162,11 @@ def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
         return np.stack([np.pad(x, ((0, size - len(x)), *rest), mode) for x in arrays]).astype(np.float32)
 
     points, rests, shares = zip(*found, strict=True)
-    return Shape(pad(points, "edge"), pad(rests, "edge"), pad(shares, "constant"))
+    coms = np.stack([np.asarray(body.shell_com)[None] for body in bodies])
+    if scenario.by_contents:
+        own = jax.vmap(scenario.hidden)(jax.random.split(jax.random.key(0), CONTENTS))
+        coms = np.stack([np.asarray(_rigid(body, own.fill, own.shell_scale, own.up)[1]) for body in bodies])
+    return Shape(pad(points, "edge"), pad(rests, "edge"), pad(shares, "constant"), coms)
 
 
 def _check_hidden(hidden: Hidden, count: int) -> Hidden:
