@@ -317,6 +317,7 @@ def laid(items: list[objects.Body], starts: Starts, touch: np.ndarray | None) ->
         columns = [*pose[:2], *low[:2], *high, high[2] - low[2], pad / 2 - pose[1] - high[1]]
         columns += [int(body.category), body.shell_mass, body.contents_density, *np.ptp(face, axis=0), len(face)]
         columns += [*np.ptp(wide, axis=0), *rotation[2], *np.abs(rotation[:, 2]), np.abs(rotation[1]).max()]
+        columns += list((turn @ rotation.T)[:2, 2])  # how it leans over its face already
         felt = None if touch is None else touch[row] - pose[:2]
         (end, pressure), (rocked, _) = (
             balance(corners, centres[index] @ rotation.T - [0, 0, low[2]], friction, scenario.slope)

@@ -1,6 +1,6 @@
 """Endurance: what becomes of very many trajectories of each scenario.
 
-    python -m benchmarks.soak                            # 30,000 trajectories: about an hour and a half on two cores
+    python -m benchmarks.soak                            # 30,000 trajectories: about two hours on two cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
 
 A new object every eight trajectories: of all classes in turn, bottles under a jerk. Counts the draws that were thrown
