@@ -146,7 +146,7 @@ def test_vmap_is_the_loop():
     batch = jax.jit(jax.vmap(lambda pose: draw(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]))(poses)
     for pose, winner in zip(poses, batch, strict=True):
         alone = drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]
-        assert np.sum(np.asarray(alone) >= 0) > 100
+        assert np.sum(np.asarray(alone) >= 0) > 40
         # Two programs round differently on some machines: a pixel on the edge between two faces may go to the other.
         assert np.sum(alone != winner) <= 4
 
