@@ -1,1 +1,1 @@
-"""What is fast and how fast: `python -m benchmarks.NAME` prints medians and ratios of one run."""
+"""What is measured: speed, endurance, invariance, what touch tells; each module's own docstring says how."""

@@ -1,15 +1,16 @@
-"""Physics: steps per second beside C MuJoCo, compilation, and what hidden values decide.
+"""Physics: steps per second beside C MuJoCo, frames per second with both streams, and compilation.
 
-    python -m benchmarks.physics             # about 2 minutes
-    python -m benchmarks.physics --scaling   # about 10 minutes on two cores; writes benchmarks/results/physics/
-    python -m benchmarks.physics --compile   # about 8 minutes on two cores
-    python -m benchmarks.physics --reroll 6  # about 2 minutes
+    python -m benchmarks.physics                   # about 2 minutes
+    python -m benchmarks.physics --pipeline 64     # about a minute on two cores; 16384 is for a GPU
+    python -m benchmarks.physics --scaling         # about 10 minutes on two cores; writes benchmarks/results/physics/
+    python -m benchmarks.physics --compile         # about 8 minutes on two cores
 
 The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in both engines, C MuJoCo's
-batch (`mujoco.rollout`) on all cores, measured in turn. `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU).
-`--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in fresh
-processes: first with an empty cache of compiled programs, then with what the first left there. `--reroll` rolls the
-same starts again with other hidden values: how far the end is decided by what cannot be seen.
+batch (`mujoco.rollout`) on all cores, measured in turn. `--pipeline` drops a bottle so many times and draws every frame
+of it, vision and touch, 64x64, uint8, fetched from the device: seconds and frames per second of either and of both,
+all costs but compilation (a frame is one world at one time). `--scaling` steps 1 to 4,096 worlds at once (65,536 on a
+GPU). `--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in
+fresh processes: first with an empty cache of compiled programs, then with what the first left there.
 """
 
 import argparse
@@ -17,7 +18,6 @@ import concurrent.futures
 import copy
 import dataclasses
 import functools
-import importlib
 import json
 import os
 import subprocess
@@ -34,31 +34,25 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 
-from sts_jax import objects, physics
+from benchmarks.starts import bodies, rigid_of
+from sts_jax import dataset, objects, physics
+from sts_jax.dataset.collect import RENDER_BATCH
 from sts_jax.physics import contact, scene
 from sts_jax.physics.scenarios import G
-from sts_jax.physics.simulate import WORKERS
+from sts_jax.physics.scene import mjx
+
+# What `simulate` compiles is measured by itself, which it has no public way for; a break shows at this import.
+from sts_jax.physics.simulate import WORKERS, _draw, _draws, _gravity, _rigid, _roll, _shapes, _Worlds
 from sts_jax.sensor import Sensor
 
-inner = importlib.import_module("sts_jax.physics.simulate")  # the package gives this name to the function
 RESULTS = Path(__file__).parent / "results" / "physics"
 SCENARIOS: dict[str, physics.Scenario] = {
     "freefall": physics.Freefall(),
     "perturbed": physics.Perturbed(),
     "inclined": physics.Inclined(),
 }
-
-
-def bodies(count: int) -> list[objects.Body]:
-    """Objects of all categories in turn."""
-    names = objects.CATEGORIES
-    return [objects.make(jax.random.key(i), names[i % len(names)]) for i in range(count)]
-
-
-def mass_properties(body: objects.Body, hidden: physics.Hidden) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Mass, centre of mass and inertia of each draw."""
-    rigid = jax.vmap(functools.partial(objects.rigid, body))(hidden.fill, hidden.shell_scale, hidden.up)
-    return list(zip(*(np.asarray(x, np.float64) for x in rigid), strict=True))
+GPU_BATCH = 4096  # frames drawn at once on a GPU
+TACCEL = 915  # environment steps/s of 4,096 environments on an H100, as published; ten times as many is our mark
 
 
 def rod() -> objects.Body:
@@ -76,22 +70,22 @@ def rod() -> objects.Body:
     )
 
 
-def in_c(items: list[objects.Body], traj: physics.Trajectory, contact: physics.Contact) -> tuple[list, np.ndarray]:
+def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics.Contact) -> tuple[list, np.ndarray]:
     """C MuJoCo's model and first state of each trajectory."""
     gel, models, states = Sensor().gel.size, [], []
-    for index, body in enumerate(items):
-        compiled = scene.compile_scene(np.asarray(body.hulls), (float(gel[0]), float(gel[1])), contact)
-        own = np.flatnonzero(np.asarray(traj.body) == index)
-        hidden = jax.tree.map(lambda x, own=own: x[own], traj.hidden)
-        for row, rigid, friction in zip(own, mass_properties(body, hidden), hidden.friction, strict=True):
-            model = copy.copy(compiled)
-            data = mujoco.MjData(model)
-            scene.set_rigid(model, data, *rigid, float(friction))
-            data.qpos[:] = traj.pose[row, 0]
-            state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
-            mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-            models.append(model)
-            states.append(state)
+    pad = (float(gel[0]), float(gel[1]))
+    compiled = [scene.compile_scene(np.asarray(body.hulls), pad, constants) for body in items]
+    properties = [np.asarray(x, np.float64) for x in (*rigid_of(items, traj), traj.hidden.friction)]
+    rows = zip(np.asarray(traj.body), np.asarray(traj.pose[:, 0]), *properties, strict=True)
+    for index, pose, mass, com, inertia, friction in rows:
+        model = copy.copy(compiled[index])
+        data = mujoco.MjData(model)
+        scene.set_rigid(model, data, mass, com, inertia, float(friction))
+        data.qpos[:] = pose
+        state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        models.append(model)
+        states.append(state)
     return models, np.array(states)
 
 
@@ -111,7 +105,7 @@ def in_turn(*runs: Callable[[], object], repeats: int = 5) -> np.ndarray:
 def speed(num: int) -> None:
     """Steps per second of both engines, on drops of one hull of 32 vertices and of eight objects."""
     compare_speed("one hull of 32 vertices", [rod()], 8 * num)
-    compare_speed("eight objects, up to 64 vertices", bodies(8), num)
+    compare_speed("eight objects, up to 64 vertices", bodies(objects.CATEGORIES, 8), num)
 
 
 def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
@@ -142,21 +136,20 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
     return [([m for m, n in zip(models, sizes, strict=True) if n == k], states[sizes == k]) for k in np.unique(sizes)]
 
 
-def worlds(count: int, frames: int) -> tuple[Any, Any, Any]:
-    """What `simulate` hands to MJX for drops of the rod from 2 mm: worlds, model, data."""
+def worlds(count: int, frames: int) -> tuple[_Worlds, mjx.Model, mjx.Data]:
+    """What `simulate` hands to MJX for drops of the rod from 2 mm."""
     scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
     pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # drawn once, then repeated
     index = np.zeros(some, np.int32)
-    shapes = inner._shapes([body], scenario)
-    start, hidden = inner._draw(
-        jax.random.key(0), index, np.arange(some, dtype=np.int32), index, shapes, scenario=scenario, pad=pad
-    )
-    fields = inner._draws([body], index, hidden, pad, scenario.contact, scenario.wall)
+    shapes = _shapes([body], scenario)
+    nth = np.arange(some, dtype=np.int32)
+    start, hidden = _draw(jax.random.key(0), index, nth, index, shapes, scenario=scenario, pad=pad)
+    fields = _draws([body], index, hidden, pad, scenario.contact, scenario.wall)
     fields, start = jax.tree.map(lambda x: np.resize(x, (count, *x.shape[1:])), (fields, start))
     hull = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), contact.hull(np.asarray(body.hulls)))
-    gravity = np.broadcast_to(np.array([0, 0, -G], np.float32), (count, frames, scenario.steps, 3))
+    gravity = jnp.broadcast_to(jnp.array([0, 0, -G]), (count, frames, scenario.steps, 3))
     _, model, data = scene.template(pad, scenario.contact, scenario.wall)
-    return inner._Worlds(fields, hull, start, gravity), model, data
+    return _Worlds(fields, hull, start, gravity), model, data
 
 
 def scaling(frames: int = 4, chunk: int = 32) -> None:
@@ -175,12 +168,12 @@ def scaling(frames: int = 4, chunk: int = 32) -> None:
         own = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
         on_device = jax.device_put(full)
 
-        def at_once(full: Any = on_device, model: Any = model, data: Any = data) -> None:
-            jax.block_until_ready(inner._roll(full, model, data))
+        def at_once(full: _Worlds = on_device, model: mjx.Model = model, data: mjx.Data = data) -> None:
+            jax.block_until_ready(_roll(full, model, data))
 
-        def in_chunks(split: list = split, model: Any = model, data: Any = data) -> None:
+        def in_chunks(split: list[_Worlds] = split, model: mjx.Model = model, data: mjx.Data = data) -> None:
             with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
-                list(pool.map(lambda part: jax.block_until_ready(inner._roll(part, model, data)), split))
+                list(pool.map(lambda part: jax.block_until_ready(_roll(part, model, data)), split))
 
         def rollout(models: list = models, own: list = own, states: np.ndarray = states) -> None:
             mujoco.rollout.rollout(models, own, states, nstep=steps, persistent_pool=True)
@@ -213,9 +206,44 @@ def write_scaling(rows: np.ndarray, device: str, chunk: int) -> None:
     figure.savefig(RESULTS / "scaling.png", dpi=150)
 
 
+def draw(body: objects.Body, traj: physics.Trajectory) -> None:
+    """Every frame of trajectories of one object, both streams, fetched to the host and let go."""
+    gpu = jax.default_backend() != "cpu"
+    batch, threads = (GPU_BATCH, 1) if gpu else (RENDER_BATCH, os.cpu_count())
+    pose, wrench = (np.asarray(x).reshape(-1, x.shape[-1]) for x in (traj.pose, traj.wrench))
+
+    def one(begin: int) -> None:
+        rows = np.minimum(np.arange(begin, begin + batch), len(pose) - 1)  # one compilation: the last is repeated
+        images = dataset.render_uint8(Sensor(), body, pose[rows], wrench[rows], resolution=(64, 64), crop=False)
+        jax.device_get(images[:2])
+
+    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        list(pool.map(one, range(0, len(pose), batch)))
+
+
+def pipeline(count: int) -> None:
+    """Prints frames per second of `count` drops of a bottle, of physics, of both streams, and together."""
+    chunk = 32 if jax.default_backend() == "cpu" else count
+    body, scenario = objects.make(jax.random.key(0), "bottle"), physics.Freefall()
+    for _ in range(2):  # the first compiles
+        times = [time.perf_counter()]
+        traj = physics.simulate(jax.random.key(1), body, Sensor(), scenario, count, chunk=chunk)
+        jax.block_until_ready(traj)
+        times.append(time.perf_counter())
+        draw(body, traj)
+        times.append(time.perf_counter())
+    frames = count * scenario.frames
+    print(f"{count:,} worlds of {scenario.frames} frames, both streams 64x64: {jax.devices()[0].device_kind}")
+    for name, seconds in (("physics", times[1] - times[0]), ("streams", times[2] - times[1])):
+        print(f"    {name:9s} {seconds:8.2f} s {frames / seconds:10,.0f} frames/s")
+    rate = frames / (times[2] - times[0])
+    print(f"    together  {times[2] - times[0]:8.2f} s {rate:10,.0f} frames/s, {rate / (10 * TACCEL):.3f} of the mark")
+    print(f"    Taccel, 4,096 environments on an H100: {TACCEL} steps/s as published; the mark: {10 * TACCEL:,}")
+
+
 def first_call(name: str, count: int) -> None:
     """In a fresh process: print seconds before the first step, and how often `count` objects compiled, as JSON."""
-    scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(count)
+    scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]
     begin = time.perf_counter()
     physics.simulate(jax.random.key(0), items[0], sensor, scenario)
@@ -225,7 +253,8 @@ def first_call(name: str, count: int) -> None:
     again = time.perf_counter() - begin
     jax.clear_caches()
     physics.simulate(jax.random.key(0), items, sensor, scenario)
-    programs = {f: getattr(inner, f)._cache_size() for f in ("_roll", "_draw", "_rigid", "_gravity")}
+    compiled: dict[str, Any] = {"_roll": _roll, "_draw": _draw, "_rigid": _rigid, "_gravity": _gravity}
+    programs = {name: function._cache_size() for name, function in compiled.items()}
     print(json.dumps({"seconds": first - again, "objects": len(items), "programs": programs}))
 
 
@@ -243,32 +272,10 @@ def compilation(count: int = 100) -> None:
                 )
 
 
-def reroll(times: int, *, num_objects: int = 48, num: int = 4) -> None:
-    """Drops the same starts several times with fresh fill, shell and friction and prints how the ends differ."""
-    sensor, scenario, items = Sensor(), physics.Freefall(), bodies(num_objects)
-    ends, rests = [], []
-    for key in jax.random.split(jax.random.key(2), times):
-        hidden = jax.vmap(scenario.hidden)(jax.random.split(key, num_objects * num))
-        traj = physics.simulate(jax.random.key(1), items, sensor, scenario, num, hidden=hidden)
-        if traj.resampled.sum():
-            raise RuntimeError("a drop was drawn again from another start; give another key")
-        ends.append(1e3 * np.asarray(traj.pose[:, -1, :2]))
-        rests.append(np.asarray(traj.outcome) == physics.Outcome.RESTS)
-    place, stay = np.array(ends), np.array(rests)
-    start = 1e3 * np.asarray(traj.pose[:, 0, :2])
-    own = np.linalg.norm(place - place.mean(0), axis=-1).mean(0) * np.sqrt(times / (times - 1))
-    moved = np.linalg.norm(place - start, axis=-1)
-    changed = np.mean(stay.any(0) & ~stay.all(0))
-    print(f"{place.shape[1]} starts of {num_objects} objects, {times} fills, shells and frictions each")
-    print(f"the end lies from the start                  {np.mean(moved[stay]):5.1f} mm (mean, of those that stay)")
-    print(f"the ends of one start from their own mean    {np.mean(own):5.1f} mm (mean), {np.median(own):.1f} (median)")
-    print(f"starts of which some ends stay and some fall {100 * changed:5.1f} %")
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--reroll", type=int, default=0, metavar="N", help="roll the same starts N times (N > 1)")
     parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
+    parser.add_argument("--pipeline", type=int, metavar="WORLDS", help="frames per second of so many drops, drawn")
     parser.add_argument("--scaling", action="store_true", help="steps per second against the number of worlds")
     parser.add_argument("--compile", action="store_true", help="seconds and number of compilations")
     parser.add_argument("--count", type=int, default=100, help="objects of which compilations are counted")
@@ -280,9 +287,7 @@ if __name__ == "__main__":
         compilation(arguments.count)
     elif arguments.scaling:
         scaling()
-    elif arguments.reroll:
-        if arguments.reroll < 2:
-            parser.error(f"--reroll {arguments.reroll}: ends are compared, roll at least twice")
-        reroll(arguments.reroll)
+    elif arguments.pipeline is not None:
+        pipeline(arguments.pipeline)
     else:
         speed(arguments.num)

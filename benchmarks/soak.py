@@ -2,15 +2,17 @@
 
     python -m benchmarks.soak                            # 30,000 trajectories: about two hours on two cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
+    python -m benchmarks.soak --keep FOLDER              # keep finished blocks there, and go on from them
 
 A new object every eight trajectories: of all classes in turn, bottles under a jerk. Counts the draws that were thrown
-away (non-finite, or deeper in the pad than the limit), outcomes, what had not settled, and holds the wrench at rest
-against the weight, and the energy out of contact against the start's. Done in blocks that `--keep` keeps in a folder:
-started again it goes on where it stopped. `benchmarks.hidden --soaked` asks what decides those trajectories.
+away (non-finite, or deeper in the pad than the limit; no other is left), outcomes, what had not settled, and holds the
+wrench at rest against the weight, and the energy out of contact against the start's. All is simulated in whole blocks,
+of `BLOCK` trajectories, or fewer where fewer are asked for. `benchmarks.hidden --soaked` asks what decides them.
 """
 
 import argparse
 import functools
+import json
 import tempfile
 from pathlib import Path
 
@@ -19,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from benchmarks.starts import Starts, bodies, rigid_of
 from sts_jax import _math, dataset, objects, physics
 from sts_jax.physics.scenarios import G
 from sts_jax.physics.simulate import SUNK_LIMIT
@@ -30,7 +33,7 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "perturbed": physics.Perturbed(),
 }
 NUM = 8  # trajectories of an object
-BLOCK = 504  # trajectories simulated by one call
+BLOCK = 504  # trajectories simulated by one call, if as many are asked for
 
 
 def excess_energy(
@@ -54,27 +57,21 @@ def excess_energy(
     return (energy - energy[:, :1]) / (mass[:, None] * np.linalg.norm(gravity) * 0.05)
 
 
-def block(name: str, index: int, count: int) -> dict[str, np.ndarray]:
-    """What became of one block of trajectories."""
+def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
+    """What became of one block of trajectories of a scenario, arrays (size, ...); `size` is a multiple of NUM."""
     scenario = SCENARIOS[name]
-    first = index * BLOCK // NUM
-    classes = ("bottle",) if name == "perturbed" else objects.CATEGORIES
-    numbers = np.arange(first, first + -(-count // NUM))
-    items = [objects.make(jax.random.key(int(i)), classes[i % len(classes)]) for i in numbers]
+    first = index * size // NUM
+    items = bodies(("bottle",) if name == "perturbed" else objects.CATEGORIES, size // NUM, first)
     key = jax.random.fold_in(jax.random.key(1), index)
     traj = jax.tree.map(np.asarray, physics.simulate(key, items, Sensor(), scenario, NUM))
-    rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
-    parts = []
-    for number, body in enumerate(items):
-        own = jax.tree.map(lambda x, mine=traj.body == number: x[mine], traj.hidden)
-        parts.append(rigid(body, own.fill, own.shell_scale, own.up))
-    mass, com, inertia = (np.concatenate(x) for x in zip(*parts, strict=True))
+    rigid = rigid_of(items, traj)
+    mass = rigid[0]
     fell = traj.outcome == physics.Outcome.FELL_OFF
     gravity = traj.gravity[0, -1].astype(np.float64)
     carried = -(mass[:, None] * gravity)
     error = np.linalg.norm(traj.wrench[:, -1, :3] - carried, axis=1) / (mass * G)
     at_rest = traj.settled & ~fell & ~traj.wall[:, -1]
-    free = excess_energy((mass, com, inertia), traj.pose, traj.velocity, gravity)
+    free = excess_energy(rigid, traj.pose, traj.velocity, gravity)
     out_of_contact = ~traj.contact & ~traj.wall & ~fell[:, None]
     return {
         "body": first + traj.body,
@@ -92,6 +89,31 @@ def block(name: str, index: int, count: int) -> dict[str, np.ndarray]:
         "wrench_error": np.where(at_rest, error, np.nan),
         "excess": np.where(out_of_contact, free, -np.inf).max(1) if name != "perturbed" else np.full(len(fell), np.nan),
     }
+
+
+def claim(folder: Path, name: str, size: int) -> None:
+    """Insists that a folder's blocks of a scenario are of these settings; see `dataset.claim`."""
+    settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
+    dataset.claim(folder / f"{name}.json", settings)
+
+
+def soaked(folder: Path, name: str) -> Starts:
+    """What the kept blocks of a scenario began with and how they ended; nothing was rolled again.
+
+    Raises:
+        FileNotFoundError: The folder holds none.
+        ValueError: They were made with other settings; names the first that differs.
+    """
+    claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
+    if not (claimed.exists() and paths):
+        raise FileNotFoundError(f"{folder} holds no block {name}-*.npz: run python -m benchmarks.soak --keep {folder}")
+    claim(folder, name, json.loads(claimed.read_text())["block"])
+    parts = []
+    for path in paths:
+        with np.load(path) as kept:
+            known = {field: kept[field] for field in Starts._fields if field != "rerolled"}
+            parts.append(Starts(**known, rerolled=np.full(len(kept["body"]), -1)))
+    return Starts(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def report(name: str, found: dict[str, np.ndarray]) -> str:
@@ -121,15 +143,14 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
 def main(num: int, names: list[str], keep: Path) -> None:
     """All blocks that are not kept yet, then the figures."""
+    size = min(BLOCK, -(-num // NUM) * NUM)
     for name in names:
+        claim(keep, name, size)
         parts = []
-        for index in tqdm(range(-(-num // BLOCK)), unit="block", desc=name):
-            count = min(BLOCK, num - index * BLOCK)
-            path = keep / f"{name}-{index:04d}-{count}.npz"
+        for index in tqdm(range(-(-num // size)), unit="block", desc=name):
+            path = keep / f"{name}-{index:04d}.npz"
             if not path.exists():
-                found = block(name, index, count)
-                keep.mkdir(parents=True, exist_ok=True)
-                dataset.write_arrays(path, found)
+                dataset.write_arrays(path, block(name, index, size))
             with np.load(path) as kept:
                 parts.append(dict(kept))
         print(report(name, {field: np.concatenate([p[field] for p in parts])[:num] for field in parts[0]}), flush=True)

@@ -1,4 +1,4 @@
-"""What JAX compiles is kept between runs."""
+"""Where things are kept between runs, among them what JAX compiles."""
 
 import hashlib
 import os
@@ -8,8 +8,13 @@ from pathlib import Path
 import jax
 
 
+def cache_folder() -> Path:
+    """For what can be made again: `sts_jax` in XDG_CACHE_HOME, or in ~/.cache where that is not set or empty."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sts_jax"
+
+
 def keep() -> None:
-    """Let JAX keep compiled programs in a folder: JAX_COMPILATION_CACHE_DIR, or one in ~/.cache/sts_jax.
+    """Let JAX keep compiled programs in a folder: JAX_COMPILATION_CACHE_DIR, or one in `cache_folder`.
 
     There is one for each kind of processor, since what was compiled for another may not run. For entry points only:
     the library leaves JAX's settings alone. An empty JAX_COMPILATION_CACHE_DIR keeps nothing.
@@ -19,8 +24,7 @@ def keep() -> None:
     is an exception all the same.
     """
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(caches / "sts_jax" / processor()))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / processor()))
 
 
 def processor() -> str:

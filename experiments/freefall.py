@@ -9,7 +9,7 @@ Leaves `runs/freefall/`: config.json, dataset/, models/NAME/, metrics.json, tabl
 the same --workdir it goes on where it stopped, and touches nothing where all is done.
 """
 
-from experiments import stages
+from experiments import command, stages
 from sts_jax import dataset, physics, training
 
 DEFAULT = stages.Config(
@@ -22,4 +22,4 @@ PAPER = stages.paper(dataset.Collection(physics.Freefall()), num_objects=340, nu
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
 if __name__ == "__main__":
-    stages.command(PRESETS, "runs/freefall", __doc__)  # collect, train, evaluate: stages.main
+    command.run(PRESETS, "runs/freefall", __doc__)  # collect, train, evaluate: stages.main

@@ -1,9 +1,11 @@
-"""A contact sheet of the object families: one row each, from a key.
+"""A contact sheet of the object families: one row each, from a key; and how well what collides fits what is seen.
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-About 20 seconds on two CPU cores for 8 x 10 objects. `--view side` is what a person sees, `--view below` what the
-sensor faces; `--shuffle` deals the objects out without rows or names, for someone else to tell apart.
+About half a minute on two CPU cores for 8 x 10 objects. `--view side` is what a person sees, `--view below` what the
+sensor faces; `--shuffle` deals the objects out without rows or names, for someone else to tell apart. Prints a line an
+object: size, faces, collision hull, and how far the surface sticks out of the hull at most / how far the hull stands
+off the surface; `--parts` makes convex parts first of what a hull fits badly (some ten seconds each).
 """
 
 import dataclasses
@@ -39,6 +41,7 @@ class Config:
     categories: tuple[str, ...] = sts.objects.CATEGORIES
     view: Literal["quarter", "side", "above", "below"] = "quarter"
     size: int = 160  # pixels, side of one object's picture
+    parts: bool = False  # what a hull fits badly collides as convex parts
     shuffle: bool = False  # in random order, numbered instead of named; the answers go to OUT with suffix .txt
 
 
@@ -63,8 +66,27 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
     )
 
 
+def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
+    """The line of one object, as `sts.objects.describe` has it; with `parts` as `dataset.make_bodies` makes it."""
+    apart, notes = sts.objects.gaps(body), []
+    if parts and apart[1] > sts.objects.HOLLOW:
+        notes = [f"as one hull {_millimetres(apart)}"]
+        body = sts.objects.decompose(body)
+        apart = sts.objects.gaps(body)
+    size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
+    drawn = int(np.asarray(body.faces).any(axis=1).sum())
+    hulls = np.asarray(body.hulls)
+    hull = f"{len(np.unique(hulls.reshape(-1, 3), axis=0))} vertices"
+    hull += f" in {len(np.unique(hulls, axis=0))} parts" if len(hulls) > 1 else ""
+    return f"{category}  {number}: " + "; ".join([size, f"{drawn} faces", hull, _millimetres(apart), *notes])
+
+
+def _millimetres(gaps: tuple[float, float]) -> str:
+    return " / ".join(f"{gap * 1e3:.2f}" for gap in gaps)
+
+
 def main(config: Config) -> None:
-    """Make the objects, take their portraits, compose the sheet."""
+    """Make the objects, describe them, take their portraits, compose the sheet."""
     if config.num < 1:
         raise ValueError(f"num is {config.num}: give at least 1 object of each family")
     unknown = set(config.categories) - set(sts.objects.CATEGORIES)
@@ -81,6 +103,11 @@ def main(config: Config) -> None:
         drawn = [drawn[i] for i in order]
         lines = [f"{i + 1} {category}" for i, (category, _) in enumerate(drawn)]
         config.out.with_suffix(".txt").write_text("\n".join(lines) + "\n")
+
+    print("class  number: size (mm); faces; collision hull; gaps (mm)")
+    for index, (category, body) in enumerate(drawn):
+        number = index if config.shuffle else index % config.num
+        print(describe(category, number + 1, body, parts=config.parts), flush=True)
 
     rows = len(config.categories)
     figure, axes = pyplot.subplots(rows, config.num, figsize=(1.6 * config.num, 1.7 * rows), squeeze=False)

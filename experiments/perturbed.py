@@ -11,7 +11,7 @@ the same --workdir it goes on where it stopped, and touches nothing where all is
 
 import dataclasses
 
-from experiments import stages
+from experiments import command, stages
 from sts_jax import dataset, physics, training
 
 BOTTLES = dataset.Collection(physics.Perturbed(), categories=("bottle",))
@@ -25,4 +25,4 @@ PAPER = stages.paper(BOTTLES, num_objects=500, num_per_object=5)  # 2,500 trajec
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
 if __name__ == "__main__":
-    stages.command(PRESETS, "runs/perturbed", __doc__)  # collect, train, evaluate: stages.main
+    command.run(PRESETS, "runs/perturbed", __doc__)  # collect, train, evaluate: stages.main

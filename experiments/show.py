@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import compilation, freefall, inclined, perturbed, stages
+from experiments import compilation, freefall, inclined, perturbed, pictures
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -57,8 +57,8 @@ def main(config: Config) -> None:
             crop=False,
         )
         visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
-        view = stages.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
-        words = stages.describe(name, one._asdict(), one.hidden._asdict())
+        view = pictures.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
+        words = pictures.describe(name, one._asdict(), one.hidden._asdict())
         path = config.out / f"{config.scenario}-{i}.png"
         evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)
         evaluation.figures.animation(

@@ -3,24 +3,19 @@
 import dataclasses
 import itertools
 import json
-import os
-import tempfile
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-import tyro
 
 import sts_jax as sts
-from experiments import compilation
+from experiments import pictures
 from experiments.progress import Bar, say
 from sts_jax import dataset, evaluation, mvae, training
+from sts_jax.dataset.collect import SPLITS
 
-CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "sts_jax"  # what is made of mesh files
-LEAST_OBJECTS = 10  # of a folder, so that whole ones can be held out to validate and to test
 # The rows of the paper's Table 1, by the modalities a model has.
 MODELS: dict[str, tuple[str, ...]] = {
     "mvae": ("visual", "tactile", "pose"),
@@ -83,47 +78,6 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class Args:
-    """What the command line of an experiment says."""
-
-    workdir: Path
-    preset: Literal["smoke", "default", "paper"] = "default"
-    plan: bool = False  # print seconds per stage from a short measurement, and stop
-    hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
-    objects: Path | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
-    parts: bool = False  # what a hull fits badly collides as convex parts
-
-
-def command(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
-    """An experiment from the command line."""
-    args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
-    compilation.keep()
-    config = presets[args.preset]
-    scenario = sts.physics.variant(config.collection.scenario, args.hidden)
-    collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)
-    if args.objects is not None:
-        collection = with_meshes(collection, args.objects, args.workdir)
-    config = dataclasses.replace(config, collection=collection)
-    if args.plan:
-        print(plan(config))
-    else:
-        main(config, args.workdir)
-
-
-def with_meshes(collection: dataset.Collection, folder: Path, workdir: Path) -> dataset.Collection:
-    """A collection of the objects of a folder, with about as many trajectories; lists them in `objects.txt`."""
-    meshes, listing = dataset.survey_meshes(
-        folder, collection.scenario, parts=collection.parts, cache=CACHE / "objects", progress=say
-    )
-    write(workdir / "objects.txt", listing.encode())
-    say(f"{len(meshes.names)} objects can be used; {workdir / 'objects.txt'} has them and what was left out")
-    if len(meshes.names) < LEAST_OBJECTS:
-        raise ValueError(f"{folder}: {len(meshes.names)} objects are too few to hold some out: give {LEAST_OBJECTS}")
-    each = max(collection.num_per_object, round(collection.num_trajectories / len(meshes.names)))
-    return dataclasses.replace(collection, meshes=meshes, num_objects=len(meshes.names), num_per_object=each)
-
-
 def main(config: Config, workdir: Path) -> None:
     """Collect, train, evaluate."""
     sensor = sts.Sensor()
@@ -148,22 +102,38 @@ def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Datase
             workdir / "dataset",
             progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total),
         )
-    for line in made.left_out:
-        say(f"collect: left out {line}")
+    left_out = [f"collect: left out {line}" for line in made.left_out]
+    for line in left_out:
+        say(line)
+    note(workdir / "objects.txt", left_out)
     if made.resampled:
         say(f"collect: {made.resampled} trajectories went non-finite or sank and were drawn again")
     return dataset.load(workdir / "dataset")
 
 
-def parts(data: dataset.Dataset, split: str) -> dict[str, np.ndarray]:
+def note(path: Path, lines: Sequence[str]) -> None:
+    """Add to a text file those of some lines that it does not have."""
+    there = path.read_text() if path.exists() else ""
+    new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in there)
+    if new:
+        dataset.write_bytes(path, (there + new).encode())
+
+
+def train_share(split: str) -> float:
+    """Of all objects, or of all trajectories where these are held out, the share that trains."""
+    # The paper has no validation part.
+    return SPLITS["train"] if split == "object" else 1 - SPLITS["test"]
+
+
+def rows_of(data: dataset.Dataset, split: str) -> dict[str, np.ndarray]:
     """Which trajectories train, validate and test."""
     if split == "object":
         return {name: data.members(name) for name in ("train", "validation", "test")}
     if split != "trajectory":
         raise ValueError(f"unknown split {split!r}: hold out by 'object' or by 'trajectory'.")
     order = np.random.default_rng(data.collection["seed"]).permutation(len(data.trajectory["outcome"]))
-    cut = round(0.8 * len(order))
-    # The paper has no validation part; the outcome's threshold is then chosen on training trajectories.
+    cut = round(train_share(split) * len(order))
+    # Without a validation part the outcome's threshold is chosen on training trajectories.
     return {"train": np.sort(order[:cut]), "validation": np.sort(order[:cut]), "test": np.sort(order[cut:])}
 
 
@@ -174,7 +144,7 @@ def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
 
 def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
     """Train the models of the paper's Table 1 on one split."""
-    pairs = data.pairs(parts(data, split)["train"], symmetries=True)
+    pairs = data.pairs(rows_of(data, split)["train"], symmetries=True)
     blank = empty_frame(sensor, config.collection)
     for number, (name, modalities) in enumerate(MODELS.items()):
         arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
@@ -257,12 +227,9 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     done = workdir / f"table{suffix}.md"
     if done.exists():
         return done.read_text()
-    part = parts(data, split)
-    train_pairs, validation, test = (
-        data.pairs(part["train"], symmetries=True),
-        data.pairs(part["validation"]),
-        data.pairs(part["test"]),
-    )
+    rows_in = rows_of(data, split)
+    train_pairs = data.pairs(rows_in["train"], symmetries=True)
+    validation, test = data.pairs(rows_in["validation"]), data.pairs(rows_in["test"])
     blank = training.load_blank(model_folder(workdir, "mvae", config, split))[0] / 255
     rows = evaluation.baselines(config.collection.scenario, train_pairs, test)
     with Bar() as bar:
@@ -275,26 +242,15 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         bar("evaluate", len(jobs), len(jobs), "intervals done")
 
     figures = workdir / f"figures{suffix}"
-    both, single = f"{TITLES['mvae']}, from all inputs", f"{TITLES['mvae']}, from visual"
-    shown = {"MVAE from vision": rows[single]}
-    if both in rows:
-        shown["MVAE from all"] = rows[both]
+    shown = {"MVAE from vision": rows[f"{TITLES['mvae']}, from visual"]}
+    if f"{TITLES['mvae']}, from all inputs" in rows:
+        shown["MVAE from all"] = rows[f"{TITLES['mvae']}, from all inputs"]
     title = f"{workdir.name}: the first {config.num_shown} of the held-out list, by {split}"
-    if config.collection.scenario.condition_scale:
-        title += "; red: where to, and how hard, the jerk drives it"
-    evaluation.figures.predictions(figures / "predictions.png", test, shown, num=config.num_shown, title=title)
-    category = np.array(dataset.class_names(config.collection))[test.object]
-    best = rows[both] if both in rows else rows[single]
-    assert best.pose is not None  # "mvae" of MODELS has one
-    first = np.sort(np.unique(test.object, return_index=True)[1])[:10]  # the first one of each of the first objects
-    samples = [dataset.sample_of_class(config.collection, name) for name in category[first]]
-    stands = evaluation.stand_ins(sensor, samples, best.pose[first], config.collection.resolution)
-    line_up = figures / "line_up.png"
-    evaluation.figures.line_up(line_up, line_up.with_suffix(".json"), test, best, category, blank, stands, first)
+    pictures.draw_predictions(figures, config.collection, sensor, test, shown, blank, num=config.num_shown, title=title)
     logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
     evaluation.figures.training_curves(figures / "training.png", logs)
     if split == config.splits[0]:
-        draw_strip(config, data, figures / "strip.png", sensor)
+        pictures.draw_strip(figures / "strip.png", config.collection, sensor, data)
 
     steps = {name: log[-1]["step"] if log else 0 for name, log in logs.items()}
     notes = [
@@ -302,11 +258,11 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         + ", ".join(f"{name} {count}" for name, count in steps.items())
         + f"; batch {config.training.batch_size}.",
     ]
-    content = (json.dumps({"split": split, **summary}, indent=2) + "\n").encode()
-    write(workdir / f"metrics{suffix}.json", content)
+    content = json.dumps({"split": split, **summary}, indent=2) + "\n"
+    dataset.write_bytes(workdir / f"metrics{suffix}.json", content.encode())
     title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
     text = evaluation.table(summary, title=title, notes=notes)
-    write(done, text.encode())
+    dataset.write_bytes(done, text.encode())
     return text
 
 
@@ -366,142 +322,5 @@ def predict(
     return out._replace(outcome=outcome)
 
 
-def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
-    """Seconds a stage, measured on a little of each and everything twice, so that compilation counts once.
-
-    Args:
-        config: The experiment.
-        num: Trajectories to simulate; each has its first and last frame rendered in all symmetries.
-        steps: Gradient steps of each model.
-
-    Returns:
-        One line a stage.
-    """
-    sensor, collection = sts.Sensor(), config.collection
-    many = 8  # objects
-    lines = []
-    with tempfile.TemporaryDirectory() as name, Bar() as bar:
-        spent: dict[str, list[float]] = {"trajectories": [], "frames": []}
-        for seed in (0, 1):
-            little = dataclasses.replace(
-                dataset.head(collection, many), num_per_object=num // many, num_full=0, symmetries=True, seed=seed
-            )
-            stamps = {"start": time.perf_counter()}
-
-            def watch(progress: dataset.Progress, stamps: dict[str, float] = stamps) -> None:
-                stamps[progress.stage] = time.perf_counter()
-                bar(f"plan: {progress.stage}", progress.done, progress.total)
-
-            dataset.collect(little, sensor, Path(name) / str(seed), progress=watch)
-            spent["trajectories"].append(stamps["trajectories"] - stamps["start"])
-            spent["frames"].append(stamps["frames"] - stamps["trajectories"])
-        last, seen = collection.scenario.frames, len(dataset.symmetries_of(collection))
-        ends = collection.num_trajectories * 2 * seen
-        frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
-        for stage, total, measured in (
-            ("trajectories", collection.num_trajectories, num),
-            ("frames", frames, 2 * len(collection.scenario.symmetries) * num),
-        ):
-            first, again = spent[stage]
-            rate = measured / again
-            seconds = max(first - again, 0) + total / rate
-            lines.append(
-                (f"collect: {total} {stage}", seconds, f"{rate:.3g} a second, {first - again:.0f} s to compile")
-            )
-
-        data = dataset.load(Path(name) / "0")
-        tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",))
-        pairs = data.pairs(np.arange(num), symmetries=True)
-        blank = empty_frame(sensor, collection)
-        share = 0.7 if config.splits[0] == "object" else 0.8
-        samples = round(share * collection.num_trajectories) * seen
-        for number, (model, modalities) in enumerate(MODELS.items()):
-            arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
-            stamps_of_steps = [time.perf_counter()]
-
-            def tick(done: int, total: int, _: dict, stamps: list[float] = stamps_of_steps, model: str = model) -> None:
-                stamps.append(time.perf_counter())
-                bar(f"plan: train {model}", done, total)
-
-            training.train(
-                dataclasses.replace(config.training, steps=steps, log_every=1, checkpoint_every=steps),
-                model_config(modalities, preprocessing),
-                arrays,
-                workdir=model_folder(Path(name), model, tiny, "trajectory"),
-                absent=preprocessing.absent,
-                targets=config.targets,
-                preprocessing=dataclasses.asdict(preprocessing),
-                progress=tick,
-            )
-            training.save_blank(model_folder(Path(name), model, tiny, "trajectory"), blank.visual, blank.tactile)
-            each = float(np.median(np.diff(stamps_of_steps)[1:]))
-            compiling = stamps_of_steps[1] - stamps_of_steps[0] - each
-            total = config.steps[number] if config.steps is not None else config.training.total(samples)
-            note = f"{each:.3g} s a step, {compiling:.0f} s to compile"
-            lines.append((f"train {model}: {total} steps", compiling + total * each, note))
-        start = time.perf_counter()
-        evaluate(tiny, data, Path(name), sensor, "trajectory")
-        lines.append(("evaluate and draw", time.perf_counter() - start, f"of {round(0.2 * num)} trajectories"))
-    repeats = len(config.splits)
-    lines = [(what, seconds * (1 if what.startswith("collect") else repeats), note) for what, seconds, note in lines]
-    lines.append(("together", sum(seconds for _, seconds, _ in lines), f"for {', '.join(config.splits)} split"))
-    return "\n".join(f"{what:<36}{seconds:>9.0f} s   ({note})" for what, seconds, note in lines)
-
-
-def draw_strip(config: Config, data: dataset.Dataset, path: Path, sensor: sts.Sensor) -> None:
-    """A fully rendered trajectory, the first with the most telling outcome, from outside and through the sensor."""
-    full = data.full_trajectories()
-    if not len(full):
-        return
-    rank = [config.collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
-    index = int(full[np.argmin(rank)])
-    one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
-    images = data.strip(index)
-    body = dataset.make_bodies(config.collection, np.array([one["body"]]))[0]
-    what = describe(dataset.class_names(config.collection)[one["body"]], one, hidden)
-    evaluation.figures.strip(
-        path,
-        one["time"],
-        views(body, one["pose"], one["gravity"], sensor, config.collection.scenario.wall),
-        images.visual / 255,
-        images.tactile / 255,
-        one["wrench"],
-        title=f"trajectory {index}: {what}",
-    )
-
-
-def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
-    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the gravity of its end drawn downwards.
-
-    What fell off and was frozen is no longer drawn.
-    """
-    size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
-    frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
-    pose = np.where(frozen[:, None], np.array([0, 0, -10, 1, 0, 0, 0], np.float32), pose)
-    return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up, wall)) for each in pose])
-
-
-def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]) -> str:
-    """One trajectory in words: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
-    outcome = sts.physics.Outcome(int(trajectory["outcome"])).name.lower().replace("_", " ")
-    words = [f"a {name} {outcome}"]
-    words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]
-    if hidden["up"][2] < 1:
-        words.append("contents' up ({:.1f}, {:.1f}, {:.1f})".format(*hidden["up"]))
-    if len(trajectory["condition"]):
-        x, y, duration = trajectory["condition"]
-        words.append(f"pad jerked by ({x:.1f}, {y:.1f}) m/s² for {1e3 * duration:.0f} ms")
-    return ", ".join(words)
-
-
 def _read_lines(path: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def write(path: Path, data: bytes) -> None:
-    """A whole file or none."""
-    dataset.write_whole(path, lambda temporary: _write_bytes(temporary, data))
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    path.write_bytes(data)

@@ -38,11 +38,6 @@ def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Arr
     )
 
 
-def quat_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """The inverse rotation of a unit quaternion."""
-    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
-
-
 def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """The same rotation, unit, with `w >= 0`."""
     q = normalize(q)

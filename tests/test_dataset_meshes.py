@@ -58,6 +58,17 @@ def test_what_can_be_used_is_collected_and_the_rest_is_said(folder: Path, tmp_pa
     np.testing.assert_array_equal(sample.vertices, dataset.make_bodies(one, np.array([3]))[0].vertices)
     assert dataset.class_names(dataset.head(one, 2)) == ("box", "box")
 
+    half, _ = dataset.survey_meshes(folder, SCENARIO, scale=0.5, up="y")
+    small = dataset.make_bodies(collection(half), np.array([2]))[0]
+    np.testing.assert_allclose(np.ptp(small.vertices, axis=0), [0.025, 0.025, 0.02], atol=1e-6)
+
+    assert dataset.mesh_classes(folder) == ("box", "can")
+    cans, listing = dataset.survey_meshes(folder, SCENARIO, classes=("can",))
+    assert set(cans.labels) == {"can"}
+    assert "torn" not in listing
+    with pytest.raises(ValueError, match="holds no cup: its classes are box, can"):
+        dataset.survey_meshes(folder, SCENARIO, classes=("can", "cup"))
+
     (folder / "box" / "1.stl").write_bytes((folder / "box" / "2.stl").read_bytes())
     assert dataset.survey_meshes(folder, SCENARIO)[0].digest != meshes.digest
 
@@ -78,6 +89,7 @@ def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_go_on(
     out = tmp_path_factory.mktemp("out") / "dataset"
     made = dataset.collect(one, sts.Sensor(), out)
     assert made.left_out == ("object 1 (box/1.stl): trajectory 0 is non-finite",)
+    assert dataset.collect(one, sts.Sensor(), out) == made  # nothing to do: it is said again
     data = dataset.load(out)
     np.testing.assert_array_equal(data.trajectory["body"], [0, 2, 3, 4, 5])
     pairs = data.pairs(np.arange(5))
@@ -87,6 +99,17 @@ def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_go_on(
             sts.Sensor(), body, pairs.pose[row, :1], data.trajectory["wrench"][row, :1], resolution=(64, 64), crop=False
         )
         assert np.mean(np.asarray(shown[0][0]) != pairs.visual[row, 0]) < 0.01
+
+
+def test_a_file_that_is_gone_since_the_survey_is_left_out(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+    one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
+    out = tmp_path_factory.mktemp("out") / "dataset"
+    (folder / "can" / "1.stl").unlink()
+    made = dataset.collect(one, sts.Sensor(), out)
+    (line,) = made.left_out
+    assert line.startswith("object 4 (can/1.stl): ")
+    assert "no such mesh file any more" in line
+    np.testing.assert_array_equal(dataset.load(out).trajectory["body"], [0, 1, 2, 3, 5])
 
 
 def test_a_folder_of_nothing_and_a_wrong_number_are_named(folder: Path, tmp_path: Path):

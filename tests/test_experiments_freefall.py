@@ -102,22 +102,8 @@ def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
     assert float(frame.pressure.sum() * area) == pytest.approx(float(traj.wrench[one, -1, 2]), rel=0.01)
 
 
-def test_the_paper_preset_has_the_papers_counts():
-    paper = freefall.PAPER
-    assert paper.collection.num_trajectories == 1700
-    assert paper.collection.scenario.frames == 60
-    assert paper.collection.crop
-    assert paper.collection.num_full == 1700
-    assert (paper.training.epochs, paper.training.batch_size) == (200, 64)
-    assert paper.training.beta_warmup == 50 / 200
-    assert (paper.targets, paper.splits[0], paper.mask_blank_touch) == ("own", "trajectory", False)
-    model = stages.model_config(stages.MODELS["mvae"], stages.preprocessing_of(paper))
-    assert [m.weight for m in model.modalities] == [1, 1, 1000]
-    assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
-
-
 def test_the_papers_split_is_a_fifth_of_shuffled_trajectories(workdir):
     data = dataset.load(workdir / "dataset")
-    parts = stages.parts(data, "trajectory")
-    assert len(parts["test"]) == round(0.2 * 16)
-    np.testing.assert_array_equal(np.sort(np.concatenate([parts["train"], parts["test"]])), np.arange(16))
+    rows = stages.rows_of(data, "trajectory")
+    assert len(rows["test"]) == round(0.2 * 16)
+    np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), np.arange(16))

@@ -175,6 +175,11 @@ def test_missing_columns_are_named(tmp_path):
     shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name not in ("unit", "front")])
     with pytest.raises(ValueError, match=r"metadata\.csv: lacks the columns front, unit "):
         objects.library(tmp_path)
+    shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name != "fullId"])
+    (tmp_path / "models-OBJ").rename(tmp_path / "models")  # known by its columns alone
+    with pytest.raises(ValueError, match=r"metadata\.csv: lacks the columns fullId "):
+        objects.library(tmp_path)
+    (tmp_path / "models").rename(tmp_path / "models-OBJ")
     shapenet.table(tmp_path, [], ["id", "class"])
     with pytest.raises(ValueError, match="lacks the columns fullId, category, up, front, unit"):
         objects.library(tmp_path)

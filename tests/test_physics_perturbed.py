@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks import invariance
 from sts_jax import objects, physics
 from sts_jax.physics import contact, roll, scene
 from sts_jax.physics.scenarios import G
@@ -55,7 +56,7 @@ def test_the_condition_is_the_jerk_and_the_future_does_not_leak(
     bottles: list[objects.Body], shaken: physics.Trajectory
 ) -> None:
     size = np.linalg.norm(shaken.condition[:, :2], axis=1)
-    assert np.all((size >= 3) & (size <= 12) & (shaken.condition[:, 2] >= 0.06) & (shaken.condition[:, 2] <= 0.12))
+    assert np.all((size >= 4) & (size <= 12) & (shaken.condition[:, 2] >= 0.06) & (shaken.condition[:, 2] <= 0.12))
     calm = dataclasses.replace(SCENARIO, acceleration=(0.0, 0.0))
     other = physics.simulate(jax.random.key(1), bottles, Sensor(), calm, NUM, chunk=16)
     for name in ("pose", "velocity", "wrench"):
@@ -76,56 +77,40 @@ def test_gravity_holds_the_whole_impulse_and_ends() -> None:
     np.testing.assert_array_equal(gravity[32 + 76 :, :2], 0)
 
 
-def driven(body: objects.Body, mass: float, com: np.ndarray, inertia: np.ndarray, friction: float) -> mujoco.MjModel:
-    """The scene with its pad on two slides, a million times as heavy as the object."""
-    xml = scene.scene_xml(np.asarray(body.hulls), PAD, SCENARIO.contact)
-    start = xml.index('<geom name="pad"')
-    end = xml.index("/>", start) + 2
-    slides = '<joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>'
-    weight = f'<inertial pos="0 0 0" mass="{1e6 * mass}" diaginertia="1 1 1"/>'
-    carriage = f'<body name="carriage">{slides}{weight}{xml[start:end]}</body>'
-    model = mujoco.MjModel.from_xml_string(xml[:start] + carriage + xml[end:])
-    scene.set_rigid(model, mujoco.MjData(model), mass, com, inertia, friction)
-    model.stat.meaninertia = model.dof_M0[2:].mean()
-    return model
-
-
 def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
-    # Compared to the end of the jerk, until one side of the base lifts off (it stands 10 um deep): then small things
-    # decide, in one engine too.
-    told, ours, same = [], [], []
+    # In C MuJoCo, every vertex of the hull a contact: the object on a driven pad, and on a fixed one under the
+    # scenario's gravity; and ours at every frame. Up to the end of the jerk or the first loss of contact, whatever
+    # rocks; after that small things decide. Frequencies of outcomes are in test_benchmarks_invariance.
+    apart, ours = [], []
     for row in range(2 * NUM):
-        body, friction = bottles[shaken.body[row]], float(shaken.hidden.friction[row])
-        moving = driven(body, *rigid(bottles, shaken, row), friction)
-        fixed = scene.compile_scene(np.asarray(body.hulls), PAD, SCENARIO.contact)
-        scene.set_rigid(fixed, mujoco.MjData(fixed), *rigid(bottles, shaken, row), friction)
-        for model in (moving, fixed):
-            model.opt.iterations, model.opt.tolerance = 100, 0  # masses this far apart converge slowly
-        a, b = mujoco.MjData(moving), mujoco.MjData(fixed)
-        a.qpos[2:] = b.qpos[:] = shaken.pose[row, 0]
+        pair = []
+        for driven in (True, False):
+            body = bottles[shaken.body[row]]
+            model = invariance.c_model(body, SCENARIO.contact, every_vertex=True, driven=driven)
+            data = mujoco.MjData(model)
+            scene.set_rigid(model, data, *rigid(bottles, shaken, row), float(shaken.hidden.friction[row]))
+            model.stat.meaninertia = model.dof_M0[-6:].mean()
+            model.opt.iterations, model.opt.tolerance = 100, 1e-12  # masses this far apart converge slowly
+            data.qpos[-7:] = shaken.pose[row, 0]
+            pair.append((model, data))
+        (moving, a), (fixed, b) = pair
         condition = jnp.asarray(shaken.condition[row])
-        times = jnp.arange(SCENARIO.steps * (SCENARIO.frames - 1)) * SCENARIO.contact.timestep
+        times = jnp.arange(int(condition[2] / SCENARIO.contact.timestep)) * SCENARIO.contact.timestep
         gravity = np.asarray(jax.vmap(lambda t, c=condition: SCENARIO.gravity(t, c))(times), np.float64)
-        touching, rocks, leans = True, False, np.max(np.arccos(np.minimum(upright(shaken.pose[row, :, 3:].T), 1)))
-        for time, own in zip(np.asarray(times), gravity, strict=True):
-            a.qfrc_applied[:2] = -moving.body("carriage").mass * own[:2]
-            fixed.opt.gravity[:] = own
+        for step, own in enumerate(gravity, start=1):
+            a.qfrc_applied[:2], fixed.opt.gravity[:] = -invariance.CARRIAGE * own[:2], own
             mujoco.mj_step(moving, a)
             mujoco.mj_step(fixed, b)
-            touching &= a.ncon > 0
-            rocks |= upright(b.qpos[3:]) < np.cos(np.radians(0.05))
-            if touching and not rocks and time < condition[2]:
-                told.append(np.linalg.norm(a.qpos[2:5] - [*a.qpos[:2], 0] - b.qpos[:3]))
-        last = jnp.asarray(a.qpos[2:] - [*a.qpos[:2], 0, 0, 0, 0, 0], jnp.float32)
-        same.append(int(SCENARIO.outcome(jnp.asarray(shaken.pose[row, 0]), last)) == shaken.outcome[row])
-        if leans < np.radians(1):
-            ours.append(np.linalg.norm(last[:2] - shaken.pose[row, -1, :2]))
-    assert len(told) > 2 * NUM * 10
-    assert np.quantile(told, 0.95) < 1e-4
-    assert np.max(told) < 3e-4
-    assert len(ours) >= 5
-    assert np.median(ours) < 3e-4
-    assert np.mean(same) >= 0.8
+            if not (a.ncon and b.ncon):
+                break
+            place = a.qpos[2:5] - [*a.qpos[:2], 0]
+            apart.append(np.linalg.norm(place - b.qpos[:3]))
+            if step % SCENARIO.steps == 0:
+                ours.append(np.linalg.norm(place - shaken.pose[row, step // SCENARIO.steps, :3]))
+    assert len(ours) >= 2 * 2 * NUM
+    assert np.max(apart) < 1e-4
+    assert np.quantile(ours, 0.9) < 1e-4
+    assert np.max(ours) < 3e-4  # while it moves by centimetres
 
 
 def prism(base: np.ndarray, height: float) -> np.ndarray:

@@ -314,7 +314,7 @@ def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: 
         ({"shell_mass": jnp.float32(-0.1)}, "body 1: shell_mass is -0.1"),
         ({"shell_mass": jnp.float32(jnp.nan)}, "body 1: shell_mass is nan"),
         ({"hulls": jnp.full((1, 64, 3), jnp.nan)}, "body 1: hulls has a non-finite"),
-        ({"hulls": jnp.zeros((1, 64, 3))}, "no volume"),
+        ({"hulls": jnp.zeros((1, 64, 3))}, "body 1: the collision hull spans no volume"),
         ({"hulls": jnp.zeros((3, 64, 3))}, "body 1: hulls has shape"),
         ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
     ],
@@ -329,11 +329,17 @@ def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:
     good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2), np.tile(np.float32([0, 0, 1]), (2, 1)))
     with pytest.raises(ValueError, match=r"hidden.fill has shape \(2,\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 3, hidden=good)
-    with pytest.raises(ValueError, match=r"hidden.friction has values outside"):
+    with pytest.raises(ValueError, match=r"hidden.friction has the value -1.0; it must be positive"):
         physics.simulate(
             jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(friction=-np.ones(2))
         )
-    with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"hidden.up has rows that are no unit vectors"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.ones((2, 3))))
+    with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 2\)"):
+        physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.eye(2)))
+    with pytest.raises(ValueError, match=r"hidden.fill reaches from 0.0 to 1.5"):
+        physics.simulate(
+            jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(fill=np.array([0, 1.5]))
+        )
     with pytest.raises(ValueError, match="no body"):
         physics.simulate(jax.random.key(0), [], Sensor(), SCENARIO)

@@ -27,7 +27,7 @@ CORNERS = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * 
 INERTIA = 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4])
 
 
-def slide(friction: float, constants: physics.Contact, frames: int) -> roll.Record:
+def slide(friction: float, constants: physics.Contact, frames: int, slope: float = SLOPE) -> roll.Record:
     """A block 60 x 40 x 20 mm laid on the pad, which is then tilted towards each azimuth; a record every 50 ms."""
     hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None]))
     model, like, data = scene.template(PAD, constants)
@@ -38,7 +38,7 @@ def slide(friction: float, constants: physics.Contact, frames: int) -> roll.Reco
     start = jax.vmap(lambda xy: roll.initial(jnp.array([*(-0.03 * xy), 0.01, 1, 0, 0, 0]), jnp.zeros(6)))(
         jnp.asarray(down, jnp.float32)
     )
-    tilted = G * np.concatenate([np.sin(SLOPE) * down, np.full((len(down), 1), -np.cos(SLOPE))], axis=1)
+    tilted = G * np.concatenate([np.sin(slope) * down, np.full((len(down), 1), -np.cos(slope))], axis=1)
     flat = np.tile([0, 0, -G], (len(down), 2, STEPS, 1))
     gravity = np.concatenate([flat, np.tile(tilted[:, None, None], (1, frames, STEPS, 1))], axis=1)
     return jax.tree.map(np.asarray, ROLL(own, data, hull, start, jnp.asarray(gravity, jnp.float32))[1])
@@ -50,13 +50,14 @@ def test_below_the_friction_angle_it_holds() -> None:
     assert np.all(creep < 1e-3), creep
 
 
-@pytest.mark.parametrize("friction", [0.2, 0.4])
-def test_above_it_slides_with_what_friction_leaves(friction: float) -> None:
-    found = slide(friction, physics.Inclined().contact, 10)
+@pytest.mark.parametrize(("friction", "degrees"), [(0.2, 30), (0.4, 30), (0.2, 18), (0.8, 45)])
+def test_above_it_slides_with_what_friction_leaves(friction: float, degrees: float) -> None:
+    slope = np.radians(degrees)
+    found = slide(friction, physics.Inclined().contact, 10, slope)
     down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
     speed = np.einsum("nfi,ni->nf", found.velocity[..., :2], down)
     gained = (speed[:, 4] - speed[:, 2]) / (2 * 0.05)
-    expected = G * (np.sin(SLOPE) - friction * np.cos(SLOPE))
+    expected = G * (np.sin(slope) - friction * np.cos(slope))
     np.testing.assert_allclose(gained, expected, rtol=0.02)
     across = np.abs(found.velocity[:, 4, 0] * down[:, 1] - found.velocity[:, 4, 1] * down[:, 0])
     assert np.all(across < 0.01 * speed[:, 4])

@@ -9,6 +9,7 @@ from sts_jax.dataset.collect import class_names as class_names
 from sts_jax.dataset.collect import collect as collect
 from sts_jax.dataset.collect import head as head
 from sts_jax.dataset.collect import make_bodies as make_bodies
+from sts_jax.dataset.collect import mesh_classes as mesh_classes
 from sts_jax.dataset.collect import render_uint8 as render_uint8
 from sts_jax.dataset.collect import sample_of_class as sample_of_class
 from sts_jax.dataset.collect import split_objects as split_objects
@@ -20,7 +21,7 @@ from sts_jax.dataset.load import load as load
 from sts_jax.dataset.records import Images as Images
 from sts_jax.dataset.records import TornFileError as TornFileError
 from sts_jax.dataset.records import write_arrays as write_arrays
-from sts_jax.dataset.records import write_whole as write_whole
+from sts_jax.dataset.records import write_bytes as write_bytes
 
 __all__ = [
     "Collected",
@@ -37,11 +38,12 @@ __all__ = [
     "head",
     "load",
     "make_bodies",
+    "mesh_classes",
     "render_uint8",
     "sample_of_class",
     "split_objects",
     "survey_meshes",
     "symmetries_of",
     "write_arrays",
-    "write_whole",
+    "write_bytes",
 ]

@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,9 @@ class Meshes:
     names: tuple[str, ...]  # of the items of `objects.library`
     labels: tuple[str, ...]  # the class of each
     digest: str  # of the files
-    cache: str | None = None  # folder, see `objects.library`
+    cache: str | None = None  # folder; this and the others: see `objects.library`
+    scale: float | None = None  # m
+    up: Literal["x", "y", "z"] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Collection:
 
 
 class Collected(NamedTuple):
-    """What is to be said of the shards made by a call."""
+    """What is to be said of a whole dataset."""
 
     resampled: int  # trajectories drawn again
     left_out: tuple[str, ...]  # a line for each object that was left out
@@ -84,6 +86,9 @@ def survey_meshes(
     folder: str | os.PathLike[str],
     scenario: physics.Scenario,
     *,
+    classes: tuple[str, ...] = (),
+    scale: float | None = None,
+    up: Literal["x", "y", "z"] | None = None,
     parts: bool = False,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
@@ -93,6 +98,9 @@ def survey_meshes(
     Args:
         folder: See `objects.library`.
         scenario: What happens to them.
+        classes: Of these classes only, see `mesh_classes`; of all where there is none.
+        scale: Metres, of one unit of the files; None takes ShapeNetSem's table, or one metre.
+        up: The files' axis that becomes +z; None takes ShapeNetSem's table, or z, for glTF y.
         parts: Whether what a hull fits badly collides as convex parts.
         cache: Keeps what is made of the files.
         progress: Called with a line for each object.
@@ -102,9 +110,14 @@ def survey_meshes(
 
     Raises:
         FileNotFoundError: No such folder.
-        ValueError: It holds no mesh, or none that can be used.
+        ValueError: It holds no mesh, none that can be used, or none of a class.
     """
-    library, listing = objects.survey(objects.library(folder, cache=cache, parts=parts), progress=progress)
+    library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts)
+    unknown = sorted(set(classes) - set(library.classes))
+    if unknown:
+        raise ValueError(f"{folder}: holds no {', '.join(unknown)}: its classes are {', '.join(library.classes)}")
+    items = tuple(item for item in library.items if not classes or item.label in classes)
+    library, listing = objects.survey(dataclasses.replace(library, items=items), progress=progress)
     usable, digest = [], hashlib.sha256()
     for index, item in enumerate(library.items):
         reason = physics.refusal(objects.read(library, index).body, scenario)
@@ -116,12 +129,18 @@ def survey_meshes(
     if not usable:
         raise ValueError(f"{folder}: holds no object that can be used; what was found:\n{listing}")
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
-    return Meshes(str(folder), names, labels, digest.hexdigest(), None if cache is None else str(cache)), listing
+    kept = None if cache is None else str(cache)
+    return Meshes(str(folder), names, labels, digest.hexdigest(), kept, scale, up), listing
+
+
+def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
+    """The classes of the objects of a folder, see `objects.library`; no mesh is opened."""
+    return objects.library(folder).classes
 
 
 @functools.lru_cache
 def _library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
-    library = objects.library(meshes.folder, cache=meshes.cache, parts=parts)
+    library = objects.library(meshes.folder, cache=meshes.cache, scale=meshes.scale, up=meshes.up, parts=parts)
     return library, {item.name: index for index, item in enumerate(library.items)}
 
 
@@ -133,10 +152,21 @@ def class_names(collection: Collection) -> tuple[str, ...]:
 
 
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
-    """The objects of a collection. A procedural one has its own key: object i is the same whatever else is made."""
+    """Objects of a collection by their numbers (n,).
+
+    A procedural one has its own key: object i is the same whatever else is made.
+
+    Raises:
+        FileNotFoundError: A mesh file is gone.
+        ValueError: No body can be made of an object.
+    """
     if collection.meshes is not None:
         library, where = _library(collection.meshes, collection.parts)
-        return [objects.read(library, where[collection.meshes.names[i]]).body for i in indices]
+        chosen = [collection.meshes.names[i] for i in indices]
+        gone = [name for name in chosen if name not in where]
+        if gone:
+            raise FileNotFoundError(f"{library.folder}: {', '.join(gone)}: no such mesh file any more")
+        return [objects.read(library, where[name]).body for name in chosen]
     key, names = jax.random.key(collection.seed), class_names(collection)
     bodies = [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
     if not collection.parts:
@@ -154,7 +184,11 @@ def head(collection: Collection, count: int) -> Collection:
 
 
 def sample_of_class(collection: Collection, name: str) -> objects.Body:
-    """Some object of a class: of the procedural ones the same for all collections, it may stand in for any of them."""
+    """Some object of a class: of the procedural ones the same for all collections, it may stand in for any of them.
+
+    Raises:
+        ValueError: No object of the collection is of that class.
+    """
     names = class_names(collection)
     if name not in names:
         raise ValueError(
@@ -224,7 +258,7 @@ def collect(
 
     Returns:
         How many trajectories were drawn again because they went non-finite or sank, and which objects were left out
-        because they did so in every draw, in the shards made now.
+        because they did so in every draw, or could not be made; of the whole dataset.
 
     Raises:
         ValueError: The folder holds another collection, the message names the field; or the pad does not have the
@@ -246,9 +280,12 @@ def collect(
     )
     made = Collected(0, ())
     for index in range(collection.num_shards):
-        if not shard_path(folder, collection, index).with_suffix(".npz").exists():
-            new = _make_shard(collection, sensor, folder, index, progress)
-            made = Collected(made.resampled + new.resampled, made.left_out + new.left_out)
+        path = shard_path(folder, collection, index).with_suffix(".npz")
+        if not path.exists():
+            _make_shard(collection, sensor, folder, index, progress)
+        shard = records.read_arrays(path)
+        resampled = made.resampled + int(shard["trajectory/resampled"].sum())
+        made = Collected(resampled, made.left_out + tuple(shard["left_out"].tolist()))
     return made
 
 
@@ -270,19 +307,18 @@ def claim(path: Path, content: dict) -> None:
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
-        data = (json.dumps(content, indent=2) + "\n").encode()
-        records.write_whole(path, lambda temporary: _write_bytes(temporary, data))
+        records.write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
         return
     try:
         there = json.loads(path.read_text())
     except json.JSONDecodeError as error:
-        raise records.TornFileError(f"{path} is torn ({error}); give another --workdir or delete this one.") from error
+        raise records.TornFileError(f"{path} is torn ({error}); give another folder or delete this one.") from error
     difference = _first_difference(there, content)
     if difference is not None:
         field, old, new = difference
         raise ValueError(
             f"{path} was made with {field} = {old!r}, asked for now is {new!r}: "
-            "give another --workdir, or delete this one to start anew."
+            f"give another folder than {path.parent}, or delete it to start anew."
         )
 
 
@@ -302,18 +338,20 @@ def _make_shard(
     folder: Path,
     index: int,
     progress: Callable[[Progress], None] | None,
-) -> Collected:
+) -> None:
     first = index * collection.objects_per_shard
     members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
     before = first * collection.num_per_object
     key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
-    left_out: list[str] = []
+    bodies, left_out = _made(collection, members)
     while True:
-        bodies = make_bodies(collection, members)
+        if not bodies:
+            raise ValueError(f"{folder}: no object of shard {index} can be simulated: {left_out[-1]}")
+        members = np.array(list(bodies))
         try:
             trajectory = physics.simulate(
                 key,
-                bodies,
+                list(bodies.values()),
                 sensor,
                 collection.scenario,
                 collection.num_per_object,
@@ -322,22 +360,34 @@ def _make_shard(
             break
         except physics.BodyError as error:  # one bad object does not stop a collection
             number = int(members[error.body])
-            name = class_names(collection)[number] if collection.meshes is None else collection.meshes.names[number]
-            left_out.append(f"object {number} ({name}): {str(error).partition(': ')[2]}")
-            members = np.delete(members, error.body)
-            if not len(members):
-                raise ValueError(f"{folder}: no object of shard {index} can be simulated: {left_out[-1]}") from error
+            del bodies[number]
+            left_out.append(f"{_named(collection, number)}: {str(error).partition(': ')[2]}")
     trajectory = jax.tree.map(np.asarray, trajectory)
     frames = _frames_of(collection, members, trajectory)
     path = shard_path(folder, collection, index)
     report = _report(progress, 0, len(frames), "frames")
-    records.write_images(path, _render(collection, sensor, bodies, trajectory, frames, report))
+    records.write_images(path, _render(collection, sensor, list(bodies.values()), trajectory, frames, report))
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
     arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
-    arrays["frames"] = frames
+    arrays |= {"frames": frames, "left_out": np.array(left_out, str)}
     records.write_arrays(path.with_suffix(".npz"), arrays)
-    return Collected(int(trajectory.resampled.sum()), tuple(left_out))
+
+
+def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, objects.Body], list[str]]:
+    """Objects by their numbers, and a line for each that cannot be made: gone or torn since the survey."""
+    bodies, left_out = {}, []
+    for number in members.tolist():
+        try:
+            (bodies[number],) = make_bodies(collection, np.array([number]))
+        except (OSError, ValueError) as error:
+            left_out.append(f"{_named(collection, number)}: {error}")
+    return bodies, left_out
+
+
+def _named(collection: Collection, number: int) -> str:
+    name = class_names(collection)[number] if collection.meshes is None else collection.meshes.names[number]
+    return f"object {number} ({name})"
 
 
 def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
@@ -428,7 +478,3 @@ def _as_json(collection: Collection) -> dict:
     content = dataclasses.asdict(collection)
     content["scenario"] = {"name": type(collection.scenario).__name__, **content["scenario"]}
     return content
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    path.write_bytes(data)

@@ -52,11 +52,20 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a small file, whole or not at all."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(data)
+
+    write_whole(path, write)
+
+
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write named arrays to an `.npz` file, whole or not at all."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
-    write_whole(path, lambda temporary: _write_bytes(temporary, buffer.getvalue()))
+    write_bytes(path, buffer.getvalue())
 
 
 def write_images(path: Path, frames: Iterable[Images]) -> None:
@@ -123,7 +132,3 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
         .reshape(-1, height, width)
         .astype(bool),
     )
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    path.write_bytes(data)

@@ -6,13 +6,16 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib import colors
+from matplotlib import colors, font_manager
 from matplotlib.axes import Axes
 from PIL import Image, ImageDraw, ImageFont
 
 from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.report import Predicted
+
+SLOWER = 2  # an animation is so many times slower than what it shows
+_PANEL = 104  # pixels, height of one panel of curves below an animation
 
 
 def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, num: int, title: str) -> None:
@@ -93,7 +96,9 @@ def strip(
     num: int = 10,
     title: str = "",
 ) -> None:
-    """One trajectory: a view from outside, both streams, and the force the pad exerts, over time.
+    """One trajectory: a view from outside, both streams, and what the pad exerts, over time.
+
+    Below the pictures is the force, below that its moment about the sensor's origin.
 
     Args:
         path: The PNG to write.
@@ -108,7 +113,7 @@ def strip(
     last = len(time) - 1
     chosen = np.unique(np.round(last * np.linspace(0, 1, num) ** 1.8).astype(int))
     figure, axes = plt.subplots(
-        4, len(chosen), figsize=(1.5 * len(chosen), 6.6), height_ratios=[1, 1, 1, 0.8], squeeze=False
+        5, len(chosen), figsize=(1.5 * len(chosen), 7.8), height_ratios=[1, 1, 1, 0.8, 0.8], squeeze=False
     )
     for column, t in enumerate(chosen):
         for row, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
@@ -117,13 +122,23 @@ def strip(
                 axes[row, column].set_ylabel(name, fontsize=8)
         axes[0, column].set_title(f"{time[t]:.2f} s", fontsize=8)
         axes[3, column].remove()
-    force = figure.add_subplot(axes[0, 0].get_gridspec()[3, :])
-    for k, name in enumerate(("$F_x$", "$F_y$", "$F_z$")):
-        force.plot(time, wrench[:, k], label=name, linewidth=1)
-    force.set_xlabel("time (s)")
-    force.set_ylabel("force (N)")
-    force.legend(fontsize=7, ncols=3)
-    force.grid(alpha=0.3)
+        axes[4, column].remove()
+    grid = axes[0, 0].get_gridspec()
+    force = figure.add_subplot(grid[3, :])
+    moment = figure.add_subplot(grid[4, :], sharex=force)
+    for axis, symbol, values, unit in (
+        (force, "F", wrench[:, :3], "force (N)"),
+        (moment, "M", 1e3 * wrench[:, 3:], "moment about\norigin (mN m)"),
+    ):
+        for k, direction in enumerate("xyz"):
+            axis.plot(time, values[:, k], label=f"${symbol}_{direction}$", linewidth=1)
+        axis.set_ylabel(unit, fontsize=8)
+        axis.tick_params(labelsize=8)
+        axis.legend(fontsize=7, ncols=3)
+        axis.grid(alpha=0.3)
+    force.tick_params(labelbottom=False)
+    moment.set_xlabel("time (s)", fontsize=8)
+    figure.align_ylabels([force, moment])
     figure.suptitle(title, fontsize=9)
     _save(figure, path)
 
@@ -139,12 +154,12 @@ def animation(
     *,
     title: str = "",
     outcome: str = "",
-    slower: float = 2,
     side: int = 240,
 ) -> None:
-    """One trajectory as a moving picture: a view from outside, both streams, and the force so far.
+    """One trajectory as a moving picture: a view from outside, both streams, force and moment so far.
 
     An arrow on the visual stream is gravity's part along the pad: what the slope, or the jerk of the pad, pulls with.
+    All is shown SLOWER times slower than it happens.
 
     Args:
         path: The GIF to write.
@@ -156,21 +171,23 @@ def animation(
         gravity: `(frames, 3)`, m/s^2, sensor frame.
         title: Above.
         outcome: Shown at the end.
-        slower: How many times slower than it happens it is shown.
         side: Of each of the three pictures (pixels).
     """
-    low, high = min(float(wrench[:, :3].min()), 0.0), max(float(wrench[:, :3].max()), 1e-3)
-    top, base, width = 44, 44 + side + 96, 3 * side
-    across = np.interp(time, [time[0], max(time[-1], time[0] + 1e-6)], [44, width - 12])
-    heights = base - 12 - (wrench[:, :3] - low) / (high - low) * 76
-    zero = base - 12 + low / (high - low) * 76
-    font, small = (ImageFont.load_default(size=size) for size in (13, 11))
+    top, width = 44, 3 * side
+    base = top + side
+    across = np.interp(time, [time[0], max(time[-1], time[0] + 1e-6)], [50, width - 12])
+    letters = font_manager.findfont("DejaVu Sans")  # comes with matplotlib; Pillow's own has no "²"
+    font, small = (ImageFont.truetype(letters, size=size) for size in (12, 11))
+    curves = [
+        ("force (N)", "F", wrench[:, :3]),
+        ("moment about the sensor's origin (mN m)", "M", 1e3 * wrench[:, 3:]),
+    ]
     pages = []
     for t in range(len(time)):
-        page = Image.new("RGB", (width, base), "white")
+        page = Image.new("RGB", (width, base + 2 * _PANEL), "white")
         draw = ImageDraw.Draw(page)
         draw.text((6, 5), title, "black", small)
-        said = f"{time[t]:.2f} s, at 1/{slower:g} of its speed" + (f": {outcome}" if t == len(time) - 1 else "")
+        said = f"{time[t]:.2f} s, at 1/{SLOWER:g} of its speed" + (f": {outcome}" if t == len(time) - 1 else "")
         draw.text((6, 23), said, "black", font)
         for column, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
             picture = Image.fromarray(np.round(255 * np.clip(images[t], 0, 1)).astype(np.uint8))
@@ -184,19 +201,42 @@ def animation(
             draw.text((side + 5, top + 3), "gravity's part along the pad", "red", small)
             draw.line([*middle, *(tip - 8 * along)], "red", 3)
             draw.polygon([tuple(tip), *map(tuple, barbs)], "red")
-        draw.line([across[0], zero, across[-1], zero], "lightgray")
-        draw.text((4, base - 94), f"{high:.2g} N", "black", small)
-        draw.text((4, zero - 7), "0 N", "black", small)
-        for k, (name, colour) in enumerate({"Fx": "tab:blue", "Fy": "tab:orange", "Fz": "tab:green"}.items()):
-            ink = colors.to_hex(colour)
-            draw.text((width - 90 + 28 * k, 23), name, ink, small)
-            draw.line([*zip(across[: t + 1], heights[: t + 1, k], strict=True)], ink, 2)
+        for panel, (head, symbol, values) in enumerate(curves):
+            _curves(draw, small, base + panel * _PANEL, across, values, t, head, symbol)
         pages.append(page)
     # A GIF counts hundredths of a second.
-    step = 10 * max(round(100 * slower * float(np.mean(np.diff(time)))), 2) if len(time) > 1 else 100
+    step = 10 * max(round(100 * SLOWER * float(np.mean(np.diff(time)))), 2) if len(time) > 1 else 100
     path.parent.mkdir(parents=True, exist_ok=True)
     durations = [step] * (len(pages) - 1) + [1500]
     pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
+
+
+def _curves(
+    draw: ImageDraw.ImageDraw,
+    font: ImageFont.FreeTypeFont,
+    top: int,
+    across: np.ndarray,
+    values: np.ndarray,
+    last: int,
+    title: str,
+    symbol: str,
+) -> None:
+    low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+    floor, scale = top + _PANEL - 10, (_PANEL - 32) / max(high - low, 1e-3)
+    heights = floor - scale * (values - low)
+    zero = floor + scale * low
+    draw.line([across[0], zero, across[-1], zero], "lightgray")
+    marks = {0.0: zero}
+    for value, height in ((high, floor - scale * (high - low)), (low, floor)):
+        if abs(height - zero) > 12:
+            marks[value] = height
+    for value, height in marks.items():
+        draw.text((across[0] - 6, height), f"{value:.3g}", "black", font, anchor="rm")
+    draw.text((across[0], top + 3), title, "black", font)
+    for k, (direction, colour) in enumerate({"x": "tab:blue", "y": "tab:orange", "z": "tab:green"}.items()):
+        ink = colors.to_hex(colour)
+        draw.text((across[-1] - 72 + 28 * k, top + 3), f"{symbol}{direction}", ink, font)
+        draw.line([*zip(across[: last + 1], heights[: last + 1, k], strict=True)], ink, 2)
 
 
 def line_up(

@@ -215,7 +215,7 @@ def _shapenet_root(folder: Path) -> Path | None:
         if table.is_file():
             with table.open(encoding="utf-8", errors="replace", newline="") as lines:
                 header = next(csv.reader(lines), [])
-            if "fullId" in header or (table.parent / "models-OBJ").is_dir():
+            if "fullId" in header or len(set(_COLUMNS) & set(header)) > 2 or (table.parent / "models-OBJ").is_dir():
                 return table.parent
     return None
 

@@ -154,10 +154,9 @@ def _lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int
     return _loft(_rings(_circle(1.0, num), profile), color, **kind)  # type: ignore[arg-type]
 
 
-def _box(size: Sequence[Number], centre: Sequence[Number], color: Color, *, chamfer: Number = 0.0) -> Part:
+def _box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
     x, y, z = size
-    outline = _rectangle(x, y, chamfer)
-    return _move(_loft(_rings(outline, [(1.0, -z / 2), (1.0, z / 2)]), color), centre)
+    return _move(_loft(_rings(_rectangle(x, y), [(1.0, -z / 2), (1.0, z / 2)]), color), centre)
 
 
 def _decal(outline: np.ndarray, color: Color) -> Part:

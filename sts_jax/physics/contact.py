@@ -180,8 +180,8 @@ def collide(
 ) -> Contacts:
     """The contacts of an object with a box whose top is centred in the origin.
 
-    The two deepest points are always among them; the others, within SKIN of the deepest, reach farthest in fixed
-    directions.
+    Among them are the deepest point and, of those within SKIN of it, the deepest that is APART from it; the others,
+    within SKIN too, reach farthest in fixed directions.
 
     Args:
         body: its convex parts.
@@ -189,6 +189,9 @@ def collide(
         half: (2,) m, half the box's size; its top is z = 0, its depth has no end.
         num: how many contacts.
         plane: the axes of the plane in which they are to reach far.
+
+    Returns:
+        `num` contacts in the frame of the box's top; those that are not needed have a distance of 1 m.
     """
     rotation, place = _math.quat_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

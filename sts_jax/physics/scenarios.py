@@ -57,9 +57,9 @@ class Shape(NamedTuple):
 class Start(NamedTuple):
     """Where an object is held, when it is let go, and the input the scenario applies."""
 
-    pose: Float[Array, "7"]
+    pose: Float[Array, "7"]  # m and quaternion, mesh frame in the sensor frame
     held: Int[Array, ""]  # steps that it is still held for, of the interval that ends with frame 0
-    condition: Float[Array, "c"]
+    condition: Float[Array, "c"]  # SI units
 
 
 Variant = Literal["default", "off", "wide-friction", "off-centre"]
@@ -288,7 +288,11 @@ class Inclined(_Common):
             raise ValueError(f"scenario.resting is {self.resting}; a share is from 0 to 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draws one start; consumes `key`. Arguments as for `Freefall.start`; nothing starts in the wall."""
+        """Draws one start; consumes `key`. Arguments as for `Freefall.start`; nothing starts in the wall.
+
+        At rest it has that of `tries` faces and turns in which some contents would hold by the widest margin and
+        others tip by it.
+        """
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting
         faces = shape.rests[jax.random.categorical(face, jnp.log(shape.shares), shape=(self.tries,))]
@@ -334,7 +338,8 @@ def variant(scenario: Scenario, name: str) -> Scenario:
     Args:
         scenario: whose other fields stay.
         name: one of `Variant`. `off`: nothing is hidden, every value is the middle of its range and contents have
-            settled at the base; `wide-friction`: friction U(.3, .9); `off-centre`: contents frozen in any direction.
+            settled at the base; `wide-friction`: friction U(.3, .9), whatever the scenario's; `off-centre`: contents
+            frozen in any direction, as they are on the slope anyway.
 
     Raises:
         ValueError: unknown name.

@@ -212,7 +212,7 @@ _SOLVER = _sound_solver()
 
 
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """The position stage of `mjx.forward`, with given contacts in place of those of the stand-in box."""
+    """The position stage of `mjx.forward`, with given contacts in place of those of the stand-in boxes."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
     data = mjx.collision(model, data)
     # MJX has no public way to hand in contacts. Should this path move, `tree_replace` fails at the first step.

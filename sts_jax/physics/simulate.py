@@ -49,18 +49,18 @@ class Trajectory(NamedTuple):
     time: Float[Array, "n f"]  # s, 0 at frame 0
     pose: Float[Array, "n f 7"]  # mesh frame in the sensor frame, w >= 0
     velocity: Float[Array, "n f 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
-    wrench: Float[
-        Array, "n f 6"
-    ]  # N, N m about the sensor's origin: the pad's; mean over the contact that ends (t - dt, t]
+    # N, N m about the sensor's origin: what the pad exerts on the object, the mean over the unbroken contact that ends
+    # with the frame, within its interval; 0 where the last step before the frame has no contact.
+    wrench: Float[Array, "n f 6"]
     contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
     wall: Bool[Array, "n f"]  # the stop wall pushes in the frame's last step
     gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
     settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
     outcome: Int[Array, "n"]  # Outcome
-    touches: Int[Array, "n"]  # contacts parted by at least 5 ms
-    sunk: Float[Array, "n"]  # m, deepest the hull went into the pad
+    touches: Int[Array, "n"]  # contacts with pad or wall, parted by at least 5 ms
+    sunk: Float[Array, "n"]  # m, deepest the hull went into pad or wall
     condition: Float[Array, "n c"]  # the scenario's input
-    hidden: Hidden  # (n,) each
+    hidden: Hidden  # (n,) each, `up` (n, 3)
     body: Int[Array, "n"]  # index into the sequence of bodies
     resampled: Int[Array, "n"]  # draws thrown away because non-finite or sunken
 
@@ -127,11 +127,16 @@ def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
         if not np.isfinite(body.hulls).all():
             raise BodyError(i, "hulls has a non-finite vertex")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
-            raise BodyError(i, f"shell_mass is {body.shell_mass} kg; it must be positive and finite")
+            raise BodyError(i, f"shell_mass is {body.shell_mass} kg; it must be positive and finite: give load a mass")
 
 
 def refusal(body: Body, scenario: Scenario) -> str | None:
-    """Why an object cannot start as a scenario asks, or None if it can."""
+    """Why an object cannot start as a scenario asks, or None if it can.
+
+    Args:
+        body: one object, whose hull spans a volume.
+        scenario: what is asked.
+    """
     return _refusal(_rests(body)[0], scenario)
 
 
@@ -146,6 +151,16 @@ def _refusal(rests: np.ndarray, scenario: Scenario) -> str | None:
 def _rests(body: Body) -> tuple[np.ndarray, np.ndarray]:
     points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
     return objects.rest_poses(points, np.asarray(body.shell_com, np.float64))
+
+
+def _hulls(bodies: Sequence[Body]) -> list[Hull]:
+    found = []
+    for index, body in enumerate(bodies):
+        try:
+            found.append(contact.hull(np.asarray(body.hulls)))
+        except ValueError as error:
+            raise BodyError(index, str(error)) from error
+    return found
 
 
 def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
@@ -170,17 +185,22 @@ def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
 
 
 def _check_hidden(hidden: Hidden, count: int) -> Hidden:
-    lengths = np.linalg.norm(hidden.up, axis=-1)
-    for name, values in hidden._replace(up=lengths)._asdict().items():
-        values = np.asarray(values)
-        if values.shape != (count,):
-            raise ValueError(f"hidden.{name} has shape {values.shape}; expected ({count},): bodies times num")
-        low, high = (0, 1) if name == "fill" else (np.finfo(np.float32).tiny, np.finfo(np.float32).max)
-        if not ((values >= low) & (values <= high)).all():
-            raise ValueError(f"hidden.{name} has values outside [{low}, {high}]")
-    if not np.allclose(lengths, 1, atol=1e-3):
-        raise ValueError(f"hidden.up has shape {np.shape(hidden.up)}; expected ({count}, 3), unit vectors")
-    return Hidden(*(jnp.asarray(x, jnp.float32) for x in hidden))
+    arrays = {name: np.asarray(values, np.float32) for name, values in hidden._asdict().items()}
+    for name, values in arrays.items():
+        expected = (count, 3) if name == "up" else (count,)
+        if values.shape != expected:
+            raise ValueError(f"hidden.{name} has shape {values.shape}; expected {expected}, {count} = bodies times num")
+        if not np.isfinite(values).all():
+            raise ValueError(f"hidden.{name} has a value that is not finite")
+    fill = arrays["fill"]
+    if fill.min() < 0 or fill.max() > 1:
+        raise ValueError(f"hidden.fill reaches from {fill.min()} to {fill.max()}; a share is from 0 to 1")
+    for name in ("shell_scale", "friction"):
+        if arrays[name].min() <= 0:
+            raise ValueError(f"hidden.{name} has the value {arrays[name].min()}; it must be positive")
+    if not np.allclose(np.linalg.norm(arrays["up"], axis=1), 1, atol=1e-3):
+        raise ValueError("hidden.up has rows that are no unit vectors; divide each by its length")
+    return Hidden(**jax.tree.map(jnp.asarray, arrays))
 
 
 def _draws(
@@ -225,7 +245,8 @@ def simulate(
         sensor: `sensor.gel.size` is the pad.
         scenario: `Freefall()`, `Inclined()` or `Perturbed()`.
         num: trajectories of each body.
-        hidden: (bodies * num,) each, body-major: rolls the starts of `key` with these instead of drawn ones.
+        hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major: rolls the starts of `key` with these instead
+            of drawn ones; where `resampled` is not 0 the start is another one.
         progress: called with the number of trajectories done so far, after each chunk.
         chunk: trajectories that MJX steps at once; another number compiles anew and rounds
             differently. Larger ones suit a GPU.
@@ -243,7 +264,7 @@ def simulate(
     count = len(bodies) * num
     given = None if hidden is None else _check_hidden(hidden, count)
     pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
-    hulls = [contact.hull(np.asarray(b.hulls)) for b in bodies]
+    hulls = _hulls(bodies)
     sizes = np.array([b.hulls.size for b in bodies])
     shapes = _shapes(bodies, scenario)
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))

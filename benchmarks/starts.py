@@ -1,0 +1,131 @@
+"""Objects by number, how their trajectories begin and end, and the frames that are seen of the beginning."""
+
+import concurrent.futures
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+from tqdm import tqdm
+
+from sts_jax import dataset, objects, physics
+from sts_jax.sensor import Sensor
+
+# Mass, centre of mass and inertia of one body with several fills, shell scales and directions of the contents.
+rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
+
+
+class Starts(NamedTuple):
+    """What trajectories begin with and how they end, a row each."""
+
+    body: np.ndarray  # (n,) index of the object
+    pose: np.ndarray  # (n, 7) frame 0
+    wrench: np.ndarray  # (n, 6) frame 0
+    condition: np.ndarray  # (n, c)
+    fill: np.ndarray  # (n,)
+    mass: np.ndarray  # (n,) kg
+    settled: np.ndarray  # (n,)
+    outcome: np.ndarray  # (n,) Outcome
+    rerolled: np.ndarray  # (n,) Outcome with other contents, -1 where it was not rolled again
+
+
+def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
+    """Objects of some families in turn, by their numbers, each from a key of its own."""
+    numbers = range(first, first + count)
+    return [objects.make(jax.random.key(i), categories[i % len(categories)]) for i in numbers]
+
+
+def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass (k,) in kg, centre of mass (k, 3) in m and inertia (k, 3, 3) of a nominal body filled to shares (k,)."""
+    up = np.tile(np.array([0, 0, 1], np.float32), (len(fill), 1))
+    mass, com, inertia = rigid(body, jnp.asarray(fill, jnp.float32), jnp.ones(len(fill)), up)
+    return np.asarray(mass), np.asarray(com), np.asarray(inertia)
+
+
+def rigid_of(items: list[objects.Body], traj: physics.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mass (n,) in kg, centre of mass (n, 3) in m and inertia (n, 3, 3) of each trajectory; they are body-major."""
+    owner, parts = np.asarray(traj.body), []
+    for index, body in enumerate(items):
+        own = jax.tree.map(lambda x, mine=owner == index: x[mine], traj.hidden)
+        parts.append(rigid(body, own.fill, own.shell_scale, own.up))
+    mass, com, inertia = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return mass, com, inertia
+
+
+def roll(
+    key: PRNGKeyArray,
+    items: list[objects.Body],
+    scenario: physics.Scenario,
+    num: int,
+    *,
+    again: int = 0,
+    reroll: tuple[str, ...] = (),
+) -> Starts:
+    """Simulates `num` starts of each object, and the first `again` of each once more with other contents.
+
+    Args:
+        key: consumed.
+        items: the objects.
+        scenario: what happens to them.
+        num: starts of each.
+        again: how many of these are rolled again.
+        reroll: fields of `physics.Hidden` that are drawn anew then.
+    """
+    key, fresh = jax.random.split(key)
+    with tqdm(total=len(items) * num, unit="starts") as bar:
+        traj = physics.simulate(key, items, Sensor(), scenario, num, progress=lambda n: bar.update(n - bar.n))
+    outcome = np.asarray(traj.outcome)
+    rerolled = np.full(len(outcome), -1)
+    if again:
+        rows = (np.arange(len(items))[:, None] * num + np.arange(again)).ravel()
+        other = jax.vmap(scenario.hidden)(jax.random.split(fresh, len(rows)))
+        hidden = jax.tree.map(lambda x: x[rows], traj.hidden)
+        hidden = hidden._replace(**{name: getattr(other, name) for name in reroll})
+        with tqdm(total=len(rows), unit="rolled again") as bar:
+            second = physics.simulate(
+                key, items, Sensor(), scenario, again, hidden=hidden, progress=lambda n: bar.update(n - bar.n)
+            )
+        same = (np.asarray(traj.resampled)[rows] == 0) & (np.asarray(second.resampled) == 0)
+        rerolled[rows[same]] = np.asarray(second.outcome)[same]
+    return Starts(
+        body=np.asarray(traj.body),
+        pose=np.asarray(traj.pose[:, 0]),
+        wrench=np.asarray(traj.wrench[:, 0]),
+        condition=np.asarray(traj.condition),
+        fill=np.asarray(traj.hidden.fill),
+        mass=rigid_of(items, traj)[0],
+        settled=np.asarray(traj.settled),
+        outcome=outcome,
+        rerolled=rerolled,
+    )
+
+
+def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndarray]:
+    """Visual and tactile first frames, uint8 (n, 64, 64, 3), of rows sorted by object."""
+
+    def one(index: int) -> tuple[np.ndarray, ...]:
+        own = starts.body == index
+        images = dataset.render_uint8(
+            Sensor(), items[index], starts.pose[own], starts.wrench[own], resolution=(64, 64), crop=False
+        )
+        return tuple(np.asarray(image) for image in images[:2])
+
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        visual, tactile = zip(*pool.map(one, np.unique(starts.body).tolist()), strict=True)
+    return np.concatenate(visual), np.concatenate(tactile)
+
+
+def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
+    """What a folder keeps under a name, or what is made now (and kept)."""
+    path = None if folder is None else folder / f"{name}.npz"
+    if path is not None and path.exists():
+        with np.load(path) as file:
+            return Starts(**{field: file[field] for field in Starts._fields})
+    starts = make()
+    if path is not None:
+        dataset.write_arrays(path, starts._asdict())
+    return starts

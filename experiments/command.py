@@ -1,0 +1,97 @@
+"""The command line of an experiment."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+import sts_jax as sts
+from experiments import compilation, stages
+from experiments.plan import plan
+from experiments.progress import say
+from sts_jax import dataset
+
+LEAST_OBJECTS = 10  # of a folder, so that whole ones can be held out to validate and to test
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """What the command line of an experiment says."""
+
+    workdir: Path
+    preset: Literal["smoke", "default", "paper"] = "default"
+    plan: bool = False  # print seconds per stage from a short measurement, and stop
+    hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
+    objects: Path | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
+    # objects of these classes only, of the eight or of the folder's; if not given: the experiment's own, and where a
+    # folder has none of those all of the folder's
+    classes: tuple[str, ...] = ()
+    parts: bool = False  # what a hull fits badly collides as convex parts
+
+
+def run(presets: Mapping[str, stages.Config], workdir: str, description: str | None) -> None:
+    """An experiment from the command line."""
+    args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
+    compilation.keep()
+    config = configure(presets[args.preset], args)
+    if args.plan:
+        print(plan(config))
+    else:
+        stages.main(config, args.workdir)
+
+
+def configure(config: stages.Config, args: Args) -> stages.Config:
+    """A preset as the command line asks for it; the objects of a folder are read, and listed in the work directory.
+
+    Raises:
+        FileNotFoundError: No such folder of objects.
+        ValueError: An unknown class; or the folder has too few objects that can be used.
+    """
+    scenario = sts.physics.variant(config.collection.scenario, args.hidden)
+    collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)
+    if args.objects is not None:
+        collection = with_meshes(collection, args.objects, args.workdir, args.classes)
+    elif args.classes:
+        unknown = sorted(set(args.classes) - set(sts.objects.CATEGORIES))
+        if unknown:
+            raise ValueError(f"unknown classes {', '.join(unknown)}: take some of {', '.join(sts.objects.CATEGORIES)}")
+        collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
+    return dataclasses.replace(config, collection=collection)
+
+
+def with_meshes(
+    collection: dataset.Collection, folder: Path, workdir: Path, classes: tuple[str, ...] = ()
+) -> dataset.Collection:
+    """A collection of the objects of a folder, with about as many trajectories; lists them in `objects.txt`.
+
+    Args:
+        collection: Of procedural objects.
+        folder: See `objects.library`.
+        workdir: Where the listing goes.
+        classes: Of these classes only. If none is given, of those of the collection's that the folder has, or of all
+            where it has none of them.
+    """
+    there = dataset.mesh_classes(folder)
+    taken = classes or tuple(name for name in there if name in collection.categories) or there
+    meshes, listing = dataset.survey_meshes(
+        folder,
+        collection.scenario,
+        classes=taken,
+        parts=collection.parts,
+        cache=compilation.cache_folder() / "objects",
+        progress=say,
+    )
+    others = [name for name in there if name not in taken]
+    if others:
+        listing += f"classes left out: {', '.join(others)}; --classes takes others\n"
+    path = workdir / "objects.txt"
+    if not (path.exists() and path.read_text().startswith(listing)):  # behind it is what collecting left out
+        dataset.write_bytes(path, listing.encode())
+    say(f"classes taken: {', '.join(taken)}" + (f"; left out: {', '.join(others)}" if others else ""))
+    say(f"{len(meshes.names)} objects can be used; {path} has them and what was left out")
+    if len(meshes.names) < LEAST_OBJECTS:
+        raise ValueError(f"{folder}: {len(meshes.names)} objects are too few to hold some out: give {LEAST_OBJECTS}")
+    each = max(collection.num_per_object, round(collection.num_trajectories / len(meshes.names)))
+    return dataclasses.replace(collection, meshes=meshes, num_objects=len(meshes.names), num_per_object=each)

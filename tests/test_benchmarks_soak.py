@@ -1,0 +1,57 @@
+"""Endurance in small: 104 trajectories of each scenario; and what `soaked` reads of kept blocks."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from benchmarks import soak
+from benchmarks.starts import Starts
+from sts_jax import physics
+from sts_jax.physics.simulate import SUNK_LIMIT
+
+
+@pytest.mark.parametrize("name", soak.SCENARIOS)
+def test_trajectories_end_sound_settled_and_weigh_what_they_weigh(name):
+    found = soak.block(name, 0, 104)
+    assert found["resampled"].sum() == 0  # so every state was finite to the end
+    assert found["sunk"].max() <= SUNK_LIMIT
+    assert np.isfinite(found["pose"]).all()
+    assert found["settled"].mean() >= 0.9
+    assert np.nanmedian(found["wrench_error"]) < 0.01
+    assert np.unique(found["body"], return_counts=True)[1].tolist() == [soak.NUM] * 13
+    assert f"{name}: 104 trajectories" in soak.report(name, found)
+
+
+def kept(folder, name, size=3):
+    """Two kept blocks of noise."""
+    rng = np.random.default_rng(4)
+    blocks = [{f: rng.normal(size=(size, 2)) for f in Starts._fields if f != "rerolled"} for _ in range(2)]
+    soak.claim(folder, name, size)
+    for index, block in enumerate(blocks):
+        np.savez(folder / f"{name}-{index:04d}.npz", **block, sunk=np.zeros(size))
+    return blocks
+
+
+def test_soaked_blocks_are_read_in_turn(tmp_path):
+    blocks = kept(tmp_path, "inclined")
+    starts = soak.soaked(tmp_path, "inclined")
+    np.testing.assert_array_equal(starts.pose, np.concatenate([b["pose"] for b in blocks]))
+    assert set(starts.rerolled) == {-1}
+    with pytest.raises(FileNotFoundError, match="no block freefall"):
+        soak.soaked(tmp_path, "freefall")
+
+
+def test_blocks_of_other_settings_are_refused(tmp_path, monkeypatch):
+    kept(tmp_path, "inclined", soak.BLOCK)
+    with pytest.raises(ValueError, match=r"inclined.json was made with block = 504, asked for now is 104"):
+        soak.main(100, ["inclined"], tmp_path)
+    monkeypatch.setattr(soak, "NUM", 4)
+    with pytest.raises(ValueError, match=r"inclined.json was made with num = 8, asked for now is 4"):
+        soak.soaked(tmp_path, "inclined")
+    other = dataclasses.replace(physics.Inclined(), tries=1)
+    monkeypatch.setitem(soak.SCENARIOS, "inclined", other)
+    with pytest.raises(
+        ValueError, match=r"inclined.json was made with scenario = .*tries=16.*asked for now is .*tries=1,"
+    ):
+        soak.soaked(tmp_path, "inclined")
