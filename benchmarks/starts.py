@@ -17,6 +17,7 @@ from sts_jax.sensor import Sensor
 
 # Mass, centre of mass and inertia of one body with several fills, shell scales and directions of the contents.
 rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
+_settled = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))  # along +z
 
 
 class Starts(NamedTuple):
@@ -40,9 +41,10 @@ def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[obje
 
 
 def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass (k,) in kg, centre of mass (k, 3) in m and inertia (k, 3, 3) of a nominal body filled to shares (k,)."""
-    up = np.tile(np.array([0, 0, 1], np.float32), (len(fill), 1))
-    mass, com, inertia = rigid(body, jnp.asarray(fill, jnp.float32), jnp.ones(len(fill)), up)
+    """Mass (k,) in kg, centre of mass (k, 3) in m and inertia (k, 3, 3) of a body with a nominal shell, filled to
+    shares (k,), settled along +z.
+    """
+    mass, com, inertia = _settled(body, jnp.asarray(fill, jnp.float32), jnp.ones(len(fill)))
     return np.asarray(mass), np.asarray(com), np.asarray(inertia)
 
 

@@ -28,6 +28,8 @@ class Args:
     # objects of these classes only, of the eight or of the folder's; if not given: the experiment's own, and where a
     # folder has none of those all of the folder's
     classes: tuple[str, ...] = ()
+    scale: float | None = None  # m, of one unit of a folder's files: 0.001 where they are in millimetres
+    up: Literal["x", "y", "z"] | None = None  # the axis of a folder's files that points up
     parts: bool = False  # what a hull fits badly collides as convex parts
 
 
@@ -51,8 +53,10 @@ def configure(config: stages.Config, args: Args) -> stages.Config:
     """
     scenario = sts.physics.variant(config.collection.scenario, args.hidden)
     collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)
+    if args.objects is None and (args.scale is not None or args.up is not None):
+        raise ValueError("--scale and --up are of the files of a folder: give it with --objects")
     if args.objects is not None:
-        collection = with_meshes(collection, args.objects, args.workdir, args.classes)
+        collection = with_meshes(collection, args.objects, args.workdir, args.classes, scale=args.scale, up=args.up)
     elif args.classes:
         unknown = sorted(set(args.classes) - set(sts.objects.CATEGORIES))
         if unknown:
@@ -62,7 +66,13 @@ def configure(config: stages.Config, args: Args) -> stages.Config:
 
 
 def with_meshes(
-    collection: dataset.Collection, folder: Path, workdir: Path, classes: tuple[str, ...] = ()
+    collection: dataset.Collection,
+    folder: Path,
+    workdir: Path,
+    classes: tuple[str, ...] = (),
+    *,
+    scale: float | None = None,
+    up: Literal["x", "y", "z"] | None = None,
 ) -> dataset.Collection:
     """A collection of the objects of a folder, with about as many trajectories; lists them in `objects.txt`.
 
@@ -72,6 +82,7 @@ def with_meshes(
         workdir: Where the listing goes.
         classes: Of these classes only. If none is given, of those of the collection's that the folder has, or of all
             where it has none of them.
+        scale, up: Of the files, see `objects.library`.
     """
     there = dataset.mesh_classes(folder)
     taken = classes or tuple(name for name in there if name in collection.categories) or there
@@ -79,6 +90,8 @@ def with_meshes(
         folder,
         collection.scenario,
         classes=taken,
+        scale=scale,
+        up=up,
         parts=collection.parts,
         cache=compilation.cache_folder() / "objects",
         progress=say,
