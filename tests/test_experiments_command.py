@@ -96,7 +96,7 @@ def test_of_a_folder_the_experiment_s_classes_are_taken_or_those_asked_for(exper
 
 def test_a_folder_of_other_classes_is_taken_whole(folder, tmp_path):
     small = command.Args(tmp_path / "small", objects=folder, scale=0.5, up="y")
-    meshes = command.configure(perturbed.SMOKE, small).collection.meshes
+    meshes = command.configure(freefall.SMOKE, small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
     with pytest.raises(ValueError, match="--scale and --up are of the files of a folder"):
