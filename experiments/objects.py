@@ -68,21 +68,11 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
 
 def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
     """The line of one object, as `sts.objects.describe` has it; with `parts` as `dataset.make_bodies` makes it."""
-    apart, notes = sts.objects.gaps(body), []
+    found = sts.objects.facts(body, apart := sts.objects.gaps(body))
     if parts and apart[1] > sts.objects.HOLLOW:
-        notes = [f"as one hull {_millimetres(apart)}"]
         body = sts.objects.decompose(body)
-        apart = sts.objects.gaps(body)
-    size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
-    drawn = int(np.asarray(body.faces).any(axis=1).sum())
-    hulls = np.asarray(body.hulls)
-    hull = f"{len(np.unique(hulls.reshape(-1, 3), axis=0))} vertices"
-    hull += f" in {len(np.unique(hulls, axis=0))} parts" if len(hulls) > 1 else ""
-    return f"{category}  {number}: " + "; ".join([size, f"{drawn} faces", hull, _millimetres(apart), *notes])
-
-
-def _millimetres(gaps: tuple[float, float]) -> str:
-    return " / ".join(f"{gap * 1e3:.2f}" for gap in gaps)
+        found = [*sts.objects.facts(body, sts.objects.gaps(body)), f"as one hull {found[-1]}"]
+    return f"{category}  {number}: " + "; ".join(found)
 
 
 def main(config: Config) -> None:

@@ -12,7 +12,7 @@ from sts_jax.objects.body import (
     rigid,
     stack,
 )
-from sts_jax.objects.libraries import HOLLOW, Entry, Item, Library, bodies, describe, library, read, survey
+from sts_jax.objects.libraries import HOLLOW, Entry, Item, Library, bodies, describe, facts, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
 from sts_jax.objects.solids import decompose, gaps, hull_gap, rest_poses
@@ -31,6 +31,7 @@ __all__ = [
     "bodies",
     "decompose",
     "describe",
+    "facts",
     "fill_moments",
     "gaps",
     "hull_gap",

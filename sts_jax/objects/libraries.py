@@ -399,14 +399,17 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
 
 def describe(entry: Entry) -> str:
     """The line of one object in a listing."""
-    size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(entry.body.vertices), axis=0))
-    drawn = int(np.asarray(entry.body.faces).any(axis=1).sum())
-    hulls = np.asarray(entry.body.hulls)
+    return f"{entry.item.label}  {entry.item.name}: " + "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
+
+
+def facts(body: Body, apart: tuple[float, float]) -> list[str]:
+    """Size (mm), faces, collision hull and gaps (mm) of a body, in words; `apart` (m) is what `gaps` gives."""
+    size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
+    drawn = int(np.asarray(body.faces).any(axis=1).sum())
+    hulls = np.asarray(body.hulls)
     parts = f" in {len(np.unique(hulls, axis=0))} parts" if len(hulls) > 1 else ""
     hull = f"{len(np.unique(hulls.reshape(-1, 3), axis=0))} vertices{parts}"
-    out, off = entry.gaps
-    facts = [size, f"{drawn} faces", hull, f"{out * 1e3:.2f} / {off * 1e3:.2f}", *entry.notes]
-    return f"{entry.item.label}  {entry.item.name}: " + "; ".join(facts)
+    return [size, f"{drawn} faces", hull, " / ".join(f"{gap * 1e3:.2f}" for gap in apart)]
 
 
 def _tried(collection: Library, index: int) -> Entry | str:
