@@ -22,7 +22,7 @@ def test_ends_do_not_depend_on_the_step_the_engine_or_the_hand(index: int) -> No
     found = invariance.sides(case, NUM)
     assert {len(labels) for labels in found.values()} == {NUM}
     shares = np.bincount(found["ours"]) / NUM
-    assert np.sum(shares > 0.1) >= 2  # there is something to tell apart
+    assert np.sum(shares > 0.01) >= 2  # there is something to tell apart
     assert invariance.compare(found, case.labels, margin=0.15)
     if index == 2:
         # With the same contacts it is the same engine: what differs are the four contacts that C keeps of a mesh.
