@@ -3,6 +3,7 @@
     python -m benchmarks.soak                            # 30,000 trajectories: about two hours on two cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
     python -m benchmarks.soak --keep FOLDER              # keep finished blocks there, and go on from them
+    python -m benchmarks.soak --first-block 17           # of 20: the others were done elsewhere
 
 A new object every eight trajectories: of all classes in turn, bottles under a jerk. Counts the draws that were thrown
 away (non-finite, or deeper in the pad than the limit; no other is left), outcomes, what had not settled, and holds the
@@ -141,28 +142,33 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
     return "\n".join(lines)
 
 
-def main(num: int, names: list[str], keep: Path) -> None:
-    """All blocks that are not kept yet, then the figures."""
+def main(num: int, names: list[str], keep: Path, *, first: int = 0) -> None:
+    """All blocks from the first one asked for on that are not kept yet, then the figures of these blocks."""
     size = min(BLOCK, -(-num // NUM) * NUM)
     for name in names:
         claim(keep, name, size)
         parts = []
-        for index in tqdm(range(-(-num // size)), unit="block", desc=name):
+        for index in tqdm(range(first, -(-num // size)), unit="block", desc=name):
             path = keep / f"{name}-{index:04d}.npz"
             if not path.exists():
                 dataset.write_arrays(path, block(name, index, size))
             with np.load(path) as kept:
                 parts.append(dict(kept))
-        print(report(name, {field: np.concatenate([p[field] for p in parts])[:num] for field in parts[0]}), flush=True)
+        found = {field: np.concatenate([part[field] for part in parts])[: num - first * size] for field in parts[0]}
+        print(report(name, found), flush=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num", type=int, default=10_000, help="trajectories of each scenario")
     parser.add_argument("--only", choices=list(SCENARIOS), help="one scenario instead of all")
+    parser.add_argument("--first-block", type=int, default=0, help=f"leave out those before it; each is {BLOCK}")
     parser.add_argument("--keep", type=Path, help="folder that keeps finished blocks")
     arguments = parser.parse_args()
-    run = functools.partial(main, arguments.num, [arguments.only] if arguments.only else list(SCENARIOS))
+    if not 0 <= arguments.first_block * BLOCK < max(arguments.num, 1):
+        parser.error(f"--first-block {arguments.first_block}: there are blocks 0 to {(arguments.num - 1) // BLOCK}")
+    names = [arguments.only] if arguments.only else list(SCENARIOS)
+    run = functools.partial(main, arguments.num, names, first=arguments.first_block)
     if arguments.keep is None:
         with tempfile.TemporaryDirectory() as folder:
             run(Path(folder))
