@@ -192,10 +192,9 @@ def main(parts: set[str], name: str, counts: Counts, keep: Path | None, soaked: 
         items = bodies(study.categories, counts.objects)
         begin = functools.partial(roll, again=counts.again, reroll=study.reroll)
         starts = kept(keep, name, lambda: begin(jax.random.key(0), items, study.scenario, counts.num))
-    print(
-        f"{study.scenario}\n{len(starts.body)} starts of {len(items)} objects ({', '.join(study.categories)})",
-        flush=True,
-    )
+    number = len(np.unique(starts.body))
+    print(study.scenario)
+    print(f"{len(starts.body)} starts of {number} objects ({', '.join(study.categories)})", flush=True)
     if "outcomes" in parts:
         outcomes(study, starts)
     learned = lesson(study, items, starts, counts.others) if parts & {"pictures", "fill"} else None
