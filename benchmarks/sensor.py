@@ -48,7 +48,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> Call
     for pose in poses:
         scenes.append(EmbreeScene())
         TriangleMesh(scenes[-1], np.asarray(_math.transform(pose, body.vertices))[faces])
-    slopes = np.asarray(optics.rays(camera, optics.full_window(camera, shape), shape)).reshape(-1, 2)
+    slopes = np.asarray(jnp.stack(optics.rays(camera, optics.full_window(camera, shape), shape), -1)).reshape(-1, 2)
     directions = np.concatenate([slopes, np.ones((len(slopes), 1), np.float32)], -1)
     origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))
     return lambda: [scene.run(origins, directions, query="DISTANCE") for scene in scenes]

@@ -1,12 +1,15 @@
 """What the sensor sees of an object: both streams, depth, segmentation."""
 
 import dataclasses
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import _math, optics, tactile
+from sts_jax._tiles import where_active
 from sts_jax.objects.body import Body
 from sts_jax.sensor import Sensor
 
@@ -83,24 +86,12 @@ def sense(
     else:
         window = optics.full_window(sensor.camera, resolution)
 
-    fine = min(resolution) < sensor.fine_below
-    if fine:
-        # Every other sample is a pixel's centre; the others lie half way between.
-        shape = (2 * resolution[0] + 1, 2 * resolution[1] + 1)
-        pitch = window[2:] / jnp.array([resolution[1], resolution[0]], jnp.float32) / 2
-        seen = jnp.concatenate([window[:2] - pitch / 2, pitch * jnp.array([shape[1], shape[0]], jnp.float32)])
-    else:
-        shape, seen = resolution, window
-
-    visual, touch, depth, hit = _draw(sensor, body, points, drawn, present, pressing, seen, shape)
-    if fine:
-        visual, touch = _filter(visual), _filter(touch)
-        depth, hit = depth[1::2, 1::2], hit[1::2, 1::2]
+    visual, touch, depth = _draw(sensor, body, points, drawn, present, pressing, window, resolution)
     return Frame(
-        visual=jnp.clip(optics.to_srgb(visual), 0, 1),
-        tactile=jnp.clip(touch, 0, 1),
-        depth=jnp.where(hit, depth, jnp.inf),
-        segmentation=hit,
+        visual=visual,
+        tactile=touch,
+        depth=depth,
+        segmentation=jnp.isfinite(depth),
         pose=jnp.where(finite, drawn, pose),
         balanced=contact.balanced & finite,
         pressure=contact.pressure,
@@ -128,13 +119,13 @@ def underside(
     places = points[:, :2] * scale[None, :] + middle[None, :] - 0.5
     height = points[:, 2]
     # No part can reach the gel that is higher over first touch than depth and tilts bring it down.
-    reach = gel.max_depth + jnp.tan(gel.max_tilt) * (gel.size[0] + gel.size[1])
+    low, high = jnp.min(points[:, :2], axis=0), jnp.max(points[:, :2], axis=0)
+    reach = gel.max_depth + jnp.tan(gel.max_tilt) * jnp.sum(high - low)
     keep = present & (jnp.min(height[body.faces], axis=1) < jnp.min(height) + reach)
     winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells)
-    weights = optics.barycentrics(places, body.faces, winner)
-    corners = height[body.faces][jnp.maximum(winner, 0)]
-    value = sum(weights[k] * corners[..., k] for k in range(3))
-    return jnp.where(winner >= 0, value, jnp.inf)
+    corners = jnp.concatenate([places, height[:, None]], axis=1)[body.faces].reshape(-1, 9)
+    images = (winner, *optics.pixel_centres(gel.cells))
+    return where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
 
 
 def _draw(
@@ -145,56 +136,110 @@ def _draw(
     present: Bool[Array, ""],
     pressing: Bool[Array, ""],
     window: Float[Array, "4"],
-    shape: tuple[int, int],
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"], Float[Array, "h w"], Bool[Array, "h w"]]:
+    resolution: tuple[int, int],
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"], Float[Array, "h w"]]:
     camera, gel = sensor.camera, sensor.gel
-    pixels, far = optics.to_pixels(camera, window, shape, points)
+    # Samples: a pixel each, or, in small images, every other one is a pixel's centre and the others lie half way
+    # between. A ring of one more around all of them is there for the normals of the outermost.
+    stride = 2 if min(resolution) < sensor.fine_below else 1
+    shape = (stride * resolution[0] + stride + 1, stride * resolution[1] + stride + 1)
+    pitch = window[2:] / jnp.array([resolution[1], resolution[0]], jnp.float32) / stride
+    before = pitch * (stride + 1) / 2
+    seen = jnp.concatenate([window[:2] - before, pitch * jnp.array([shape[1], shape[0]], jnp.float32)])
+    pixels, far = optics.to_pixels(camera, seen, shape, points)
     inverse = 1 / jnp.maximum(far, camera.near)
     keep = present & jnp.all(far[body.faces] > camera.near, axis=1)
     winner = optics.rasterise(pixels, -inverse, body.faces, keep, body.two_sided, shape)
-    hit = winner >= 0
-    nearest = jnp.maximum(winner, 0)
-
-    corners = inverse[body.faces][nearest]
-    weights = [w * corners[..., k] for k, w in enumerate(optics.barycentrics(pixels, body.faces, winner))]
-    depth = 1 / sum(weights)
-    weights = [w * depth for w in weights]
-    # Kept as they are: XLA would work them out again for each of the neighbours that a normal needs.
-    depth, weights, nearest = jax.lax.optimization_barrier((depth, weights, nearest))
-    slopes = optics.rays(camera, window, shape)
+    corners = jnp.concatenate([pixels, inverse[:, None]], axis=1)[body.faces].reshape(-1, 9)
+    centres = optics.pixel_centres(shape)
+    depth = where_active(_depth, winner >= 0, corners, (winner, *centres), jnp.full(shape, jnp.inf))
 
     # seen through the skin
-    on_face = slopes * camera.distance
+    slopes = optics.rays(camera, seen, shape)
     half = jnp.stack([jnp.asarray(gel.size[0]), jnp.asarray(gel.size[1])]) / 2
-    on_pad = jnp.all(jnp.abs(on_face) <= 1.0001 * half[None, None, :], axis=-1)  # its edge is the image's: no rounding
-    square_radius = jnp.sum((on_face / half[None, None, :]) ** 2, axis=-1)
-    empty = optics.empty_view(sensor.room, square_radius, on_pad.astype(jnp.float32))
-    turned = body.normals @ _math.quat_matrix(pose[3:]).T
-    corners = jnp.concatenate([turned, body.colors, body.uv], axis=-1).reshape(-1, 24)[nearest]
-    values = sum(weights[k][..., None] * corners[..., 8 * k : 8 * k + 8] for k in range(3))
-    normals = _math.normalize(values[..., :3])
-    towards = normals[..., 0] * slopes[..., 0] + normals[..., 1] * slopes[..., 1] + normals[..., 2]
-    normals = jnp.where((body.two_sided & (towards > 0))[..., None], -normals, normals)
-    albedo = values[..., 3:6] * optics.sample_texture(body.texture, values[..., 6:])
-    shaded = optics.shade(sensor.room, albedo, normals, depth - camera.distance, empty)
-    visual = jnp.where(hit[..., None], shaded, empty)
+    place = [slopes[k] * camera.distance / half[k] for k in range(2)]
+    on_pad = (jnp.abs(place[0]) <= 1.0001) & (jnp.abs(place[1]) <= 1.0001)  # its edge is the image's: no rounding
+    empty = _planes(optics.empty_view(sensor.room, place[0] ** 2 + place[1] ** 2, on_pad.astype(jnp.float32)))
+    inner = tuple(image[1:-1, 1:-1] for image in (winner, depth, *centres, *slopes, *empty))
+    params = (sensor, body, corners, _math.quat_matrix(pose[3:]))
+    visual = where_active(_look, inner[0] >= 0, params, inner, list(inner[6:]))
+    visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in _pixels(visual, stride)]
 
     # the skin itself
     face = jnp.asarray(camera.distance)
-    skin = jnp.where(hit & on_pad & pressing, jnp.clip(depth, face - gel.thickness, face), face)
-    surface = jnp.concatenate([slopes * skin[..., None], (skin - face)[..., None]], axis=-1)
-    skin_normals = tactile.surface_normals(jax.lax.optimization_barrier(surface))
-    light = tactile.phong(sensor.phong, sensor.lights, jax.lax.optimization_barrier(skin_normals))
-    dark = tactile.darken(sensor.phong, face - skin) * jnp.where(on_pad, 1, sensor.room.rim)
-    return visual, light * dark[..., None], depth, hit
+    touched = on_pad & pressing & (depth < face)
+    skin = jnp.where(touched, jnp.maximum(depth, face - gel.thickness), face)
+    flat = tactile.phong(sensor.phong, sensor.lights, jnp.array([[[0.0, 0.0, -1.0]]]))
+    flat = [jnp.broadcast_to(flat[..., k], inner[0].shape) for k in range(3)]
+    surface = (slopes[0] * skin, slopes[1] * skin, skin - face)
+    touch = where_active(_skin, _near(touched), sensor, surface, flat, ring=1)
+    rim = jnp.where(on_pad[1:-1, 1:-1], 1, sensor.room.rim)
+    touch = [jnp.clip(channel, 0, 1) for channel in _pixels([channel * rim for channel in touch], stride)]
+    depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
+    return jnp.stack(visual, axis=-1), jnp.stack(touch, axis=-1), depth
 
 
-def _filter(samples: Float[Array, "a b 3"]) -> Float[Array, "h w 3"]:
-    """A tent one pixel wide at half height: from samples half a pixel apart to pixels."""
+def _depth(corners: Float[Array, "f 9"], images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
+    """Depth of the winning faces."""
+    return 1 / functools.reduce(operator.add, _shares(corners, *images))
 
-    def tent(number: int) -> Float[Array, "n a"]:
-        off = jnp.abs(jnp.arange(2 * number + 1)[None, :] - 2 * jnp.arange(number)[:, None] - 1)
-        return jnp.maximum(0.5 - 0.25 * off, 0)
 
-    down, across = tent(samples.shape[0] // 2), tent(samples.shape[1] // 2)
-    return jnp.einsum("ia,jb,abk->ijk", down, across, samples)
+def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) -> list[Array]:
+    """The object's colour through the skin, linear light."""
+    sensor, body, corners, turn = params
+    winner, depth, column, row, slope_x, slope_y, *empty = images
+    nearest = jnp.maximum(winner, 0)
+    shares = [share * jnp.where(winner >= 0, depth, 1) for share in _shares(corners, winner, column, row)]
+
+    def inside(values: Float[Array, "f 3 k"]) -> list[Float[Array, "h w"]]:
+        size = values.shape[-1]
+        of_face = values.reshape(-1, 3 * size)[nearest]
+        return [sum(share * of_face[..., size * k + i] for k, share in enumerate(shares)) for i in range(size)]
+
+    across = inside(body.normals)
+    normal = _math.normalize(jnp.stack([sum(turn[i, k] * across[k] for k in range(3)) for i in range(3)], axis=-1))
+    towards = normal[..., 0] * slope_x + normal[..., 1] * slope_y + normal[..., 2]
+    normal = jnp.where((body.two_sided & (towards > 0))[..., None], -normal, normal)
+    albedo = jnp.stack(inside(body.colors), axis=-1)
+    albedo *= optics.sample_texture(body.texture, jnp.stack(inside(body.uv), axis=-1))
+    height = jnp.where(winner >= 0, depth, 1) - sensor.camera.distance
+    return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1)))
+
+
+def _skin(sensor: Sensor, surface: tuple[Array, Array, Array]) -> list[Array]:
+    """The lit skin, from its points with one more on each side."""
+    light = tactile.phong(sensor.phong, sensor.lights, tactile.surface_normals(surface))
+    dark = tactile.darken(sensor.phong, -surface[2][1:-1, 1:-1])
+    return [channel * dark for channel in _planes(light)]
+
+
+def _height(corners: Float[Array, "f 9"], images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
+    """Height of the winning faces, linear on the gel's grid."""
+    return functools.reduce(operator.add, _shares(corners, *images))
+
+
+def _shares(
+    corners: Float[Array, "f 9"], winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
+) -> list[Float[Array, "h w"]]:
+    """Weight of each corner of the winning face times its third value; its first two are its place on the screen."""
+    of_face = corners[jnp.maximum(winner, 0)]
+    weights = optics.barycentrics([of_face[..., k : k + 2] for k in (0, 3, 6)], column, row)
+    return [weight * of_face[..., k] for weight, k in zip(weights, (2, 5, 8), strict=True)]
+
+
+def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array, "h w"]]:
+    """Of samples half a pixel apart by a tent one pixel wide at half height; else samples are pixels."""
+    if stride == 1:
+        return samples
+    rows = [0.5 * s[1:-1:2] + 0.25 * (s[:-2:2] + s[2::2]) for s in samples]
+    return [0.5 * r[:, 1:-1:2] + 0.25 * (r[:, :-2:2] + r[:, 2::2]) for r in rows]
+
+
+def _planes(image: Float[Array, "h w 3"]) -> list[Float[Array, "h w"]]:
+    return [image[..., k] for k in range(3)]
+
+
+def _near(flags: Bool[Array, "a b"]) -> Bool[Array, "h w"]:
+    """Whether any of a pixel's 3x3 neighbourhood is flagged; without the outermost."""
+    rows = flags[:-2] | flags[1:-1] | flags[2:]
+    return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]

@@ -40,7 +40,7 @@ def test_points_land_where_a_pinhole_puts_them():
 @pytest.mark.parametrize("shape", [(64, 64), (97, 53)])
 def test_rays_are_the_inverse_of_projection(shape):
     window = jnp.array([-0.02, 0.01, 0.03, 0.04])
-    slopes = optics.rays(CAMERA, window, shape)
+    slopes = np.stack(optics.rays(CAMERA, window, shape), -1)
     points = jnp.concatenate([0.17 * slopes, jnp.full((*shape, 1), 0.07)], -1).reshape(-1, 3)
     pixels, _ = optics.to_pixels(CAMERA, window, shape, points)
     rows, columns = np.mgrid[: shape[0], : shape[1]]

@@ -25,7 +25,8 @@ def draw(vertices, faces, two_sided, pose, shape):
     inverse = 1 / jnp.maximum(depth, CAMERA.near)
     keep = jnp.all(depth[faces] > CAMERA.near, axis=1)
     winner = optics.rasterise(pixels, -inverse, faces, keep, two_sided, shape)
-    weights = optics.barycentrics(pixels, faces, winner)
+    corners = pixels[faces][jnp.maximum(winner, 0)]
+    weights = optics.barycentrics([corners[..., k, :] for k in range(3)], *optics.pixel_centres(shape))
     corners = inverse[faces][jnp.maximum(winner, 0)]
     return jnp.where(winner >= 0, 1 / sum(w * corners[..., k] for k, w in enumerate(weights)), jnp.inf), winner
 

@@ -2,7 +2,7 @@
 
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
 from sts_jax.optics.photograph import photograph
-from sts_jax.optics.rasterise import barycentrics, rasterise
+from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
 from sts_jax.optics.shading import Room, empty_view, sample_texture, shade, to_linear, to_srgb
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "full_window",
     "object_window",
     "photograph",
+    "pixel_centres",
     "rasterise",
     "rays",
     "sample_texture",

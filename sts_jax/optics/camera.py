@@ -95,7 +95,9 @@ def to_pixels(
     return (on_face - window[None, :2]) * scale[None, :] - 0.5, depth
 
 
-def rays(camera: Camera, window: Float[Array, "4"], shape: tuple[int, int]) -> Float[Array, "h w 2"]:
+def rays(
+    camera: Camera, window: Float[Array, "4"], shape: tuple[int, int]
+) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Slopes (x / depth, y / depth) of the rays through the pixel centres.
 
     Args:
@@ -104,8 +106,9 @@ def rays(camera: Camera, window: Float[Array, "4"], shape: tuple[int, int]) -> F
         shape: (height, width) of the image, pixels.
 
     Returns:
-        `h w 2`; the point at depth D on a ray is (D x, D y, D - camera.distance).
+        Both slopes; the point at depth D on a ray is (D x, D y, D - camera.distance).
     """
     x = (window[0] + (jnp.arange(shape[1]) + 0.5) / shape[1] * window[2]) / camera.distance
     y = (window[1] + (jnp.arange(shape[0]) + 0.5) / shape[0] * window[3]) / camera.distance
-    return jnp.stack(jnp.meshgrid(x, y), axis=-1)
+    x, y = jnp.meshgrid(x, y)
+    return x, y

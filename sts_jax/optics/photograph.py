@@ -5,7 +5,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import _math
 from sts_jax.optics.camera import Camera, full_window, rays, to_pixels
-from sts_jax.optics.rasterise import barycentrics, rasterise
+from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
 from sts_jax.optics.shading import to_srgb
 
 _SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # light from above and from below, linear
@@ -55,13 +55,14 @@ def photograph(
     keep = jnp.all(depth[faces] > 0.01, axis=1)
     winner = rasterise(pixels, -inverse, faces, keep, jnp.asarray(two_sided), shape)
     nearest = jnp.maximum(winner, 0)
-    shares = [w * inverse[faces[:, k]][nearest] for k, w in enumerate(barycentrics(pixels, faces, winner))]
+    weights = barycentrics([pixels[faces[:, k]][nearest] for k in range(3)], *pixel_centres(shape))
+    shares = [w * inverse[faces[:, k]][nearest] for k, w in enumerate(weights)]
     total = shares[0] + shares[1] + shares[2]
     corners = jnp.concatenate([normals, albedo], -1)[nearest]
     values = jnp.einsum("hwk,hwkc->hwc", jnp.stack(shares, -1) / total[..., None], corners)
 
-    slopes = rays(camera, window, shape)
-    ray = jnp.concatenate([slopes, jnp.ones_like(slopes[..., :1])], -1) @ turn
+    x, y = rays(camera, window, shape)
+    ray = jnp.stack([x, y, jnp.ones_like(x)], -1) @ turn
     normal = _math.normalize(values[..., :3])
     normal = jnp.where(jnp.sum(normal * ray, -1, keepdims=True) > 0, -normal, normal)
     lamp = _math.normalize(-forward - 0.6 * right + jnp.array([0.0, 0.0, 0.8]))

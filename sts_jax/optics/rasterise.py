@@ -9,6 +9,8 @@ Pixel coordinates are (column, row), whole numbers at pixel centres, x to the ri
 what is nearer and affine across a face on the screen: -1/depth in a pinhole's view, depth itself in a parallel one.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,29 +119,33 @@ def rasterise(
 
 
 def barycentrics(
-    points: Float[Array, "v 2"], faces: Int[Array, "f 3"], winner: Int[Array, "h w"]
-) -> tuple[Float[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """Weights of the winning face's corners at every pixel centre, affine on the screen.
+    corners: Sequence[Float[Array, "*n 2"]], column: Float[Array, "*n"], row: Float[Array, "*n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
+    """Weights of a face's corners at a place on the screen, affine on the screen.
 
     Args:
-        points: vertices on the screen, (column, row) in pixels.
-        faces: corner indices.
-        winner: from `rasterise`.
+        corners: the three corners, (column, row) in pixels.
+        column: of the place, pixels.
+        row: of the place, pixels.
 
     Returns:
-        Non-negative weights that sum to 1, one image per corner; arbitrary but finite where nothing is seen.
+        Weights that sum to 1, none below 0 even where rounding puts a place outside its face; (1, 0, 0) for a face
+        without area.
     """
-    height, width = winner.shape
-    corners = points[faces].reshape(-1, 6)[jnp.maximum(winner, 0)]
-    column = jnp.broadcast_to(jnp.arange(width, dtype=jnp.float32)[None, :], winner.shape)
-    row = jnp.broadcast_to(jnp.arange(height, dtype=jnp.float32)[:, None], winner.shape)
-    a, b, c = ((corners[..., 2 * k] - column, corners[..., 2 * k + 1] - row) for k in range(3))
+    # Relative to the place: in absolute pixels float32 loses per cents on slivers.
+    a, b, c = ((corner[..., 0] - column, corner[..., 1] - row) for corner in corners)
     area = _cross(a, b, c)
     ok = area != 0
     area = jnp.where(ok, area, 1)
     first = jnp.clip((b[0] * c[1] - c[0] * b[1]) / area, 0, 1)
     second = jnp.clip((c[0] * a[1] - a[0] * c[1]) / area, 0, 1 - first)
     return jnp.where(ok, first, 1), jnp.where(ok, second, 0), jnp.where(ok, 1 - first - second, 0)
+
+
+def pixel_centres(shape: tuple[int, int]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """Columns and rows of an image's pixels."""
+    row, column = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij")
+    return column, row
 
 
 def _cross(a: tuple[Array, ...], b: tuple[Array, ...], c: tuple[Array, ...]) -> Array:

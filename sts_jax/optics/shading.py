@@ -44,7 +44,7 @@ def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
 def to_srgb(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """sRGB of linear light (IEC 61966-2-1)."""
     high = linear > 0.0031308
-    return jnp.where(high, 1.055 * jnp.where(high, linear, 1) ** (1 / 2.4) - 0.055, 12.92 * linear)
+    return jnp.where(high, 1.055 * jnp.exp(jnp.log(jnp.where(high, linear, 1)) / 2.4) - 0.055, 12.92 * linear)
 
 
 def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "h w 2"]) -> Float[Array, "h w 3"]:
@@ -109,7 +109,11 @@ def shade(
     Returns:
         Image in linear light.
     """
-    incidence = jnp.maximum(normals @ _math.normalize(room.directions).T, 0)
-    lit = albedo * (jnp.asarray(room.ambient)[None, None, :] + incidence @ room.colors)
-    through = jnp.exp(-jnp.maximum(heights, 0) / room.haze)[..., None]
-    return through * lit + (1 - through) * empty
+    directions, ambient, colors = _math.normalize(room.directions), jnp.asarray(room.ambient), room.colors
+    incidence = [jnp.maximum(sum(d[k] * normals[..., k] for k in range(3)), 0) for d in directions]
+    through = jnp.exp(-jnp.maximum(heights, 0) / room.haze)
+    channels = []
+    for k in range(3):
+        light = ambient[k] + sum(one * color[k] for one, color in zip(incidence, colors, strict=True))
+        channels.append(through * albedo[..., k] * light + (1 - through) * empty[..., k])
+    return jnp.stack(channels, axis=-1)

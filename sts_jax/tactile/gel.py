@@ -8,10 +8,15 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-_NEWTON_STEPS = 10
+_NEWTON_STEPS = 20  # at most
+_SETTLED = 1e-7  # m, a step shorter than this is the last
+_ENOUGH = 0.5  # of the energy's slope along a whole step may be left at its end; else a shorter one is tried
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
+_SIDE = 10  # cells, of the squares that are solved for, or left out, as one
+_FEW = 32  # squares solved for at first
+_NEAR = 0.003  # m over the deepest imprint: what lies within it is solved for at first
 _LEVER = 0.02  # m, by which tilts are scaled
 _BOTTOM = 300.0  # how many times stiffer the springs are beyond the deepest imprint
 _FAR = 1.0  # m, stands for the height where there is no object
@@ -110,42 +115,33 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     target = load * jnp.array([1.0, 0.0, 0.0])
 
     height = jnp.where(jnp.isfinite(heights), heights, _FAR)
-    touch = jnp.min(height)
-    reach = touch <= gel.max_depth
     tilt = jnp.tan(gel.max_tilt) * _LEVER
     bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
-    near_bound = 0.9999 * bound
 
-    def pushed(length: Float[Array, "r c"]) -> Float[Array, "r c"]:
-        return jnp.maximum(length, 0) + _BOTTOM * jnp.maximum(length - gel.max_depth, 0)
+    # Few cells are pressed: first only squares of cells near the lowest one are solved for. That is the whole solution
+    # if it presses none that was left out; else all are solved for.
+    squares, squares_x, squares_y = _squares(height, x, y)
+    lowest = jnp.min(squares, axis=1)
+    touch = jnp.min(lowest)
+    reach = touch <= gel.max_depth
+    start = jnp.stack([touch + gel.max_depth, jnp.float32(0), jnp.float32(0)])
+    number = len(lowest)
 
-    def newton(_: Array, u: Float[Array, "3"]) -> Float[Array, "3"]:
-        length = _plane(u, fixed_x, fixed_y) - fixed_height
-        gradient = _moments(pushed(length), fixed_x, fixed_y) - fixed_target
-        held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
-        curvature = _curvature(length, gel.max_depth, fixed_x, fixed_y)
-        step = -_solve(curvature, gradient, held)
-        # At a limit, and still led beyond it by the other unknowns: without this one.
-        held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
-        step = -_solve(curvature, gradient, held)
-        room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
-        step = step * jnp.clip(jnp.min(jnp.where(step == 0, 1, room)), 0, 1)
-        along = _plane(step, fixed_x, fixed_y)
-        slopes = [
-            jnp.sum(step * (_moments(pushed(length + t * along), fixed_x, fixed_y) - fixed_target))
-            for t in _STEP_LENGTHS
-        ]
-        best = jnp.argmin(jnp.abs(jnp.stack(slopes)))
-        return u + jnp.array(_STEP_LENGTHS)[best] * step
+    def solve(chosen: Int[Array, "n"]) -> Float[Array, "3"]:
+        cells = squares.at[chosen].get(mode="fill", fill_value=_FAR)
+        places = (squares_x[chosen % len(squares_x)], squares_y[chosen // len(squares_x) % len(squares_y)])
+        places = tuple(
+            jnp.broadcast_to(p, (len(chosen), _SIDE, _SIDE)) for p in (places[0][:, None, :], places[1][:, :, None])
+        )
+        basis = jnp.stack([jnp.ones(cells.size), places[1].reshape(-1), places[0].reshape(-1)])
+        return _newton(cells.reshape(-1), basis, target, start, bound, gel.max_depth)
 
-    fixed_x, fixed_y, fixed_height, fixed_target = jax.lax.stop_gradient((x, y, height, target))
-    start = jnp.stack([jax.lax.stop_gradient(touch + gel.max_depth), jnp.float32(0), jnp.float32(0)])
-    u = jax.lax.stop_gradient(jax.lax.fori_loop(0, _NEWTON_STEPS, newton, start))
-
-    length = _plane(u, x, y) - height
-    gradient = _moments(pushed(length), x, y) - target
-    curvature = jax.lax.stop_gradient(_curvature(length, gel.max_depth, x, y))
-    u = jnp.clip(u - _solve(curvature, gradient, jnp.abs(u) >= near_bound), -bound, bound)
+    (few,) = jnp.nonzero(lowest < touch + gel.max_depth + _NEAR, size=min(_FEW, number), fill_value=number)
+    u = solve(few)
+    left_out = jnp.ones(number, bool).at[few].set(False, mode="drop").reshape(len(squares_y), len(squares_x))
+    left_out = left_out.repeat(_SIDE, axis=0).repeat(_SIDE, axis=1)[: gel.cells[0], : gel.cells[1]]
+    missed = jnp.any(left_out & (_plane(u, x, y) > height))
+    u = jax.lax.cond(missed, lambda: solve(jnp.arange(number)), lambda: u)
 
     u = jnp.where(pressed & reach, u, 0)
     length = jnp.where(pressed & reach, jnp.clip(_plane(u, x, y) - height, 0, gel.max_depth), 0)
@@ -159,6 +155,80 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
         pressure=gel.stiffness * length,
         balanced=balanced,
     )
+
+
+def _squares(
+    height: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]
+) -> tuple[Float[Array, "n k"], Float[Array, "a s"], Float[Array, "b s"]]:
+    """Heights square by square, and the x and y of each column and row of squares; beyond the grid nothing is near."""
+    parts = []
+    for place in (x, y):
+        more = -len(place) % _SIDE
+        parts.append(jnp.pad(place, (0, more)).reshape(-1, _SIDE))
+    rows, columns = len(parts[1]), len(parts[0])
+    more = [(0, rows * _SIDE - height.shape[0]), (0, columns * _SIDE - height.shape[1])]
+    squares = jnp.pad(height, more, constant_values=_FAR).reshape(rows, _SIDE, columns, _SIDE).swapaxes(1, 2)
+    return squares.reshape(rows * columns, _SIDE * _SIDE), *parts
+
+
+def _newton(
+    height: Float[Array, "n"],
+    basis: Float[Array, "3 n"],
+    target: Float[Array, "3"],
+    start: Float[Array, "3"],
+    bound: Float[Array, "3"],
+    limit: Scalar,
+) -> Float[Array, "3"]:
+    """The plane `u . basis` whose springs to `height` have the moments `target`, or what comes nearest in bounds."""
+    near_bound = 0.9999 * bound
+
+    def plane(u: Float[Array, "3"], basis: Float[Array, "3 n"]) -> Float[Array, "n"]:
+        return u[0] * basis[0] + u[1] * basis[1] + u[2] * basis[2]
+
+    def pushed(length: Array) -> Array:
+        return jnp.maximum(length, 0) + _BOTTOM * jnp.maximum(length - limit, 0)
+
+    def curvature(length: Float[Array, "n"], basis: Float[Array, "3 n"]) -> Float[Array, "3 3"]:
+        weight = (length > 0) + _BOTTOM * (length > limit)
+        full = (weight[None, :] * basis) @ basis.T
+        return full + (1e-6 + 1e-5 * full[0, 0]) * jnp.eye(3)
+
+    def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, u, _ = state
+        length = plane(u, fixed_basis) - fixed_height
+        gradient = fixed_basis @ pushed(length) - fixed_target
+        held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
+        matrix = curvature(length, fixed_basis)
+        step = -_solve(matrix, gradient, held)
+        # At a limit, and still led beyond it by the other unknowns: without this one.
+        held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
+        step = -_solve(matrix, gradient, held)
+        room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
+        step = step * jnp.clip(jnp.min(jnp.where(step == 0, 1, room)), 0, 1)
+        along = plane(step, fixed_basis)
+
+        def slope(part: float) -> Float[Array, ""]:
+            return jnp.abs(jnp.sum(pushed(length + part * along) * along) - jnp.sum(step * fixed_target))
+
+        def shorter() -> Float[Array, ""]:
+            slopes = jnp.stack([slope(part) for part in _STEP_LENGTHS])
+            return jnp.array(_STEP_LENGTHS)[jnp.argmin(slopes)]
+
+        whole = slope(1.0) <= _ENOUGH * jnp.abs(jnp.sum(step * gradient))
+        u = u + jax.lax.cond(whole, lambda: jnp.float32(1), shorter) * step
+        return count + 1, u, jnp.max(jnp.abs(step))
+
+    def unsettled(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        return (state[0] < _NEWTON_STEPS) & (state[2] > _SETTLED)
+
+    fixed_basis, fixed_height, fixed_target = jax.lax.stop_gradient((basis, height, target))
+    first = (jnp.int32(0), jax.lax.stop_gradient(start), jnp.float32(jnp.inf))
+    u = jax.lax.stop_gradient(jax.lax.while_loop(unsettled, newton, first)[1])
+
+    length = plane(u, basis) - height
+    gradient = basis @ pushed(length) - target
+    matrix = jax.lax.stop_gradient(curvature(length, basis))
+    return jnp.clip(u - _solve(matrix, gradient, jnp.abs(u) >= near_bound), -bound, bound)
 
 
 def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "r c"]:
@@ -175,14 +245,6 @@ def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]
 def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3"]:
     sums = _sums(value, x, y)
     return jnp.stack([sums[0, 0], sums[1, 0], sums[0, 1]])
-
-
-def _curvature(
-    length: Float[Array, "r c"], limit: Scalar, x: Float[Array, "c"], y: Float[Array, "r"]
-) -> Float[Array, "3 3"]:
-    s = _sums((length > 0) + _BOTTOM * (length > limit), x, y)
-    rows = [[s[0, 0], s[1, 0], s[0, 1]], [s[1, 0], s[2, 0], s[1, 1]], [s[0, 1], s[1, 1], s[0, 2]]]
-    return jnp.stack([jnp.stack(row) for row in rows]) + (1e-6 + 1e-5 * s[0, 0]) * jnp.eye(3)
 
 
 def _solve(matrix: Float[Array, "3 3"], vector: Float[Array, "3"], held: Bool[Array, "3"]) -> Float[Array, "3"]:

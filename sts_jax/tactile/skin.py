@@ -44,19 +44,21 @@ class Phong:
     darkening: Scalar = 0.001  # m, depth at which the skin is 1/e as bright; the paper names the mask, not its shape
 
 
-def surface_normals(points: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
+def surface_normals(
+    points: tuple[Float[Array, "a b"], Float[Array, "a b"], Float[Array, "a b"]],
+) -> Float[Array, "h w 3"]:
     """Unit normals of a grid of points: the axis of least covariance of each point's 3x3 neighbourhood.
 
     Args:
-        points: sensor frame (m). At the border the neighbourhood is what there is of it.
+        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`.
 
     Returns:
         Unit normals towards the camera (z <= 0) (paper, supplement "Simulator Details").
     """
-    height, width, _ = points.shape
+    height, width = (n - 2 for n in points[0].shape)
     # Differences from the middle point in millimetres: float32 keeps its digits.
-    planes = [1e3 * points[..., k] for k in range(3)]
-    padded = [jnp.pad(p, 1, mode="edge") for p in planes]
+    padded = [1e3 * part for part in points]
+    planes = [part[1:-1, 1:-1] for part in padded]
     near = [
         [padded[k][i : i + height, j : j + width] - planes[k] for k in range(3)]
         for i in range(3)

@@ -1,0 +1,92 @@
+"""Work where there is something to see: an image function on the tiles that need it, with the whole image's gradient.
+
+Most of a sensor's image is empty. `where_active` cuts it into square tiles and walks, batch by batch, those that hold
+an active pixel, so that an image costs what is on it and not its size.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+TILE = 8  # pixels, side of a tile
+BATCH = 8  # tiles done at a time
+
+Images = Any  # a tree of images (height, width)
+Function = Callable[[Any, Images], Images]
+
+
+def where_active(
+    function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images, *, ring: int = 0
+) -> Images:
+    """`jnp.where(active, function(params, images), otherwise)`, for the price of the tiles that hold an active pixel.
+
+    Derivatives are those of this expression, taken over the whole image.
+
+    Args:
+        function: `(params, images) -> images'`, from images of any size (a + 2 ring, b + 2 ring) to images (a, b), of
+            which each pixel depends on those within `ring` of it alone. It must close over no tracer: what it needs
+            comes by its arguments.
+        active: where the result is wanted.
+        params: passed on, whole.
+        images: tree of (h + 2 ring, w + 2 ring).
+        otherwise: tree of (h, w), as `function` returns them.
+        ring: pixels around each pixel.
+
+    Returns:
+        Tree of (h, w).
+    """
+    if min(active.shape) < TILE:
+        return _dense(function, active, params, images, otherwise)
+    return _where_active(function, ring, active, params, images, otherwise)
+
+
+def _dense(function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images) -> Images:
+    return jax.tree.map(lambda value, other: jnp.where(active, value, other), function(params, images), otherwise)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _where_active(
+    function: Function, ring: int, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images
+) -> Images:
+    height, width = active.shape
+    rows, columns = -(-height // TILE), -(-width // TILE)
+    number = rows * columns
+    flags = jnp.pad(active, [(0, rows * TILE - height), (0, columns * TILE - width)])
+    used = jnp.any(flags.reshape(rows, TILE, columns, TILE), axis=(1, 3)).reshape(number)
+    end = jnp.sum(used)
+    (order,) = jnp.nonzero(used, size=-(-number // BATCH) * BATCH, fill_value=number)
+    # The last row and column of tiles overlap those before them: a tile lies in the image.
+    first_row = jnp.minimum(order // columns * TILE, height - TILE)
+    first_column = jnp.minimum(order % columns * TILE, width - TILE)
+
+    def body(state: tuple[Array, Images]) -> tuple[Array, Images]:
+        base, result = state
+        corners = [jax.lax.dynamic_slice(first, (base,), (BATCH,)) for first in (first_row, first_column)]
+
+        def windows(image: Array, side: int) -> Array:
+            # Tiles along the last axis: there a processor's vector units work best.
+            take = jax.vmap(lambda row, column: jax.lax.dynamic_slice(image, (row, column), (side, side)), out_axes=-1)
+            return take(*corners)
+
+        parts = jax.tree.map(lambda image: windows(image, TILE + 2 * ring), images)
+        values = jax.vmap(function, in_axes=(None, -1), out_axes=-1)(params, parts)
+        wanted = windows(active, TILE) & (base + jnp.arange(BATCH) < end)[None, None, :]
+
+        def put(all_: Array, value: Array) -> Array:
+            value = jnp.where(wanted, value, windows(all_, TILE))
+            for k in range(BATCH):
+                all_ = jax.lax.dynamic_update_slice(all_, value[..., k], (corners[0][k], corners[1][k]))
+            return all_
+
+        return base + BATCH, jax.tree.map(put, result, values)
+
+    return jax.lax.while_loop(lambda state: state[0] < end, body, (jnp.int32(0), otherwise))[1]
+
+
+@_where_active.defjvp
+def _where_active_jvp(function: Function, ring: int, primals: tuple, tangents: tuple) -> tuple[Images, Images]:
+    return jax.jvp(functools.partial(_dense, function, primals[0]), primals[1:], tangents[1:])
