@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 from sts_jax import _math, optics, tactile
 from sts_jax.objects.body import Body
@@ -198,3 +198,36 @@ def _filter(samples: Float[Array, "a b 3"]) -> Float[Array, "h w 3"]:
 
     down, across = tent(samples.shape[0] // 2), tent(samples.shape[1] // 2)
     return jnp.einsum("ia,jb,abk->ijk", down, across, samples)
+
+
+def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n h w 3"]:
+    """The image with the internal light between off, `Frame.visual`, and full, `Frame.tactile`.
+
+    The LEDs add to what comes through the skin, in linear light. Of the two streams V and T the camera exposes V for k
+    times as long (`Room.exposure`); at a share l of the LEDs' power it exposes so that what is as bright in both is so
+    in between:
+
+        image = ((1 - l) V + l k T) / (1 - l + l k)
+
+    Args:
+        sensor: what took the frame.
+        frame: one, or any leading axes.
+        light: share of the LEDs' full power, 0 to 1. Under `jit` and `vmap`, where no error can be raised, it is
+            clipped, and not a number is 0.
+
+    Returns:
+        Image, sRGB in [0, 1]; the streams themselves at 0 and 1.
+
+    Raises:
+        ValueError: `light` is outside [0, 1] or not a number.
+    """
+    if not isinstance(light, jax.core.Tracer) and not 0 <= float(light) <= 1:
+        raise ValueError(f"light is {light}; it is a share of the LEDs' full power, from 0 (visual) to 1 (tactile)")
+    light = jnp.asarray(light, jnp.float32)
+    light = jnp.where(light >= 0, jnp.where(light <= 1, light, 1), 0)
+    bright = light * sensor.room.exposure
+    share = bright / (1 - light + bright)
+    mixed = optics.to_srgb((1 - share) * optics.to_linear(frame.visual) + share * optics.to_linear(frame.tactile))
+    # Going to linear light and back rounds: what is missing to the streams, at their ends.
+    ends = jnp.where(share == 0, frame.visual - mixed, jnp.where(share == 1, frame.tactile - mixed, 0))
+    return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)

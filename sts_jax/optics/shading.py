@@ -32,6 +32,7 @@ class Room:
     background: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
     haze: Scalar = 0.3  # m, height over the skin at which 1/e of an object's own light comes through
     vignette: Scalar = 0.1  # share of light lost at the pad's edge, as the square of the distance from the centre
+    exposure: Scalar = 1.0  # how many times longer the camera exposes for the view than for the lit skin (`expose`)
     rim: Scalar = 0.35  # brightness of what lies beyond the pad's edges, of the background's
 
 
