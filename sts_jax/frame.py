@@ -92,7 +92,7 @@ def sense(
     else:
         shape, seen = resolution, window
 
-    visual, touch, depth, hit = _draw(sensor, body, points, drawn, present, pressing, seen, shape)
+    visual, touch, depth, hit = _draw(sensor, body, points, drawn, heights, present, pressing, seen, shape)
     if fine:
         visual, touch = _filter(visual), _filter(touch)
         depth, hit = depth[1::2, 1::2], hit[1::2, 1::2]
@@ -142,6 +142,7 @@ def _draw(
     body: Body,
     points: Float[Array, "v 3"],
     pose: Float[Array, "7"],
+    heights: Float[Array, "r c"],
     present: Bool[Array, ""],
     pressing: Bool[Array, ""],
     window: Float[Array, "4"],
@@ -167,8 +168,11 @@ def _draw(
     on_face = slopes * camera.distance
     half = jnp.stack([jnp.asarray(gel.size[0]), jnp.asarray(gel.size[1])]) / 2
     on_pad = jnp.all(jnp.abs(on_face) <= 1.0001 * half[None, None, :], axis=-1)  # its edge is the image's: no rounding
+    walls = optics.housing(sensor.room, on_pad, on_face, gel.size, camera.distance)
     square_radius = jnp.sum((on_face / half[None, None, :]) ** 2, axis=-1)
-    empty = optics.empty_view(sensor.room, square_radius, on_pad.astype(jnp.float32))
+    x, y = on_face[0, :, 0], on_face[:, 0, 1]
+    hidden = optics.hidden_sky(heights, gel.size, jnp.max(points[:, 2]), x, y)
+    empty = optics.empty_view(sensor.room, square_radius, walls, hidden)
     turned = body.normals @ _math.quat_matrix(pose[3:]).T
     corners = jnp.concatenate([turned, body.colors, body.uv], axis=-1).reshape(-1, 24)[nearest]
     values = sum(weights[k][..., None] * corners[..., 8 * k : 8 * k + 8] for k in range(3))
@@ -176,8 +180,8 @@ def _draw(
     towards = normals[..., 0] * slopes[..., 0] + normals[..., 1] * slopes[..., 1] + normals[..., 2]
     normals = jnp.where((body.two_sided & (towards > 0))[..., None], -normals, normals)
     albedo = values[..., 3:6] * optics.sample_texture(body.texture, values[..., 6:])
-    shaded = optics.shade(sensor.room, albedo, normals, depth - camera.distance, empty)
-    visual = jnp.where(hit[..., None], shaded, empty)
+    shaded = optics.shade(sensor.room, albedo, normals, depth - camera.distance, empty, hidden)
+    visual = jnp.where((hit & on_pad)[..., None], shaded, empty)
 
     # the skin itself
     face = jnp.asarray(camera.distance)
@@ -185,7 +189,7 @@ def _draw(
     surface = jnp.concatenate([slopes * skin[..., None], (skin - face)[..., None]], axis=-1)
     skin_normals = tactile.surface_normals(jax.lax.optimization_barrier(surface))
     light = tactile.phong(sensor.phong, sensor.lights, jax.lax.optimization_barrier(skin_normals))
-    dark = tactile.darken(sensor.phong, face - skin) * jnp.where(on_pad, 1, sensor.room.rim)
+    dark = tactile.darken(sensor.phong, face - skin) * walls
     return visual, light * dark[..., None], depth, hit
 
 
