@@ -1,7 +1,7 @@
 """The See-Through-your-Skin sensor in JAX: simulate it, see with it, learn to predict from it."""
 
 from sts_jax import dataset, evaluation, mvae, objects, optics, physics, tactile, training
-from sts_jax.frame import Frame, sense
+from sts_jax.frame import Frame, expose, sense
 from sts_jax.predict import Prediction, Predictor
 from sts_jax.sensor import Sensor
 
@@ -12,6 +12,7 @@ __all__ = [
     "Sensor",
     "dataset",
     "evaluation",
+    "expose",
     "mvae",
     "objects",
     "optics",

@@ -6,7 +6,7 @@ import operator
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _math, optics, tactile
 from sts_jax._tiles import where_active
@@ -86,7 +86,7 @@ def sense(
     else:
         window = optics.full_window(sensor.camera, resolution)
 
-    visual, touch, depth = _draw(sensor, body, points, drawn, present, pressing, window, resolution)
+    visual, touch, depth = _draw(sensor, body, points, drawn, heights, present, pressing, window, resolution)
     return Frame(
         visual=visual,
         tactile=touch,
@@ -97,6 +97,39 @@ def sense(
         pressure=contact.pressure,
         window=window,
     )
+
+
+def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n h w 3"]:
+    """The image with the internal light between off, `Frame.visual`, and full, `Frame.tactile`.
+
+    The LEDs add to what comes through the skin, in linear light. Of the two streams V and T the camera exposes V for k
+    times as long (`Room.exposure`); at a share l of the LEDs' power it exposes so that what is as bright in both is so
+    in between:
+
+        image = ((1 - l) V + l k T) / (1 - l + l k)
+
+    Args:
+        sensor: what took the frame.
+        frame: one, or any leading axes.
+        light: share of the LEDs' full power, 0 to 1. Under `jit` and `vmap`, where no error can be raised, it is
+            clipped, and not a number is 0.
+
+    Returns:
+        Image, sRGB in [0, 1]; the streams themselves at 0 and 1.
+
+    Raises:
+        ValueError: `light` is outside [0, 1] or not a number.
+    """
+    if not isinstance(light, jax.core.Tracer) and not 0 <= float(light) <= 1:
+        raise ValueError(f"light is {light}; it is a share of the LEDs' full power, from 0 (visual) to 1 (tactile)")
+    light = jnp.asarray(light, jnp.float32)
+    light = jnp.where(light >= 0, jnp.where(light <= 1, light, 1), 0)
+    bright = light * sensor.room.exposure
+    share = bright / (1 - light + bright)
+    mixed = optics.to_srgb((1 - share) * optics.to_linear(frame.visual) + share * optics.to_linear(frame.tactile))
+    # Going to linear light and back rounds: what is missing to the streams, at their ends.
+    ends = jnp.where(share == 0, frame.visual - mixed, jnp.where(share == 1, frame.tactile - mixed, 0))
+    return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)
 
 
 def underside(
@@ -133,6 +166,7 @@ def _draw(
     body: Body,
     points: Float[Array, "v 3"],
     pose: Float[Array, "7"],
+    heights: Float[Array, "r c"],
     present: Bool[Array, ""],
     pressing: Bool[Array, ""],
     window: Float[Array, "4"],
@@ -156,13 +190,15 @@ def _draw(
 
     # seen through the skin
     slopes = optics.rays(camera, seen, shape)
-    half = jnp.stack([jnp.asarray(gel.size[0]), jnp.asarray(gel.size[1])]) / 2
-    place = [slopes[k] * camera.distance / half[k] for k in range(2)]
+    x, y = (slope * camera.distance for slope in slopes)  # where the rays cross the gel's face
+    place = x * 2 / gel.size[0], y * 2 / gel.size[1]
     on_pad = (jnp.abs(place[0]) <= 1.0001) & (jnp.abs(place[1]) <= 1.0001)  # its edge is the image's: no rounding
-    empty = _planes(optics.empty_view(sensor.room, place[0] ** 2 + place[1] ** 2, on_pad.astype(jnp.float32)))
-    inner = tuple(image[1:-1, 1:-1] for image in (winner, depth, *centres, *slopes, *empty))
+    walls = optics.housing(sensor.room, on_pad, jnp.stack([x, y], axis=-1), gel.size, camera.distance)
+    hidden = optics.hidden_sky(heights, gel.size, jnp.max(points[:, 2]), x[0], y[:, 0])
+    empty = _planes(optics.empty_view(sensor.room, place[0] ** 2 + place[1] ** 2, walls, hidden))
+    inner = tuple(image[1:-1, 1:-1] for image in (winner, depth, *centres, *slopes, hidden, *empty))
     params = (sensor, body, corners, _math.quat_matrix(pose[3:]))
-    visual = where_active(_look, inner[0] >= 0, params, inner, list(inner[6:]))
+    visual = where_active(_look, (winner >= 0)[1:-1, 1:-1] & on_pad[1:-1, 1:-1], params, inner, list(inner[-3:]))
     visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in _pixels(visual, stride)]
 
     # the skin itself
@@ -173,8 +209,7 @@ def _draw(
     flat = [jnp.broadcast_to(flat[..., k], inner[0].shape) for k in range(3)]
     surface = (slopes[0] * skin, slopes[1] * skin, skin - face)
     touch = where_active(_skin, _near(touched), sensor, surface, flat, ring=1)
-    rim = jnp.where(on_pad[1:-1, 1:-1], 1, sensor.room.rim)
-    touch = [jnp.clip(channel, 0, 1) for channel in _pixels([channel * rim for channel in touch], stride)]
+    touch = [jnp.clip(channel, 0, 1) for channel in _pixels([channel * walls[1:-1, 1:-1] for channel in touch], stride)]
     depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
     return jnp.stack(visual, axis=-1), jnp.stack(touch, axis=-1), depth
 
@@ -187,7 +222,7 @@ def _depth(corners: Float[Array, "f 9"], images: tuple[Array, Array, Array]) -> 
 def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) -> list[Array]:
     """The object's colour through the skin, linear light."""
     sensor, body, corners, turn = params
-    winner, depth, column, row, slope_x, slope_y, *empty = images
+    winner, depth, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
     shares = [share * jnp.where(winner >= 0, depth, 1) for share in _shares(corners, winner, column, row)]
 
@@ -203,7 +238,7 @@ def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) 
     albedo = jnp.stack(inside(body.colors), axis=-1)
     albedo *= optics.sample_texture(body.texture, jnp.stack(inside(body.uv), axis=-1))
     height = jnp.where(winner >= 0, depth, 1) - sensor.camera.distance
-    return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1)))
+    return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
 
 
 def _skin(sensor: Sensor, surface: tuple[Array, Array, Array]) -> list[Array]:

@@ -1,11 +1,20 @@
-"""Shading against loops in NumPy float64."""
+"""Shading against loops in NumPy float64, and the sky that an object hides against rays."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 
 from sts_jax import optics
+
+PAD = (0.15, 0.15)  # m
+CELLS = (150, 150)
+SHAPES = [(64, 64), (97, 53), (200, 200), (1232, 1640)]
 
 
 @pytest.fixture(autouse=True)
@@ -31,29 +40,192 @@ def test_texture_is_bilinear_with_its_first_row_at_v_zero():
     between = jnp.full((1, 1, 2), 3 / 8)  # the corner of four texels
     np.testing.assert_allclose(sample(table, between)[0, 0], texture[2:4, 2:4].mean((0, 1)), atol=1e-5)
     np.testing.assert_allclose(sample(table, between + 1), sample(table, between), atol=1e-5)
+    plain = sample(jnp.full((1, 1, 3), 0.5), jnp.zeros((7, 2)))
+    np.testing.assert_array_equal(plain, np.full((7, 3), 0.5))
 
 
-@pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200)])
-def test_shading_is_lamberts_law_in_haze(shape):
-    room = optics.Room()
-    rng = np.random.default_rng(0)
+def samples(shape, seed=0):
+    """Random albedo, normals, heights, empty view and hidden sky."""
+    rng = np.random.default_rng(seed)
     albedo, empty = rng.uniform(size=(2, *shape, 3))
     normals = rng.normal(size=(*shape, 3))
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    heights = rng.uniform(-0.002, 0.2, shape)
-    arrays = [jnp.asarray(a, jnp.float32) for a in (albedo, normals, heights, empty)]
+    return albedo, normals, rng.uniform(-0.002, 0.2, shape), empty, rng.uniform(size=shape)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_shading_is_lamberts_law_behind_a_milky_skin(shape):
+    room = optics.Room()
+    albedo, normals, heights, empty, hidden = samples(shape)
+    arrays = [jnp.asarray(a, jnp.float32) for a in (albedo, normals, heights, empty, hidden)]
     got = np.asarray(jax.jit(optics.shade)(room, *arrays))
+    rng = np.random.default_rng(1)
     for i, j in zip(rng.integers(shape[0], size=100), rng.integers(shape[1], size=100), strict=True):
         light = np.array(room.ambient, float)
         for direction, color in zip(np.asarray(room.directions, float), np.asarray(room.colors), strict=True):
             light = light + max(direction @ normals[i, j] / np.linalg.norm(direction), 0) * color
-        through = np.exp(-max(heights[i, j], 0) / room.haze)
-        expected = through * albedo[i, j] * light + (1 - through) * empty[i, j]
+        height = max(heights[i, j], 0)
+        light *= 1 - room.crease * hidden[i, j] * np.exp(-height / room.crease_height)
+        through = np.exp(-height / room.haze)
+        behind = through * np.asarray(room.tint) * albedo[i, j] * light + (1 - through) * empty[i, j]
+        sky = empty[i, j] / (1 - room.milk * hidden[i, j])
+        expected = (1 - room.milk) * behind + room.milk * (1 - hidden[i, j]) * sky
         np.testing.assert_allclose(got[i, j], expected, atol=1e-5)
 
 
-def test_the_empty_view_has_the_originals_colour_in_its_middle():
+def test_a_list_of_samples_is_shaded_as_an_image_is():
     room = optics.Room()
-    image = optics.empty_view(room, jnp.array([[0.0, 1.0], [2.0, 2.0]]), jnp.array([[1.0, 1.0], [1.0, 0.0]]))
-    assert np.array_equal(np.round(np.asarray(optics.to_srgb(image))[0, 0] * 255), [178, 178, 204])
-    assert np.all(np.diff(np.asarray(image).reshape(-1, 3)[:, 0]) < 0)
+    arrays = [jnp.asarray(a, jnp.float32) for a in samples((20, 30))]
+    image = optics.shade(room, *arrays)
+    few = np.random.default_rng(0).integers(600, size=77)
+    listed = [a.reshape(600, *a.shape[2:])[few] for a in arrays]
+    np.testing.assert_allclose(optics.shade(room, *listed), image.reshape(600, 3)[few], atol=1e-6)
+    alone = [a[3] for a in listed]
+    np.testing.assert_allclose(optics.shade(room, *alone), image.reshape(600, 3)[few[3]], atol=1e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_empty_view_is_the_originals_colour_less_vignette_walls_and_shadow(shape):
+    room = optics.Room()
+    rng = np.random.default_rng(0)
+    radius, walls, hidden = rng.uniform(0, 2.8, shape), rng.uniform(size=shape), rng.uniform(size=shape)
+    image = np.asarray(jax.jit(optics.empty_view)(room, *map(jnp.float32, (radius, walls, hidden))))
+    colour = ((np.array([178, 178, 204]) / 255 + 0.055) / 1.055) ** 2.4
+    light = (1 - room.vignette * radius) * walls**2 * (1 - room.milk * hidden)
+    np.testing.assert_allclose(image, light[..., None] * colour, atol=1e-5)
+    middle = optics.empty_view(room, jnp.zeros(()), jnp.ones(()), jnp.zeros(()))
+    assert np.array_equal(np.round(np.asarray(optics.to_srgb(middle)) * 255), [178, 178, 204])
+
+
+def test_walls_are_dark_and_darker_below():
+    room, distance = optics.Room(), 0.1
+    places = np.array([[0.0, 0.0], [0.074, -0.074], [0.076, 0.0], [0.0, -0.09], [-0.1, 0.02], [0.09, 0.1]])
+    on_pad = jnp.array([True, True, False, False, False, False])
+    got = optics.housing(room, on_pad, jnp.asarray(places, jnp.float32), PAD, distance)
+    expected = []
+    for x, y in places:
+        # the ray (0, 0, -distance) + s (x, y, distance) meets the nearest of the walls |x| = 75 mm, |y| = 75 mm
+        s = min(0.075 / abs(x) if x else np.inf, 0.075 / abs(y) if y else np.inf)
+        expected.append(1.0 if s > 1 else room.rim * np.exp(-distance * (1 - s) / room.rim_depth))
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    assert np.all(np.asarray(got)[2:] < 0.35)
+    assert got[2] > got[3] > got[4] > 0
+
+
+def centres(cells):
+    return ((np.arange(cells) + 0.5) / cells - 0.5) * 0.15
+
+
+def box_heights(low, half_x, half_y, cells=CELLS):
+    x, y = np.meshgrid(centres(cells[1]), centres(cells[0]))
+    return np.where((abs(x) < half_x) & (abs(y) < half_y), low, np.inf)
+
+
+def hidden_by(heights, top, x, y):
+    return np.asarray(jax.jit(optics.hidden_sky)(*map(jnp.float32, (heights,)), PAD, *map(jnp.float32, (top, x, y))))
+
+
+def rays_hidden(mesh, places, num=3000):
+    """Share of rays, spread by the cosine, from places of the skin that meet a mesh."""
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, np.float32))
+    index = np.arange(num)
+    radius, angle = np.sqrt((index + 0.5) / num), index * np.pi * (3 - np.sqrt(5))
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], -1)
+    shares = []
+    for x, y in places:
+        origins = np.tile([x, y, 1e-5], (num, 1)).astype(np.float32)
+        shares.append(np.mean(scene.run(origins, directions.astype(np.float32), query="DISTANCE") < 1e3))
+    return np.array(shares)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "half_x", "half_y"),
+    [
+        (0.0, 0.06, 0.0125, 0.0125),  # stands
+        (0.0, 0.02, 0.04, 0.015),  # lies
+        (0.0, 0.003, 0.03, 0.03),  # a plate
+        (0.02, 0.05, 0.03, 0.02),  # in the air
+        (0.06, 0.1, 0.05, 0.03),
+    ],
+)
+def test_hidden_sky_is_about_what_rays_find(low, high, half_x, half_y):
+    mesh = trimesh.creation.box((2 * half_x, 2 * half_y, high - low))
+    mesh.apply_translation((0, 0, (low + high) / 2))
+    x, y = np.linspace(-0.07, 0.07, 29), np.linspace(-0.07, 0.07, 15)
+    got = hidden_by(box_heights(low, half_x, half_y), high, x, y)
+    truth = rays_hidden(mesh, [(a, b) for b in y for a in x]).reshape(15, 29)
+    # at an edge on the skin it is as soft as the grid is coarse
+    assert np.abs(got - truth).mean() < 0.07
+    assert np.corrcoef(got.ravel(), truth.ravel())[0, 1] > 0.94
+    assert got.min() >= 0
+    assert got.max() <= 1 + 1e-6
+
+
+def test_under_a_ball_it_is_what_rays_find():
+    x, y = np.meshgrid(centres(150), centres(150))
+    square = x**2 + y**2
+    heights = np.where(square < 0.02**2, 0.02 - np.sqrt(np.maximum(0.02**2 - square, 0)), np.inf)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)
+    ball.apply_translation((0, 0, 0.02))
+    x, y = np.linspace(-0.07, 0.07, 29), np.linspace(-0.07, 0.07, 15)
+    truth = rays_hidden(ball, [(a, b) for b in y for a in x]).reshape(15, 29)
+    got = hidden_by(heights, 0.04, x, y)
+    assert np.abs(got - truth).mean() < 0.02
+    assert np.abs(got - truth).max() < 0.1
+
+
+def test_beside_a_straight_edge_it_is_the_closed_form():
+    heights = np.where(centres(150)[None, :] < 0, 0.0, np.inf) * np.ones((150, 1))
+    x = np.linspace(0.01, 0.07, 25)
+    got = hidden_by(heights, 0.04, x, np.zeros(1))[0]
+    ends = 0.075 / np.sqrt(0.075**2 + 0.04**2)  # the pad is not endless, along the edge and away from it
+    away = x / np.sqrt(x**2 + 0.04**2)
+    back = (x + 0.075) / np.sqrt((x + 0.075) ** 2 + 0.04**2)
+    np.testing.assert_allclose(got, 0.5 * (back - away) * ends, atol=0.01)
+
+
+@pytest.mark.parametrize("cells", [(150, 150), (100, 120), (77, 301), (20, 20)])
+def test_hidden_sky_hardly_depends_on_the_grid(cells):
+    x, y = np.linspace(-0.07, 0.07, 15), np.linspace(-0.07, 0.07, 21)
+    got = hidden_by(box_heights(0.0, 0.03, 0.045, cells), 0.03, x, y)
+    fine = hidden_by(box_heights(0.0, 0.03, 0.045, (300, 300)), 0.03, x, y)
+    assert got.shape == (21, 15)
+    assert np.abs(got - fine).max() < 0.15
+    assert np.abs(got - fine).mean() < 0.03
+
+
+def test_nothing_hides_nothing():
+    assert not np.any(hidden_by(np.full(CELLS, np.inf), 0.1, centres(30), centres(40)))
+    # nor does what is far above, or lies wholly below
+    assert hidden_by(box_heights(0.5, 0.03, 0.03), 0.6, centres(30), centres(40)).max() < 0.01
+    assert not np.any(hidden_by(box_heights(-0.1, 0.03, 0.03), -0.05, centres(30), centres(40)))
+
+
+def test_gradients_are_finite_and_the_finite_differences():
+    room = optics.Room()
+    x, y = jnp.linspace(-0.07, 0.07, 15), jnp.linspace(-0.07, 0.07, 15)
+    heights = jnp.asarray(box_heights(0.01, 0.02, 0.03), jnp.float32)
+
+    @jax.jit
+    def mean(lift, room, tint):
+        hidden = optics.hidden_sky(heights + lift, PAD, 0.05 + lift, x, y)
+        empty = optics.empty_view(room, jnp.zeros((15, 15)), jnp.ones((15, 15)), hidden)
+        grey, up = jnp.full((15, 15, 3), 0.5), jnp.zeros((15, 15, 3)).at[..., 2].set(-1.0)
+        tinted = dataclasses.replace(room, tint=tint)
+        return jnp.mean(hidden), jnp.mean(optics.shade(tinted, grey, up, jnp.full((15, 15), lift), empty, hidden))
+
+    for k in (0, 1):
+        gradient = jax.jit(jax.grad(lambda *a, k=k: mean(*a)[k], argnums=(0, 1, 2)))
+        for lift in (0.0, 0.004):
+            for leaf in jax.tree.leaves(gradient(lift, room, room.tint)):
+                assert np.all(np.isfinite(leaf))
+        there, back = mean(0.0045, room, room.tint)[k], mean(0.0035, room, room.tint)[k]
+        assert float(gradient(0.004, room, room.tint)[0]) == pytest.approx(float(there - back) / 0.001, rel=0.02)
+    extremes = [jnp.array([0.0, 0.0, 1.0, 1.0]), jnp.array([-0.01, 0.0, 0.0, 3.0])]
+    slope = jax.grad(lambda h, z: jnp.sum(optics.shade(room, *(jnp.ones((4, 3)),) * 2, z, jnp.ones((4, 3)), h)), (0, 1))
+    assert all(np.all(np.isfinite(g)) for g in slope(*extremes))
+    milky = dataclasses.replace(room, milk=1.0)
+    assert np.all(
+        np.isfinite(optics.shade(milky, *(jnp.ones((4, 3)),) * 2, extremes[1], jnp.zeros((4, 3)), extremes[0]))
+    )

@@ -3,7 +3,16 @@
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
 from sts_jax.optics.photograph import photograph
 from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
-from sts_jax.optics.shading import Room, empty_view, sample_texture, shade, to_linear, to_srgb
+from sts_jax.optics.shading import (
+    Room,
+    empty_view,
+    hidden_sky,
+    housing,
+    sample_texture,
+    shade,
+    to_linear,
+    to_srgb,
+)
 
 __all__ = [
     "Camera",
@@ -11,6 +20,8 @@ __all__ = [
     "barycentrics",
     "empty_view",
     "full_window",
+    "hidden_sky",
+    "housing",
     "object_window",
     "photograph",
     "pixel_centres",

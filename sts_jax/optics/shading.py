@@ -1,13 +1,13 @@
-"""How the world above looks through the skin: a lit object in the haze of a translucent gel.
+"""How the world above looks through the skin: a lit object, its shadow on the skin, the haze of a translucent gel.
 
-Light is added up in linear units; `to_srgb` is the last step of an image.
+Light is added up in linear units; `to_srgb` is the last step of an image. What takes samples takes them in any shape.
 """
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sts_jax import _math
 
@@ -30,9 +30,21 @@ class Room:
     )
     # sRGB of the empty view; the original's (178, 178, 204) / 255
     background: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
-    haze: Scalar = 0.3  # m, height over the skin at which 1/e of an object's own light comes through
+    haze: Scalar = 3.0  # m, height over the skin at which 1/e of an object's own light comes through
+    milk: Scalar = 0.25  # share of the empty view that the skin scatters: of as much of the sky as shines on the place
+    # of an object's light that skin and gel let through: most of the background's tint
+    tint: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.8, 0.8, 1.0]))
+    crease: Scalar = 0.4  # share of its light that an object lacks on the skin, where it hides all of the sky
+    crease_height: Scalar = 0.015  # m, height over the skin at which 1/e of that is lacking
     vignette: Scalar = 0.1  # share of light lost at the pad's edge, as the square of the distance from the centre
-    rim: Scalar = 0.35  # brightness of what lies beyond the pad's edges, of the background's
+    rim: Scalar = 0.3  # brightness, as shown, of the housing's walls right under the pad's edge, over the pad's
+    rim_depth: Scalar = 0.03  # m, under the skin, at which the walls are 1/e as bright
+    exposure: Scalar = 1.0  # how many times longer the camera exposes for the view than for the lit skin (`expose`)
+
+
+_SKY_CELLS = 30  # about, along each side of the grid on which the sky is hidden
+_SLICES = 4  # into which an object is cut to see what it hides
+_LOWEST = 0.0015  # m, of a slice
 
 
 def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -47,7 +59,7 @@ def to_srgb(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(high, 1.055 * jnp.exp(jnp.log(jnp.where(high, linear, 1)) / 2.4) - 0.055, 12.92 * linear)
 
 
-def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "h w 2"]) -> Float[Array, "h w 3"]:
+def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
     """Bilinear look-up; u runs to the right, v = 0 is the top row, and both wrap.
 
     Args:
@@ -59,7 +71,7 @@ def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "h w 2"]) ->
     """
     size = texture.shape[0]
     if size == 1:
-        return jnp.broadcast_to(texture, (*uv.shape[:2], 3))
+        return jnp.broadcast_to(texture[0], (*uv.shape[:-1], 3))
     place = uv * size - 0.5
     low = jnp.floor(place)
     part = place - low
@@ -72,32 +84,130 @@ def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "h w 2"]) ->
     return top * (1 - py) + bottom * py
 
 
-def empty_view(room: Room, square_radius: Float[Array, "h w"], on_pad: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+def hidden_sky(
+    heights: Float[Array, "r c"],
+    size: tuple[Scalar, Scalar],
+    top: Float[Array, ""],
+    x: Float[Array, "w"],
+    y: Float[Array, "h"],
+) -> Float[Array, "h w"]:
+    """Share of the sky, weighted by the cosine, that an object hides from places of the skin.
+
+    The object is cut at a few heights z, from its lowest point to its top; a slice is what of its underside lies below
+    z. At a distance d from its edge, where that is straight, a slice hides (1 - d / sqrt(d^2 + z^2)) / 2. So with K_z,
+    which integrates that edge's derivative over each cell, along y and along x, `hidden = max_z K_z slice_z K_z^T` on
+    a grid of some 5 mm; between its cells run quadratic splines.
+
+    Args:
+        heights: of the object's underside over the gel's face (m), `inf` where there is none, on an even grid.
+        size: of that grid along x and y (m), the pad's; it is centred on the sensor's axis.
+        top: height of the object's highest point (m).
+        x: of the places, along an image's rows (m).
+        y: of the places, along its columns (m).
+
+    Returns:
+        Shares in [0, 1]; beyond the pad those of its edge.
+    """
+    blocks = [max(1, round(cells / _SKY_CELLS)) for cells in heights.shape]
+    padding = [(0, -cells % block) for cells, block in zip(heights.shape, blocks, strict=True)]
+
+    def pool(value: Float[Array, "r c"]) -> Float[Array, "a b"]:
+        value = jnp.pad(value, padding)
+        shape = (value.shape[0] // blocks[0], blocks[0], value.shape[1] // blocks[1], blocks[1])
+        return jnp.sum(value.reshape(shape), axis=(1, 3))
+
+    there = jnp.isfinite(heights)
+    count = pool(there.astype(jnp.float32))
+    height = pool(jnp.where(there, heights, 0)) / jnp.maximum(count, 1)
+    covered = count / (blocks[0] * blocks[1])
+    rows, columns = covered.shape
+    pitch_y, pitch_x = (s / n * b for s, n, b in zip(size[::-1], heights.shape, blocks, strict=True))
+
+    lowest = jnp.clip(jnp.min(heights), _LOWEST, 1)
+    highest = jnp.maximum(top, lowest)
+    hidden = jnp.zeros_like(covered)
+    for share in (k / (_SLICES - 1) for k in range(_SLICES)):
+        z = lowest ** (1 - share) * highest**share
+        part = covered * jnp.clip(2 - height / z, 0, 1) * (top > 0)
+        hidden = jnp.maximum(hidden, _cast(rows, pitch_y / z) @ part @ _cast(columns, pitch_x / z).T)
+    down = _spline(rows, (y + size[1] / 2) / pitch_y - 0.5)
+    across = _spline(columns, (x + size[0] / 2) / pitch_x - 0.5)
+    return down @ hidden @ across.T
+
+
+def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
+    """What a strip one cell wide, at a height of 1, hides from the middle of each cell."""
+    index = jnp.arange(number, dtype=jnp.float32)
+    away = (index[None, :] - index[:, None] - 0.5) * pitch
+    edge = away + pitch
+    return 0.5 * (edge / jnp.sqrt(edge * edge + 1) - away / jnp.sqrt(away * away + 1))
+
+
+def _spline(number: int, place: Float[Array, "n"]) -> Float[Array, "n m"]:
+    """Weights of so many samples, at whole numbers, at each place between them."""
+    off = jnp.abs(jnp.clip(place, 0, number - 1)[:, None] - jnp.arange(number)[None, :])
+    weights = jnp.where(off < 0.5, 0.75 - off * off, 0.5 * jnp.maximum(1.5 - off, 0) ** 2)
+    return weights / jnp.sum(weights, axis=1, keepdims=True)
+
+
+def housing(
+    room: Room,
+    on_pad: Bool[Array, "*n"],
+    places: Float[Array, "*n 2"],
+    size: tuple[Scalar, Scalar],
+    distance: Scalar,
+) -> Float[Array, "*n"]:
+    """Brightness, as shown, where rays pass by the pad and meet the housing's walls, over the pad's.
+
+    A wall stands under each edge, dark, and lit by what gets in there: `rim exp(-t / rim_depth)` at t under the skin.
+
+    Args:
+        room: its constants.
+        on_pad: whether the rays pass through the pad.
+        places: where the rays cross the plane of the gel's face (m).
+        size: of the pad along x and y (m).
+        distance: of the pinhole from that plane (m).
+
+    Returns:
+        1 on the pad.
+    """
+    beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
+    below = distance * (1 - 1 / jnp.maximum(beyond, 1))
+    return jnp.where(on_pad, 1, room.rim * jnp.exp(-below / room.rim_depth))
+
+
+def empty_view(
+    room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
+) -> Float[Array, "*n 3"]:
     """What is seen where there is no object, in linear light.
 
     Args:
         room: its constants.
         square_radius: of the place on the gel's face, from the pad's centre, over half the pad's side.
-        on_pad: 1 where the ray passes through the pad, 0 beyond it.
+        walls: from `housing`; its square is about linear.
+        hidden: from `hidden_sky`.
 
     Returns:
-        Image in linear light.
+        Linear light.
     """
-    light = (1 - room.vignette * square_radius) * (room.rim + (1 - room.rim) * on_pad)
-    return jnp.maximum(light, 0)[..., None] * to_linear(jnp.asarray(room.background))[None, None, :]
+    light = (1 - room.vignette * square_radius) * walls * walls * (1 - room.milk * hidden)
+    return jnp.maximum(light, 0)[..., None] * jnp.broadcast_to(to_linear(room.background), (*light.shape, 3))
 
 
 def shade(
     room: Room,
-    albedo: Float[Array, "h w 3"],
-    normals: Float[Array, "h w 3"],
-    heights: Float[Array, "h w"],
-    empty: Float[Array, "h w 3"],
-) -> Float[Array, "h w 3"]:
+    albedo: Float[Array, "*n 3"],
+    normals: Float[Array, "*n 3"],
+    heights: Float[Array, "*n"],
+    empty: Float[Array, "*n 3"],
+    hidden: Float[Array, "*n"],
+) -> Float[Array, "*n 3"]:
     """Colour of an object seen through the skin.
 
-    Lambert's law under ambient and directional light, `E = ambient + sum_m max(0, L_m . N) c_m`; then the skin's haze:
-    `exp(-height / haze)` of it comes through, and the empty view takes the rest.
+    Lambert's law under ambient and directional light, `E = ambient + sum_m max(0, L_m . N) c_m`, of which a share of
+    `crease hidden exp(-height / crease_height)` is lacking near the skin; then the haze: `exp(-height / haze)` of it,
+    tinted, comes through, and the empty view takes the rest; then the skin's milk: `1 - milk` of that and
+    `milk (1 - hidden)` of the sky's light.
 
     Args:
         room: its constants.
@@ -105,15 +215,21 @@ def shade(
         normals: unit.
         heights: over the gel's face (m).
         empty: from `empty_view`.
+        hidden: from `hidden_sky`, of the places of the skin that the samples are seen through.
 
     Returns:
-        Image in linear light.
+        Linear light.
     """
     directions, ambient, colors = _math.normalize(room.directions), jnp.asarray(room.ambient), room.colors
     incidence = [jnp.maximum(sum(d[k] * normals[..., k] for k in range(3)), 0) for d in directions]
-    through = jnp.exp(-jnp.maximum(heights, 0) / room.haze)
+    heights = jnp.maximum(heights, 0)
+    lit = 1 - room.shade * hidden * jnp.exp(-heights / room.gap)
+    through = jnp.exp(-heights / room.haze)
+    # `empty` is the sky's light, less what the skin does not scatter where it is hidden.
+    veil = room.milk * (1 - hidden) / (1 - room.milk * hidden)
     channels = []
     for k in range(3):
         light = ambient[k] + sum(one * color[k] for one, color in zip(incidence, colors, strict=True))
-        channels.append(through * albedo[..., k] * light + (1 - through) * empty[..., k])
+        seen = through * lit * albedo[..., k] * light + (1 - through) * empty[..., k]
+        channels.append((1 - room.milk) * seen + veil * empty[..., k])
     return jnp.stack(channels, axis=-1)

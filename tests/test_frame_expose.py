@@ -1,0 +1,144 @@
+"""The image at any light between the two streams, against a loop in NumPy float64."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sts_jax as sts
+from sts_jax import objects
+
+expose = jax.jit(sts.expose)
+SENSOR = sts.Sensor()
+
+
+def with_exposure(value):
+    return dataclasses.replace(SENSOR, room=dataclasses.replace(SENSOR.room, exposure=value))
+
+
+def noise(shape, seed=0):
+    """A frame of random images with black and white in them."""
+    rng = np.random.default_rng(seed)
+    images = rng.uniform(size=(2, *shape, 3)).astype(np.float32)
+    images[rng.uniform(size=images.shape) < 0.05] = 0
+    images[rng.uniform(size=images.shape) < 0.05] = 1
+    visual, tactile = map(jnp.asarray, images)
+    lead = shape[:-2]
+    return sts.Frame(
+        visual=visual,
+        tactile=tactile,
+        depth=jnp.zeros(shape),
+        segmentation=jnp.zeros(shape, bool),
+        pose=jnp.zeros((*lead, 7)),
+        balanced=jnp.ones(lead, bool),
+        pressure=jnp.zeros((*lead, 3, 3)),
+        window=jnp.zeros((*lead, 4)),
+    )
+
+
+def decode(s):
+    return s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4
+
+
+def encode(x):
+    return 12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055
+
+
+@pytest.mark.parametrize("exposure", [1.0, 6.0])
+@pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
+def test_the_streams_are_the_ends_to_the_last_bit(shape, exposure):
+    frame, sensor = noise(shape), with_exposure(exposure)
+    for call in (expose, sts.expose):
+        assert np.array_equal(call(sensor, frame, 0.0), frame.visual)
+        assert np.array_equal(call(sensor, frame, 1.0), frame.tactile)
+
+
+def test_the_streams_of_a_pressed_object_are_the_ends():
+    body = objects.make(jax.random.key(0), "mouse")
+    low = float(jnp.min(body.vertices[:, 2]))
+    frame = jax.jit(sts.sense)(SENSOR, body, jnp.array([0.0, 0.0, -low - 3e-4, 1.0, 0.0, 0.0, 0.0]))
+    assert np.array_equal(expose(SENSOR, frame, 0), frame.visual)
+    assert np.array_equal(expose(SENSOR, frame, 1), frame.tactile)
+    half = np.asarray(expose(SENSOR, frame, 0.5))
+    low, high = np.minimum(frame.visual, frame.tactile), np.maximum(frame.visual, frame.tactile)
+    assert np.all((half >= low - 1e-6) & (half <= high + 1e-6))
+
+
+@pytest.mark.parametrize("exposure", [1.0, 6.0])
+@pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
+def test_light_adds_up_in_linear_units(shape, exposure):
+    frame = noise(shape)
+    rng = np.random.default_rng(1)
+    for light in (1e-3, 0.2, 0.5, 0.9):
+        image = np.asarray(expose(with_exposure(exposure), frame, light))
+        for i, j, k in zip(*(rng.integers(n, size=200) for n in (*shape, 3)), strict=True):
+            seen, felt = float(frame.visual[i, j, k]), float(frame.tactile[i, j, k])
+            # seconds of exposure: `exposure` with the LEDs off, 1 at full power
+            outside, leds_on = decode(seen) / exposure, decode(felt)
+            radiance = outside + light * (leds_on - outside)
+            grey = 1 / exposure + light * (1 - 1 / exposure)  # of what shows as 1 in both streams
+            assert image[i, j, k] == pytest.approx(encode(radiance / grey), abs=2e-6)
+
+
+def test_more_light_is_more_touch_where_that_is_brighter():
+    frame = noise((64, 64))
+    images = np.stack([expose(with_exposure(3.0), frame, light) for light in np.linspace(0, 1, 9)])
+    brighter = np.asarray(frame.tactile > frame.visual)
+    assert np.all(np.diff(images, axis=0)[:, brighter] >= -1e-6)
+    assert np.all(np.diff(images, axis=0)[:, ~brighter] <= 1e-6)
+
+
+def test_gradients_are_the_finite_differences_and_finite_at_the_ends():
+    frame = noise((97, 53))
+    weights = jnp.asarray(np.random.default_rng(2).normal(size=(97, 53, 3)), jnp.float32)
+
+    def loss(light, exposure, visual):
+        shown = sts.expose(with_exposure(exposure), dataclasses.replace(frame, visual=visual), light)
+        return jnp.mean(weights * shown)
+
+    value = jax.jit(loss)
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1, 2)))
+    for light in (0.0, 0.3, 1.0):
+        for leaf in gradient(light, 4.0, frame.visual):
+            assert np.all(np.isfinite(leaf))
+    by_light, by_exposure, by_visual = gradient(0.3, 4.0, frame.visual)
+    step = 0.01
+    assert float(by_light) == pytest.approx(
+        float(value(0.3 + step, 4.0, frame.visual) - value(0.3 - step, 4.0, frame.visual)) / (2 * step), rel=0.01
+    )
+    assert float(by_exposure) == pytest.approx(
+        float(value(0.3, 4.1, frame.visual) - value(0.3, 3.9, frame.visual)) / 0.2, rel=0.01
+    )
+    inner = (frame.visual > 0.1) & (frame.visual < 0.9)
+    along = jnp.where(inner, weights, 0)
+    there, back = value(0.3, 4.0, frame.visual + 0.01 * along), value(0.3, 4.0, frame.visual - 0.01 * along)
+    assert float(jnp.sum(by_visual * along)) == pytest.approx(float(there - back) / 0.02, rel=0.01)
+    # at an end the image is the stream itself, so its derivative is 1
+    at_end = gradient(0.0, 4.0, frame.visual)[2]
+    np.testing.assert_allclose(np.asarray(at_end)[inner], np.asarray(weights / weights.size)[inner], rtol=1e-4)
+    assert float(jnp.abs(gradient(0.0, 4.0, frame.visual)[0])) > 0
+
+
+def test_vmap_over_frames_and_over_lights():
+    frames, lights = noise((3, 64, 64)), jnp.array([0.0, 0.4, 1.0])
+    both = jax.vmap(lambda frame, light: sts.expose(SENSOR, frame, light))(frames, lights)
+    for k in range(3):
+        one = jax.tree.map(lambda leaf, k=k: leaf[k], frames)
+        np.testing.assert_allclose(both[k], expose(SENSOR, one, lights[k]), atol=1e-6)
+    assert np.array_equal(both[0], frames.visual[0])
+    assert np.array_equal(both[2], frames.tactile[2])
+    np.testing.assert_allclose(sts.expose(SENSOR, frames, 0.4)[1], both[1], atol=1e-6)  # leading axes
+
+
+@pytest.mark.parametrize("light", [-0.1, 1.1, np.nan, np.float32(2), np.inf])
+def test_a_light_that_is_no_share_is_named(light):
+    with pytest.raises(ValueError, match=r"light is .*from 0 \(visual\) to 1 \(tactile\)"):
+        sts.expose(SENSOR, noise((8, 8)), light)
+
+
+def test_under_jit_it_is_clipped_and_never_nan():
+    frame = noise((64, 64))
+    for light, stream in ((-0.5, frame.visual), (np.nan, frame.visual), (1.5, frame.tactile), (np.inf, frame.tactile)):
+        assert np.array_equal(expose(SENSOR, frame, light), stream)
