@@ -184,7 +184,7 @@ def _draw(
     skin = jnp.where(hit & on_pad & pressing, jnp.clip(depth, face - gel.thickness, face), face)
     surface = jnp.concatenate([slopes * skin[..., None], (skin - face)[..., None]], axis=-1)
     skin_normals = tactile.surface_normals(jax.lax.optimization_barrier(surface))
-    light = tactile.phong(sensor.phong, sensor.lights, jax.lax.optimization_barrier(skin_normals))
+    light = tactile.phong(sensor.phong, sensor.lights, jax.lax.optimization_barrier(skin_normals), surface)
     dark = tactile.darken(sensor.phong, face - skin) * jnp.where(on_pad, 1, sensor.room.rim)
     return visual, light * dark[..., None], depth, hit
 
