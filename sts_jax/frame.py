@@ -6,12 +6,15 @@ import operator
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _math, optics, tactile
 from sts_jax._tiles import where_active
 from sts_jax.objects.body import Body
 from sts_jax.sensor import Sensor
+
+_UNTOUCHED = 1e-8  # m, an imprint that changes no picture: what the skin's coupling leaves far from a contact
 
 
 @jax.tree_util.register_dataclass
@@ -120,7 +123,7 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     Raises:
         ValueError: `light` is outside [0, 1] or not a number.
     """
-    if not isinstance(light, jax.core.Tracer) and not 0 <= float(light) <= 1:
+    if not isinstance(light, jax.core.Tracer) and not 0 <= np.asarray(light) <= 1:
         raise ValueError(f"light is {light}; it is a share of the LEDs' full power, from 0 (visual) to 1 (tactile)")
     light = jnp.asarray(light, jnp.float32)
     light = jnp.where(light >= 0, jnp.where(light <= 1, light, 1), 0)
@@ -204,11 +207,17 @@ def _draw(
     # the skin itself
     face = jnp.asarray(camera.distance)
     touched = on_pad & pressing & (depth < face)
-    skin = jnp.where(touched, jnp.maximum(depth, face - gel.thickness), face)
-    flat = tactile.phong(sensor.phong, sensor.lights, jnp.array([[[0.0, 0.0, -1.0]]]))
-    flat = [jnp.broadcast_to(flat[..., k], inner[0].shape) for k in range(3)]
-    surface = (slopes[0] * skin, slopes[1] * skin, skin - face)
-    touch = where_active(_skin, _near(touched), sensor, surface, flat, ring=1)
+    imprint = jnp.where(touched, jnp.minimum(face - depth, gel.thickness), 0)
+    coupled = sensor.skin.coupling > 0
+    imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
+    shares = tactile.shadows(sensor.skin, sensor.lights, imprint, seen) if sensor.skin.shadow_steps else ()
+    flat = jnp.stack([x[1:-1, 1:-1], y[1:-1, 1:-1], jnp.zeros_like(x[1:-1, 1:-1])], axis=-1)
+    untouched = tactile.phong(
+        sensor.phong, sensor.lights, jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape), flat
+    )
+    touch = where_active(
+        _skin, _near(imprint > _UNTOUCHED), sensor, (*slopes, imprint, *shares), _planes(untouched), ring=1
+    )
     touch = [jnp.clip(channel, 0, 1) for channel in _pixels([channel * walls[1:-1, 1:-1] for channel in touch], stride)]
     depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
     return jnp.stack(visual, axis=-1), jnp.stack(touch, axis=-1), depth
@@ -229,10 +238,13 @@ def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) 
     def inside(values: Float[Array, "f 3 k"]) -> list[Float[Array, "h w"]]:
         size = values.shape[-1]
         of_face = values.reshape(-1, 3 * size)[nearest]
-        return [sum(share * of_face[..., size * k + i] for k, share in enumerate(shares)) for i in range(size)]
+        of_corner = [[share * of_face[..., size * k + i] for k, share in enumerate(shares)] for i in range(size)]
+        return [first + second + third for first, second, third in of_corner]
 
     across = inside(body.normals)
-    normal = _math.normalize(jnp.stack([sum(turn[i, k] * across[k] for k in range(3)) for i in range(3)], axis=-1))
+    normal = _math.normalize(
+        jnp.stack([row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn], -1)
+    )
     towards = normal[..., 0] * slope_x + normal[..., 1] * slope_y + normal[..., 2]
     normal = jnp.where((body.two_sided & (towards > 0))[..., None], -normal, normal)
     albedo = jnp.stack(inside(body.colors), axis=-1)
@@ -241,10 +253,15 @@ def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) 
     return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
 
 
-def _skin(sensor: Sensor, surface: tuple[Array, Array, Array]) -> list[Array]:
-    """The lit skin, from its points with one more on each side."""
-    light = tactile.phong(sensor.phong, sensor.lights, tactile.surface_normals(surface))
-    dark = tactile.darken(sensor.phong, -surface[2][1:-1, 1:-1])
+def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Array]:
+    """The lit skin, from the rays, its imprint and the lights' shares, with one more pixel on each side."""
+    slope_x, slope_y, imprint, *shares = images
+    depth = sensor.camera.distance - imprint
+    surface = slope_x * depth, slope_y * depth, -imprint
+    points = jnp.stack([part[1:-1, 1:-1] for part in surface], axis=-1)
+    arriving = jnp.stack([share[1:-1, 1:-1] for share in shares]) if shares else None
+    light = tactile.phong(sensor.phong, sensor.lights, tactile.surface_normals(surface), points, arriving)
+    dark = tactile.darken(sensor.phong, imprint[1:-1, 1:-1])
     return [channel * dark for channel in _planes(light)]
 
 

@@ -1,13 +1,14 @@
-"""A sensor's file: whole, readable, refused with a named field."""
+"""A sensor's file: whole, readable, refused with a named field; and what no sensor can be."""
 
 import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax import Sensor
+from sts_jax import Sensor, tactile
 
 
 def test_the_defaults_are_the_papers():
@@ -18,18 +19,37 @@ def test_the_defaults_are_the_papers():
     assert (phong.specular, phong.diffuse, phong.ambient, phong.shininess) == (0.5, 1.0, 0.8, 5.0)
     assert np.tan(sensor.camera.fov / 2) == pytest.approx(0.75)
     assert sensor.camera.distance == 0.1
+    assert (sensor.skin.coupling, sensor.skin.shadow_steps) == (0, 0)
+    assert isinstance(sensor.lights, tactile.Lights)
+    sensor.check()
+    dataclasses.replace(sensor, lights=tactile.Leds()).check()
 
 
-def test_saved_and_loaded_are_equal(tmp_path):
+LEDS = tactile.Leds(
+    positions=jnp.array([[0.1, 0.0, -0.002], [0.0, 0.07, -0.0123]]),
+    colors=jnp.array([[0.1, 0.2, 0.3], [1.0, 0.0, 0.7]]),
+    falloff=1.5,
+    reference=0.0987,
+)
+
+
+@pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["Lights", "Leds"])
+def test_saved_and_loaded_are_equal(tmp_path, lights):
     sensor = Sensor()
     gel = dataclasses.replace(sensor.gel, stiffness=5e5, cells=(100, 120))
-    sensor = dataclasses.replace(sensor, gel=gel, fine_below=0)
+    skin = tactile.Skin(coupling=0.0003, shadow_steps=12, shadow_reach=0.01, penumbra=0.3)
+    sensor = dataclasses.replace(sensor, gel=gel, fine_below=0, lights=lights, skin=skin)
     sensor.save(tmp_path / "sensor.json")
     loaded = Sensor.load(tmp_path / "sensor.json")
     assert jax.tree.structure(loaded) == jax.tree.structure(sensor)
     for wrote, read in zip(jax.tree.leaves(sensor), jax.tree.leaves(loaded), strict=True):
         assert np.array_equal(wrote, read)
     assert [p.name for p in tmp_path.iterdir()] == ["sensor.json"]
+    values = json.loads((tmp_path / "sensor.json").read_text())
+    assert values["lights"]["kind"] == type(lights).__name__
+    assert values["skin"] == {"coupling": 0.0003, "shadow_steps": 12, "shadow_reach": 0.01, "penumbra": 0.3}
+    loaded.save(tmp_path / "again.json")
+    assert (tmp_path / "again.json").read_text() == (tmp_path / "sensor.json").read_text()
 
 
 def change(values, path, value):
@@ -47,18 +67,50 @@ def change(values, path, value):
     [
         ("gel.stiffness", 0),
         ("gel.stiffness", "soft"),
+        ("gel.stiffness", "3"),
+        ("gel.stiffness", True),
         ("gel.thickness", None),
         ("gel.size", [0.15]),
         ("gel.cells", [0, 150]),
         ("gel.colour", 1),
+        ("gel.max_depth", 0.006),
+        ("gel.max_tilt", 1.6),
         ("camera.distance", -0.1),
+        ("camera.distance", 0.003),
+        ("camera.near", 0.099),
         ("camera.fov", 3.5),
         ("camera", 3),
+        ("lights", []),
+        ("lights.kind", None),
+        ("lights.kind", "Lamps"),
+        ("lights.kind", ["Leds"]),
+        ("lights.positions", [[0.1, 0, -0.02]]),
         ("lights.directions", [[0, 1]]),
+        ("lights.directions", []),
         ("lights.directions", [[0, 0, float("nan")]]),
-        ("lights.directions", [[0, 0, 1.0]] * 3),
+        ("lights.directions", [[0, 0, -1.0]] * 3),
+        ("lights.directions", [[0, 0, 0]] * 4),
+        ("lights.directions", [[0, 1, 0.1]] * 4),
+        ("lights.directions", [[0, 1, 0.1], [0, 1]]),
+        ("lights.colors", [[0, 0, -0.1]] * 4),
         ("gel.cells", [0.5, 150]),
         ("phong.ambient_color", [1, 1, 1, 1]),
+        ("phong.shininess", -5),
+        ("phong.shininess", 0),
+        ("phong.specular", -0.5),
+        ("phong.darkening", 0),
+        ("skin", None),
+        ("skin.coupling", -0.001),
+        ("skin.coupling", float("inf")),
+        ("skin.shadow_steps", -1),
+        ("skin.shadow_steps", 2.5),
+        ("skin.shadow_reach", 0),
+        ("skin.penumbra", 0),
+        ("room.directions", [[0, 0, 0], [1, 0, 0], [0, 0, 1]]),
+        ("room.colors", [[0, 0, 1]]),
+        ("room.background", [0.5, 0.5, 1.1]),
+        ("room.vignette", 2),
+        ("fine_below", -1),
     ],
 )
 def test_a_bad_field_is_named(tmp_path, field, value):
@@ -72,11 +124,77 @@ def test_a_bad_field_is_named(tmp_path, field, value):
     assert str(path) in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("positions", [[0.0, 0, -0.004]]),  # over the pad, in the gel
+        ("positions", [[0.0, 0, -0.005]]),
+        ("positions", [[0.075, 0.075, 0.0]]),  # at its corner
+        ("positions", [[0.1, 0, 0.001]]),  # beside the pad, outside of the sensor
+        ("positions", [[0.0, 0, 0.1]]),
+        ("directions", [[0.0, 0, -1]]),  # unknown to Leds
+        ("falloff", -1),
+        ("falloff", [2, 2]),
+        ("reference", 0),
+        ("reference", None),
+    ],
+)
+def test_a_bad_led_is_named(tmp_path, field, value):
+    path = tmp_path / "sensor.json"
+    dataclasses.replace(Sensor(), lights=tactile.Leds(colors=jnp.ones((1, 3)), positions=LEDS.positions[:1])).save(path)
+    Sensor.load(path)
+    values = json.loads(path.read_text())
+    change(values["lights"], field, value)
+    path.write_text(json.dumps(values))
+    with pytest.raises(ValueError, match=f"lights.{field}") as error:
+        Sensor.load(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize("position", [[0.0, 0, -0.0051], [0.0751, 0, -0.001], [0, -0.2, 0], [0, 0, -0.15]])
+def test_leds_before_the_gel_beside_it_and_behind_the_pinhole_can_be(position):
+    leds = tactile.Leds(positions=jnp.array([position]), colors=jnp.ones((1, 3)))
+    dataclasses.replace(Sensor(), lights=leds).check()
+
+
+def with_field(sensor, field, value):
+    room, name = field.split(".")
+    return dataclasses.replace(sensor, **{room: dataclasses.replace(getattr(sensor, room), **{name: value})})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("camera.distance", 0.004, "gel.thickness"),
+        ("gel.thickness", 0.2, "camera.distance"),
+        ("gel.stiffness", 0.0, "above 0"),
+        ("gel.stiffness", float("nan"), "finite"),
+        ("lights.directions", jnp.zeros((4, 3)), "length"),
+        ("phong.shininess", -1.0, "above 0"),
+        ("skin.coupling", -1e-3, "below 0"),
+    ],
+)
+def test_a_check_names_field_value_and_remedy(field, value, says):
+    sensor = with_field(Sensor(), field, value)
+    with pytest.raises(ValueError, match=says) as error:
+        sensor.check()
+    assert field in str(error.value)
+    assert str(value) in str(error.value) or not isinstance(value, float)
+
+
+def test_what_cannot_be_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"field phong\.darkening"):
+        with_field(Sensor(), "phong.darkening", 0.0).save(tmp_path / "sensor.json")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_torn_or_missing_file_is_named(tmp_path):
     path = tmp_path / "sensor.json"
     with pytest.raises(FileNotFoundError, match=r"sensor\.json"):
         Sensor.load(path)
     Sensor().save(path)
-    path.write_text(path.read_text()[:200])
-    with pytest.raises(ValueError, match=r"sensor\.json is torn"):
-        Sensor.load(path)
+    text = path.read_bytes()
+    for torn in (text[:200], b"", b"\xff\xfe" + text):
+        path.write_bytes(torn)
+        with pytest.raises(ValueError, match=r"sensor\.json is torn"):
+            Sensor.load(path)

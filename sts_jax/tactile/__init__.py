@@ -1,18 +1,22 @@
-"""Touch: the gel's equilibrium, the skin's normals, lights and reflectance."""
+"""Touch: the gel's equilibrium, the skin's shape, lights, shadows and reflectance."""
 
 from sts_jax.tactile.gel import Equilibrium, Gel, cell_area, cell_centres, indent, settle
-from sts_jax.tactile.skin import Lights, Phong, darken, phong, surface_normals
+from sts_jax.tactile.skin import Leds, Lights, Phong, Skin, couple, darken, phong, shadows, surface_normals
 
 __all__ = [
     "Equilibrium",
     "Gel",
+    "Leds",
     "Lights",
     "Phong",
+    "Skin",
     "cell_area",
     "cell_centres",
+    "couple",
     "darken",
     "indent",
     "phong",
     "settle",
+    "shadows",
     "surface_normals",
 ]

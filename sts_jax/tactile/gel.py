@@ -129,11 +129,10 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
     def solve(chosen: Int[Array, "n"]) -> Float[Array, "3"]:
         cells = squares.at[chosen].get(mode="fill", fill_value=_FAR)
-        places = (squares_x[chosen % len(squares_x)], squares_y[chosen // len(squares_x) % len(squares_y)])
-        places = tuple(
-            jnp.broadcast_to(p, (len(chosen), _SIDE, _SIDE)) for p in (places[0][:, None, :], places[1][:, :, None])
-        )
-        basis = jnp.stack([jnp.ones(cells.size), places[1].reshape(-1), places[0].reshape(-1)])
+        shape = (len(chosen), _SIDE, _SIDE)
+        own_x = jnp.broadcast_to(squares_x[chosen % len(squares_x)][:, None, :], shape)
+        own_y = jnp.broadcast_to(squares_y[chosen // len(squares_x) % len(squares_y)][:, :, None], shape)
+        basis = jnp.stack([jnp.ones(cells.size), own_y.reshape(-1), own_x.reshape(-1)])
         return _newton(cells.reshape(-1), basis, target, start, bound, gel.max_depth)
 
     (few,) = jnp.nonzero(lowest < touch + gel.max_depth + _NEAR, size=min(_FEW, number), fill_value=number)
@@ -161,14 +160,10 @@ def _squares(
     height: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]
 ) -> tuple[Float[Array, "n k"], Float[Array, "a s"], Float[Array, "b s"]]:
     """Heights square by square, and the x and y of each column and row of squares; beyond the grid nothing is near."""
-    parts = []
-    for place in (x, y):
-        more = -len(place) % _SIDE
-        parts.append(jnp.pad(place, (0, more)).reshape(-1, _SIDE))
-    rows, columns = len(parts[1]), len(parts[0])
-    more = [(0, rows * _SIDE - height.shape[0]), (0, columns * _SIDE - height.shape[1])]
-    squares = jnp.pad(height, more, constant_values=_FAR).reshape(rows, _SIDE, columns, _SIDE).swapaxes(1, 2)
-    return squares.reshape(rows * columns, _SIDE * _SIDE), *parts
+    down, across = ((0, -n % _SIDE) for n in height.shape)
+    column, row = jnp.pad(x, across).reshape(-1, _SIDE), jnp.pad(y, down).reshape(-1, _SIDE)
+    squares = jnp.pad(height, (down, across), constant_values=_FAR).reshape(len(row), _SIDE, len(column), _SIDE)
+    return squares.swapaxes(1, 2).reshape(-1, _SIDE * _SIDE), column, row
 
 
 def _newton(

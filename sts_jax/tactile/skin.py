@@ -1,4 +1,4 @@
-"""The drawn skin: surface normals of a grid of points, Phong's reflectance, darkening by depth.
+"""The drawn skin: lateral coupling, surface normals, lights far and near, shadows, Phong's reflectance, darkening.
 
 Images are float32, (height, width, 3). Nothing here clips to [0, 1]: a pixel adds up its light first.
 """
@@ -12,6 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sts_jax import _math
+
+_NEAREST = 1e-4  # m, a light is never nearer than this to what it lights
+_FAINTEST = 1e-20  # cosines below it make no highlight: their power would not be a number in the gradient
+
 
 Scalar = float | Array
 
@@ -29,6 +33,35 @@ class Lights:
     colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
     )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Leds:
+    """Near lights: points that light the skin from where they are. All constants are ours."""
+
+    # m, sensor frame: 5 mm beyond the pad's left, right, top and bottom edge, 5 mm under the gel
+    positions: Float[Array, "*n m 3"] = dataclasses.field(
+        default_factory=lambda: jnp.array([[-0.08, 0, -0.01], [0.08, 0, -0.01], [0, -0.08, -0.01], [0, 0.08, -0.01]])
+    )
+    # intensity per channel at the reference distance, diffuse and specular alike
+    colors: Float[Array, "*n m 3"] = dataclasses.field(
+        default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    )
+    falloff: Scalar = 2.0  # power of the distance by which light falls off; 2: a point in the open, 0: none
+    reference: Scalar = 0.08  # m, distance at which a light has its colour
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Skin:
+    """How the skin follows what presses on it, and whether its raised parts stand in each other's light."""
+
+    coupling: Scalar = 0.0  # m, standard deviation of the Gaussian that smooths the imprint; 0 as in the paper
+    # steps along the way to each light; 0: no shadows, as in the paper
+    shadow_steps: int = dataclasses.field(default=0, metadata={"static": True})
+    shadow_reach: Scalar = 0.02  # m along the gel's face: how far a raised part's shadow is followed. Ours.
+    penumbra: Scalar = 0.1  # rad, how tall a light looks: where all of it is hidden it is dark. Ours.
 
 
 @jax.tree_util.register_dataclass
@@ -76,33 +109,166 @@ def surface_normals(
     return jnp.stack([jnp.where(away, -n, n) for n in normal], axis=-1)
 
 
-def phong(phong: Phong, lights: Lights, normals: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
+def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
+    """The imprint as a skin has it that does not follow a sharp edge: smoothed by a Gaussian.
+
+    The weights are `exp(-r^2 / (2 length^2))` at the pixels' distances r, divided by their sum over the image: a
+    uniform imprint stays what it is, at the border too. Two dense products, exact for any length.
+
+    Args:
+        depth: of the imprint (m), finite.
+        length: standard deviation (m). 0, or less than a twentieth of a pixel, gives `depth` itself.
+        pitch: of a pixel along x and y (m).
+
+    Returns:
+        Depth of the skin (m).
+    """
+
+    def band(number: int, step: Array) -> Float[Array, "a a"]:
+        sigma = jnp.maximum(length / step, 0.05)  # pixels: the next weighs exp(-200), which is 0 in float32
+        place = jnp.arange(number)
+        weights = jnp.exp(-0.5 * ((place[:, None] - place[None, :]) / sigma) ** 2)
+        return weights / jnp.sum(weights, axis=1, keepdims=True)
+
+    down, across = band(depth.shape[0], pitch[1]), band(depth.shape[1], pitch[0])
+    return jnp.linalg.multi_dot([down, depth, across.T], precision=jax.lax.Precision.HIGHEST)
+
+
+def shadows(
+    skin: Skin, lights: Lights | Leds, depth: Float[Array, "h w"], window: Float[Array, "4"]
+) -> Float[Array, "m h w"]:
+    """Share of each light that raised parts of the skin let through to each pixel.
+
+    What is pressed stands out towards the camera, into the gel that the light runs through. Along the way from a point
+    to a light, the horizon is the steepest rise to what stands there; a light as tall as `penumbra`, whose lower end
+    is at the elevation e over the gel's plane, is hidden up to it:
+
+        share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
+
+    A light in the gel's plane, as the paper's are, has e = 0. It lights a part of the skin only by its flank, and of
+    that only what stands out farther than all that stands before it; flat skin and the tops of what is pressed get
+    nothing of it, in shadow or not (L . N = 0). So such shadows are seen on flanks behind other raised parts alone.
+    They would be endless, were the light a point; the penumbra ends them where a part looks lower than it from there.
+    A flank that faces away is dark by its normal before it is in shadow.
+
+    Args:
+        skin: number of steps, how far they go, penumbra. Steps are short near the point and longer away from it
+            (`t = reach (k / steps)^2`): what is narrower than a step may cast no shadow far away.
+        lights: far or near. Nothing behind a near light is in its way.
+        depth: of the skin below the gel's face (m). What lies beyond the image casts no shadow.
+        window: what the image shows, (left, top, width, height) on the gel's face (m).
+
+    Returns:
+        Shares, 1: all of the light arrives. Light from all sides (`Phong.ambient`) has no shadow.
+    """
+    rows, columns = depth.shape
+    pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
+    lengths = skin.shadow_reach * (jnp.arange(1, skin.shadow_steps + 1) / max(skin.shadow_steps, 1)) ** 2
+    if isinstance(lights, Lights):
+        # The way to a light is the same everywhere: the whole image moves, with room for another on every side.
+        places = _math.normalize(lights.directions)
+        around = jnp.pad(depth, ((rows + 1, rows + 1), (columns + 1, columns + 1)))
+        look = functools.partial(_moved, around)
+    else:
+        places = lights.positions
+        look = functools.partial(_sampled, jnp.pad(depth, 1))
+        x = window[0] + (jnp.arange(columns) + 0.5) * pitch[0]
+        x, y = jnp.meshgrid(x, window[1] + (jnp.arange(rows) + 0.5) * pitch[1])
+
+    def share(place: Float[Array, "3"]) -> Float[Array, "h w"]:
+        if isinstance(lights, Lights):
+            ux, uy = _math.normalize(place[:2])
+            elevation, way = jnp.arctan2(-place[2], _math.norm(place[:2])), jnp.float32(jnp.inf)
+        else:
+            ux, uy, way = _unit(place[0] - x, place[1] - y)
+            elevation = jnp.arctan2(-place[2] - depth, way)
+
+        def step(horizon: Float[Array, "h w"], length: Float[Array, ""]) -> tuple[Float[Array, "h w"], None]:
+            rise = (look(ux * length / pitch[0], uy * length / pitch[1]) - depth) / length
+            return jnp.where(length < way, jnp.maximum(horizon, rise), horizon), None
+
+        horizon, _ = jax.lax.scan(step, jnp.full_like(depth, -1e3), lengths)
+        return jnp.clip(1 - (jnp.arctan(horizon) - elevation) / skin.penumbra, 0, 1)
+
+    return jnp.stack([share(place) for place in places])
+
+
+def _moved(around: Float[Array, "a b"], across: Float[Array, ""], down: Float[Array, ""]) -> Float[Array, "h w"]:
+    """Values so many pixels away from every pixel of the middle third, bilinear."""
+    rows, columns = around.shape[0] // 3, around.shape[1] // 3
+    across, down = jnp.clip(across, -columns, columns), jnp.clip(down, -rows, rows)
+    left, top = jnp.floor(across), jnp.floor(down)
+    start = (top.astype(jnp.int32) + rows + 1, left.astype(jnp.int32) + columns + 1)
+    part = jax.lax.dynamic_slice(around, start, (rows + 1, columns + 1))
+    right, low = across - left, down - top
+    part = part[:, :-1] * (1 - right) + part[:, 1:] * right
+    return part[:-1] * (1 - low) + part[1:] * low
+
+
+def _sampled(
+    padded: Float[Array, "a b"], across: Float[Array, "h w"], down: Float[Array, "h w"]
+) -> Float[Array, "h w"]:
+    """Values so many pixels away from each pixel, bilinear; the image has a border of one pixel more."""
+    rows, columns = across.shape
+    column = jnp.clip(jnp.arange(1, columns + 1)[None, :] + across, 0, columns + 1)
+    row = jnp.clip(jnp.arange(1, rows + 1)[:, None] + down, 0, rows + 1)
+    left, top = jnp.minimum(jnp.floor(column), columns), jnp.minimum(jnp.floor(row), rows)
+    right, low = column - left, row - top
+    i, j = top.astype(jnp.int32), left.astype(jnp.int32)
+    upper = padded[i, j] * (1 - right) + padded[i, j + 1] * right
+    return upper * (1 - low) + (padded[i + 1, j] * (1 - right) + padded[i + 1, j + 1] * right) * low
+
+
+def phong(
+    phong: Phong,
+    lights: Lights | Leds,
+    normals: Float[Array, "*n 3"],
+    points: Float[Array, "*n 3"],
+    shares: Float[Array, "m *n"] | None = None,
+) -> Float[Array, "*n 3"]:
     """Phong's reflection of the lights by the skin.
 
-        I = k_a i_a + sum_m (k_d (L_m . N) i_m + k_s (R_m . V)^alpha i_m),   R_m = 2 (L_m . N) N - L_m
+        I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
-    with both products clipped at 0. V is the optical axis, as for a distant viewer: a skin that lies flat is then
-    uniform, whatever its place.
+    with both products clipped at 0. V is the optical axis, as for a distant viewer: a skin that lies flat under far
+    lights is then uniform, whatever its place. A near light at p_m has L_m towards p_m and its intensity is
+    `(reference / |p_m - x|)^falloff i_m`, where no distance counts as less than 0.1 mm.
 
     Args:
         phong: the skin's constants.
-        lights: directions need not be of unit length.
+        lights: far (directions need not be of unit length) or near.
         normals: unit, towards the camera.
+        points: of the skin, sensor frame (m); far lights do not need them.
+        shares: of each light that arrives, from `shadows`; all of it if not given.
 
     Returns:
         Image, not clipped (paper, equation "phong").
     """
     nx, ny, nz = (normals[..., k] for k in range(3))
-    directions, colors = _math.normalize(lights.directions), lights.colors
-    image = [jnp.broadcast_to(jnp.asarray(phong.ambient * i, jnp.float32), nx.shape) for i in phong.ambient_color]
-    for m in range(directions.shape[0]):
-        incidence = directions[m, 0] * nx + directions[m, 1] * ny + directions[m, 2] * nz
-        towards = directions[m, 2] - 2 * incidence * nz  # R . V with V = (0, 0, -1)
-        shines = towards > 0
+    places = _math.normalize(lights.directions) if isinstance(lights, Lights) else lights.positions
+    image = [jnp.broadcast_to(jnp.asarray(phong.ambient * i, nx.dtype), nx.shape) for i in phong.ambient_color]
+    for m in range(places.shape[0]):
+        lx, ly, lz = (places[m, k] for k in range(3))
+        if isinstance(lights, Leds):
+            lx, ly, lz, distance = _unit(lx - points[..., 0], ly - points[..., 1], lz - points[..., 2])
+        incidence = lx * nx + ly * ny + lz * nz
+        towards = lz - 2 * incidence * nz  # R . V with V = (0, 0, -1)
+        shines = towards > _FAINTEST
         highlight = jnp.where(shines, jnp.exp(phong.shininess * jnp.log(jnp.where(shines, towards, 1))), 0)
         strength = phong.diffuse * jnp.maximum(incidence, 0) + phong.specular * highlight
-        image = [channel + strength * colors[m, k] for k, channel in enumerate(image)]
+        if isinstance(lights, Leds):
+            strength *= jnp.exp(lights.falloff * jnp.log(lights.reference / distance))
+        if shares is not None:
+            strength *= shares[m]
+        image = [channel + strength * lights.colors[m, k] for k, channel in enumerate(image)]
     return jnp.stack(image, axis=-1)
+
+
+def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
+    """A vector over its length, by components, and the length, which is never below `_NEAREST`."""
+    square = functools.reduce(operator.add, (p * p for p in parts))
+    length = jnp.sqrt(jnp.maximum(square, _NEAREST**2))
+    return (*(p / length for p in parts), length)
 
 
 def darken(phong: Phong, depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
