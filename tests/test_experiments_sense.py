@@ -1,0 +1,170 @@
+import dataclasses
+import re
+
+import jax
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import sts_jax as sts
+from experiments import sense
+
+TINY = (24, 32)
+
+
+@pytest.fixture
+def box(tmp_path):
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((0.04, 0.03, 0.02)).export(path)
+    return path
+
+
+def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
+    out = tmp_path / "bottle.png"
+    config = sense.Config("bottle", out=out, resolution=TINY)
+    sense.main(config)
+    lines = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"bottle: \d+ x \d+ x \d+ mm, \d+ faces", lines[0])
+    assert re.match(
+        r"on face 0 of the \d+ that it can rest on \(share [\d.]+\); [\d.]+ kg, pressed by [\d.]+ N", lines[1]
+    )
+    imprint = re.fullmatch(r"deepest imprint ([\d.]+) mm, contact area (\d+) mm2, balanced", lines[2])
+    assert imprint is not None
+    assert 0 < float(imprint[1]) < 3
+    assert int(imprint[2]) > 0
+    assert re.fullmatch(r"[\d.e-]+ s a frame of 32 x 24 \([\d.]+ s the first\)", lines[3])
+    assert lines[4] == str(out)
+
+    body, sensor = sense.read(config, "bottle"), sts.Sensor()
+    pose, wrench, _ = sense.lay(config, body)
+    frame = jax.jit(sts.sense, static_argnames="resolution")(
+        sensor, body, pose.astype(np.float32), wrench.astype(np.float32), resolution=TINY
+    )
+    picture = np.asarray(Image.open(out))
+    times, step = 5, 5 * 32 + 4  # small images are shown with larger pixels
+    assert picture.shape == (2 * (24 * times + sense.HEAD), 3 * step, 3)
+    streams = [frame.visual, sts.expose(sensor, frame, 0.5), frame.tactile]
+    for column, stream in enumerate(streams):
+        shown = picture[sense.HEAD : sense.HEAD + 120 : times, column * step : column * step + 160 : times]
+        assert np.abs(shown - np.round(255 * np.asarray(stream))).max() <= 1
+    below = picture[2 * sense.HEAD + 120 :: times]
+    seen = below[:, step : step + 160 : times, 0] > 0
+    assert np.array_equal(seen, frame.segmentation)
+    assert np.array_equal(below[:, :160:times, 0] > 30, frame.segmentation)  # depth
+    assert below[:, 2 * step :].std() > 10  # pressure
+
+
+def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
+    config = sense.Config(str(box), out=tmp_path / "box.png", resolution=TINY, mass=0.2, crop=True)
+    body, sensor = sense.read(config, str(box)), sts.Sensor()
+    frame, _, words = sense.look(config, sensor, body)
+    assert "0.2 kg, pressed by 1.96 N" in words
+    assert float(frame.pressure.sum()) * 1e-6 == pytest.approx(0.2 * sense.G, rel=0.005)
+    # its largest face, 40 x 30 mm, by p = k d
+    assert "deepest imprint 0.82 mm, contact area 1200 mm2, balanced" in words
+    assert bool(frame.balanced)
+    harder = dataclasses.replace(config, force=3.0)
+    assert float(sense.look(harder, sensor, body)[0].pressure.sum()) * 1e-6 == pytest.approx(3.0, rel=0.005)
+
+
+def test_where_it_lies_is_where_it_was_told(box):
+    config = sense.Config(str(box), mass=0.1, position=(0.02, -0.01), turn=90.0)
+    body = sense.read(config, str(box))
+
+    def corners(config):
+        pose, wrench, words = sense.lay(config, body)
+        w, x, y, z = pose[3:]
+        return Rotation.from_quat([x, y, z, w]).apply(np.asarray(body.vertices, float)) + pose[:3], wrench, words
+
+    points, wrench, _ = corners(config)
+    np.testing.assert_allclose(np.ptp(points, axis=0), [0.03, 0.04, 0.02], atol=1e-6)
+    np.testing.assert_allclose((points.min(0) + points.max(0)) / 2, [0.02, -0.01, 0.01], atol=1e-6)
+    np.testing.assert_allclose(wrench, [0, 0, 0.981, -0.01 * 0.981, -0.02 * 0.981, 0], atol=1e-5)
+
+    points, _, _ = corners(dataclasses.replace(config, rest=2, turn=0.0))
+    assert np.ptp(points[:, 2]) == pytest.approx(0.03, abs=1e-6)  # on one of the second largest pair of faces
+
+    points, wrench, words = corners(dataclasses.replace(config, tilt=(10.0, 0.0), height=0.03))
+    assert points[:, 2].min() == pytest.approx(0.03, abs=1e-6)
+    assert not np.any(wrench)
+    assert "tilted by 10 and 0 degrees" in words
+    assert "30.0 mm over the gel" in words
+    # about x, whatever the turn about the vertical
+    height = 0.02 * np.cos(np.deg2rad(10)) + 0.03 * np.sin(np.deg2rad(10))
+    assert np.ptp(corners(dataclasses.replace(config, tilt=(10.0, 0.0), turn=0.0))[0][:, 2]) == pytest.approx(height)
+
+
+def test_a_round_thing_lies_as_its_file_has_it(tmp_path):
+    path = tmp_path / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=3, radius=0.02).export(path)
+    config = sense.Config(str(path))
+    pose, _, words = sense.lay(config, sense.read(config, str(path)))
+    assert pose[2] == pytest.approx(0.02, rel=0.01)
+    assert "that it can rest on" in words
+
+
+def test_sheet_of_all_classes(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sts.objects, "CATEGORIES", ("fork", "watch"))
+    out = tmp_path / "classes.png"
+    sense.main(sense.Config("classes", out=out, resolution=TINY))
+    picture = np.asarray(Image.open(out))
+    assert picture.shape == (sense.SHEET[0] + sense.HEAD, 6 * (sense.SHEET[1] + 4), 3)
+    text = capsys.readouterr().out
+    assert text.count("deepest imprint") == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["classes.png"]
+
+
+def test_a_sensor_of_a_file_is_used(box, tmp_path):
+    path = tmp_path / "soft.json"
+    sensor = sts.Sensor()
+    dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, stiffness=1e6)).save(path)
+    sense.main(sense.Config(str(box), out=tmp_path / "a.png", resolution=TINY, mass=0.1, sensor=path))
+    soft = sense.look(
+        sense.Config(str(box), resolution=TINY, mass=0.1),
+        sts.Sensor.load(path),
+        sense.read(sense.Config(str(box), mass=0.1), str(box)),
+    )[2]
+    assert "deepest imprint 0.82 mm" in soft
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mesh": "teapot"}, "teapot: no such file, nor one of the classes bottle, camera"),
+        ({"mesh": "teapot.obj"}, r"teapot\.obj: no such mesh file"),
+        ({"resolution": (0, 64)}, r"resolution is \(0, 64\).*at least 1 pixel"),
+        ({"mass": 0.0}, "mass is 0.0: give one above 0"),
+        ({"mass": np.nan}, "mass is nan: give finite"),
+        ({"force": -1.0}, "force is -1.0: give one above 0, or 0"),
+        ({"position": (0.0, np.inf)}, "position is .*finite"),
+        ({"light": 1.5}, "light is 1.5"),
+        ({"rest": 99}, r"rest is 99: it rests on \d+ faces, give 0 to"),
+        ({"mesh": "bottle", "longest_side": 0.1}, "longest_side is of a mesh file, and bottle is a class"),
+        ({"longest_side": 0.2}, "longest_side is 0.2 m, the pad is 0.15 m wide"),
+        ({"scale": 100.0}, r"longest side is 4 m, the pad is 0.15 m wide: give longest_side"),
+        ({"out": "nowhere/a.png"}, "nowhere: no such folder"),
+        ({"sensor": "none.json"}, r"none\.json"),
+    ],
+)
+def test_what_cannot_be_shown_is_named(box, tmp_path, monkeypatch, changes, message):
+    monkeypatch.chdir(tmp_path)
+    changes = {"mesh": str(box), "out": tmp_path / "a.png", "resolution": TINY} | changes
+    config = sense.Config(**{**changes, "out": sense.Path(changes["out"])})
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        sense.main(config)
+    assert not (tmp_path / "a.png").exists()
+
+
+def test_meshes_that_are_broken_or_too_many_faces(tmp_path):
+    bad = trimesh.creation.box((0.04, 0.03, 0.02))
+    bad.vertices[3] = np.nan
+    (tmp_path / "nan.obj").write_text(trimesh.exchange.obj.export_obj(bad))
+    with pytest.raises(ValueError, match=r"nan\.obj.*NaN"):
+        sense.main(sense.Config(str(tmp_path / "nan.obj"), out=tmp_path / "a.png"))
+    record = np.zeros(1_000_000, [("numbers", "<f4", 12), ("attribute", "<u2")])
+    record["numbers"][:, 3:] = np.random.default_rng(0).uniform(0, 0.1, (1_000_000, 9))
+    (tmp_path / "many.stl").write_bytes(bytes(80) + np.uint32(1_000_000).tobytes() + record.tobytes())
+    with pytest.raises(ValueError, match=r"many\.stl: 1,000,000 faces, at most 131,072 can be drawn: give faces="):
+        sense.main(sense.Config(str(tmp_path / "many.stl"), out=tmp_path / "a.png"))

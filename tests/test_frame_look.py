@@ -1,0 +1,119 @@
+"""What a picture through the skin looks like: shadow, housing, texture."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from optics_bodies import body_mesh, from_trimesh, public_meshes
+from PIL import Image
+
+import sts_jax as sts
+from sts_jax import objects
+
+SENSOR = sts.Sensor()
+sense = jax.jit(sts.sense, static_argnames=("resolution", "crop"))
+
+
+def with_room(**changes):
+    return dataclasses.replace(SENSOR, room=dataclasses.replace(SENSOR.room, **changes))
+
+
+def at(x, y, z):
+    return jnp.array([x, y, z, 1.0, 0, 0, 0], jnp.float32)
+
+
+@pytest.mark.parametrize("resolution", [(64, 64), (97, 53), (200, 200)])
+def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
+    body = from_trimesh(trimesh.creation.cylinder(radius=0.015, height=0.06))
+    empty = np.asarray(sense(SENSOR, body, at(0, 0, -1.0), resolution=resolution).visual)
+    there = sense(SENSOR, body, at(0, 0, 0.03), resolution=resolution)
+    share = np.asarray(there.visual).mean(-1) / empty.mean(-1)
+    height, width = resolution
+    left, top, wide, tall = np.asarray(there.window)
+    x = left + (np.arange(width) + 0.5) / width * wide
+    y = top + (np.arange(height) + 0.5) / height * tall
+    away = np.hypot(x[None, :], y[:, None])
+    # a bystander's wall hides nearly half of the sky; 3 % as shown is some 7 % of the light
+    ring = (away > 0.016) & (away < 0.02) & ~np.asarray(there.segmentation)
+    if ring.any():
+        assert 0.9 < share[ring].mean() < 0.97
+    assert np.all(share[(away > 0.06) & ~np.asarray(there.segmentation)] > 0.985)
+    in_air = np.asarray(sense(SENSOR, body, at(0, 0, 0.13), resolution=resolution).visual).mean(-1) / empty.mean(-1)
+    assert in_air[(away > 0.03) & (away < 0.035)].min() > 0.96
+
+
+def test_beyond_the_pad_there_is_a_dark_housing_whatever_lies_there():
+    body = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.03)), color=(0.9, 0.9, 0.1))
+    gone = sense(SENSOR, body, at(0, 0, -1.0), resolution=(96, 128))
+    over = sense(SENSOR, body, at(0.07, 0, 0.015), resolution=(96, 128))
+    beyond = np.abs(0.2 * ((np.arange(128) + 0.5) / 128 - 0.5)) > 0.076
+    assert beyond.sum() == 30
+    assert np.asarray(over.segmentation)[:, beyond].any()  # geometry: what no housing hides
+    for stream in ("visual", "tactile"):
+        image = np.asarray(getattr(gone, stream))
+        # no more than a shadow of what overhangs
+        np.testing.assert_allclose(np.asarray(getattr(over, stream))[:, beyond], image[:, beyond], atol=0.01)
+        assert image[:, beyond].max() < 0.35 * image[:, 64].max()
+        inwards = image[48, :15].mean(-1)
+        assert np.all(np.diff(inwards) > 0)  # brightest right under the pad's edge
+
+
+def test_objects_stand_out_as_they_did_without_shadow_milk_and_tint():
+    plain = with_room(milk=0.0, crease=0.0, haze=0.3, tint=jnp.ones(3))
+    empty = np.asarray(sense(SENSOR, objects.make(jax.random.key(0), "fork"), at(0, 0, -1.0)).visual)
+    for height, least in ((0.0, 1.0), (0.05, 0.9)):
+        apart = []
+        for category in objects.CATEGORIES:
+            body = objects.make(jax.random.key(1), category)
+            low = float(jnp.min(body.vertices[:, 2]))
+            row = []
+            for sensor in (SENSOR, plain):
+                frame = sense(sensor, body, at(0, 0, height - low), jnp.zeros(6))
+                seen = np.asarray(frame.segmentation)
+                row.append(np.abs(np.asarray(frame.visual) - empty)[seen].mean())
+            apart.append(row)
+        ours, before = np.mean(apart, axis=0)
+        assert ours > least * before
+
+
+def test_a_public_texture_is_where_rays_find_it():
+    meshes = public_meshes()
+    body = objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
+    raw = trimesh.load_scene(meshes / "potion.obj", process=False).to_geometry()
+    sheet = np.asarray(Image.open(meshes / "potion.png").convert("RGB")) / 255
+    # nothing but albedo
+    bare = with_room(milk=0.0, crease=0.0, haze=1e6, tint=jnp.ones(3), ambient=jnp.ones(3), colors=jnp.zeros((3, 3)))
+    turn = np.array([np.cos(0.6), np.sin(0.6), 0.0, 0.0])
+    pose = jnp.asarray([0.0, 0.0, 0.05, *turn], jnp.float32)
+    size = (240, 240)
+    frame = sense(bare, body, pose, jnp.zeros(6), resolution=size, crop=True)
+
+    mesh = body_mesh(body, frame.pose)
+    assert len(mesh.faces) == len(raw.faces)
+    scene = EmbreeScene()
+    towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, SENSOR.camera.distance]) < 0
+    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles[towards], np.float32))
+    left, top, width, height = np.asarray(frame.window)
+    x = left + (np.arange(size[1]) + 0.5) / size[1] * width
+    y = top + (np.arange(size[0]) + 0.5) / size[0] * height
+    slopes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2) / SENSOR.camera.distance
+    rays = np.concatenate([slopes, np.ones((len(slopes), 1))], -1).astype(np.float32)
+    origins = np.tile(np.float32([[0, 0, -SENSOR.camera.distance]]), (len(rays), 1))
+    hit = scene.run(origins, rays, output=1)
+    seen = hit["primID"] >= 0
+    face = np.flatnonzero(towards)[hit["primID"][seen]]
+    u, v = hit["u"][seen], hit["v"][seen]
+    corners = np.asarray(raw.visual.uv)[np.asarray(raw.faces)[face]]
+    place = np.einsum("nk,nkc->nc", np.stack([1 - u - v, u, v], -1), corners)
+    column = np.clip((place[:, 0] % 1 * sheet.shape[1]).astype(int), 0, sheet.shape[1] - 1)
+    row = np.clip(((1 - place[:, 1] % 1) * sheet.shape[0]).astype(int), 0, sheet.shape[0] - 1)
+    shown = np.asarray(frame.visual).reshape(-1, 3)[seen]
+    assert seen.mean() > 0.2
+    error = np.abs(shown - sheet[row, column]).max(-1)
+    assert np.median(error) < 0.02  # between texels, and at seams, they differ
+    assert np.quantile(error, 0.9) < 0.15
