@@ -350,7 +350,7 @@ def test_gradients_are_those_of_finite_differences(lights, depth):
 
             def moved(sign, index=index, change=step * direction):
                 return drawing(
-                    structure.unflatten([v + sign * change * (k == index) for k, v in enumerate(leaves)]), weights
+                    structure.unflatten([v + sign * change if k == index else v for k, v in enumerate(leaves)]), weights
                 )
 
             numeric = float(moved(1) - moved(-1)) / (2 * step)
