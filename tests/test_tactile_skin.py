@@ -339,6 +339,9 @@ def test_gradients_are_those_of_finite_differences(lights, depth):
         if isinstance(lights, tactile.Lights):
             tilted = start["lights"].directions + jnp.array([[0.05, 0.02, -0.1]])
             start["lights"] = dataclasses.replace(start["lights"], directions=tilted)
+        else:
+            under = start["lights"].positions - jnp.array([[0.0, 0, 0.002]])
+            start["lights"] = dataclasses.replace(start["lights"], positions=under)
         weights = jax.random.normal(jax.random.key(0), (*shape, 3), jnp.float64)
         gradient = differentiated(start, weights)[1]
         assert all(jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient))
