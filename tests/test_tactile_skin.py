@@ -345,6 +345,9 @@ def test_gradients_are_those_of_finite_differences(lights, depth):
         if isinstance(lights, tactile.Lights):
             tilted = start["lights"].directions + jnp.array([[0.05, 0.02, -0.1]])
             start["lights"] = dataclasses.replace(start["lights"], directions=tilted)
+        else:
+            under = start["lights"].positions - jnp.array([[0.0, 0, 0.002]])
+            start["lights"] = dataclasses.replace(start["lights"], positions=under)
         weights = jax.random.normal(jax.random.key(0), (*shape, 3), jnp.float64)
         gradient = differentiated(start, weights)[1]
         assert all(jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(gradient))
@@ -356,7 +359,7 @@ def test_gradients_are_those_of_finite_differences(lights, depth):
 
             def moved(sign, index=index, change=step * direction):
                 return drawing(
-                    structure.unflatten([v + sign * change * (k == index) for k, v in enumerate(leaves)]), weights
+                    structure.unflatten([v + sign * change if k == index else v for k, v in enumerate(leaves)]), weights
                 )
 
             numeric = float(moved(1) - moved(-1)) / (2 * step)

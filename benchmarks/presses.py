@@ -1,0 +1,264 @@
+"""Our shader held against real presses of a ball on a GelSight.
+
+    python -m benchmarks.presses
+
+The wheel of `taxim` 1.4.1 (MIT) carries 48 pictures (480x640, 0.0295 mm a pixel) of a ball of radius 2 mm pressed into
+a GelSight, its background, and each contact's centre and radius, so that the skin's normals there are a sphere's. On
+36 of them `tactile.phong` is fitted; every fourth is held out. A picture is
+
+    background (1 + phong(pressed) - phong(flat))
+
+so that the flat sensor is the background, and what the press changes goes with how bright it is there; all in
+the camera's own values over 255. Lights are chosen from rings of candidates around the picture by non-negative least
+squares; then places, colours, the LEDs' fall-off, specular share and shininess follow the gradient. Printed: the peak
+signal-to-noise ratio within 0.92 of the contacts' radii, of all pixels of all held-out presses together, for the
+background alone, far lights and LEDs. `presses.png` has the held-out presses, a column each: real, ours, and four
+times their difference on grey.
+"""
+
+import dataclasses
+import functools
+import importlib.util
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from PIL import Image
+from scipy.optimize import nnls
+
+from sts_jax import tactile
+
+PITCH = 0.0295e-3  # m a pixel (taxim/calib/gelsight/params.json)
+RADIUS = 2e-3  # m, of the ball
+TRUSTED = 0.92  # share of a contact's radius within which its normals count as known
+EVERY = 4  # of the presses is held out: the fourth, the eighth, ...
+NUMBER = 12  # of lights
+STEPS = 1500
+RATE = 0.1
+OUT = Path(__file__).parent / "results" / "presses"
+
+
+@dataclasses.dataclass(frozen=True)
+class Presses:
+    """Pictures in [0, 1] and the geometry that belongs to them."""
+
+    background: Float[np.ndarray, "h w 3"]
+    images: Float[np.ndarray, "n h w 3"]
+    centres: Float[np.ndarray, "n 2"]  # column, row (pixels)
+    radii: Float[np.ndarray, "n"]  # of the contacts (pixels)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Pixels:
+    """Some pixels of some presses, in a list."""
+
+    normals: Float[Array, "p 3"]  # of the skin, towards the camera
+    points: Float[Array, "p 3"]  # of the skin (m), the origin where the image's middle looks at
+    color: Float[Array, "p 3"]
+    background: Float[Array, "p 3"]
+
+
+def read() -> Presses:
+    """The recordings, from the installed package, which is not imported.
+
+    Raises:
+        FileNotFoundError: it is not installed.
+    """
+    spec = importlib.util.find_spec("taxim")
+    path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
+    if path is None or not path.is_file():
+        raise FileNotFoundError(
+            "the presses are in the package taxim 1.4.1: pip install -e '.[bench]' -c constraints.txt"
+        )
+    with np.load(path) as pack:
+        background, images = pack["f0"] / np.float32(255), pack["imgs"] / np.float32(255)
+        return Presses(background, images, pack["touch_center"], pack["touch_radius"].astype(np.float64))
+
+
+def held_out(number: int) -> np.ndarray:
+    """Which of so many presses are never fitted."""
+    return np.arange(number) % EVERY == EVERY - 1
+
+
+def skin_under_ball(
+    centre: Float[np.ndarray, "2"], radius: float, row: np.ndarray, column: np.ndarray, shape: tuple[int, int]
+) -> tuple[Float[np.ndarray, "p 3"], Float[np.ndarray, "p 3"]]:
+    """Normals and points of the skin where it lies on the ball.
+
+    Args:
+        centre: column and row of the contact (pixels).
+        radius: of the contact (pixels).
+        row: of the pixels asked for, within the contact.
+        column: of them.
+        shape: (height, width) of the image.
+
+    Returns:
+        Unit normals towards the camera; points (m), the contact's rim in the gel's face.
+    """
+    x, y = PITCH * (column - centre[0]), PITCH * (row - centre[1])
+    under = np.sqrt(RADIUS**2 - x**2 - y**2)
+    depth = under - np.sqrt(max(RADIUS**2 - (PITCH * radius) ** 2, 0))
+    middle = (np.array(shape) - 1) / 2
+    points = np.stack([PITCH * (column - middle[1]), PITCH * (row - middle[0]), -depth], axis=-1)
+    return np.stack([x, y, -under], axis=-1) / RADIUS, points
+
+
+def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float = TRUSTED) -> Pixels:
+    """Pixels within a share of the contacts' radii, of every so manieth row and column."""
+    shape, found = presses.background.shape[:2], []
+    rows, columns = np.meshgrid(np.arange(0, shape[0], every), np.arange(0, shape[1], every), indexing="ij")
+    for index in which:
+        centre, radius = presses.centres[index], presses.radii[index]
+        inside = np.hypot(columns - centre[0], rows - centre[1]) < within * radius
+        row, column = rows[inside], columns[inside]
+        normals, points = skin_under_ball(centre, radius, row, column, shape)
+        found.append((normals, points, presses.images[index, row, column], presses.background[row, column]))
+    return Pixels(*(jnp.asarray(np.concatenate(v), jnp.float32) for v in zip(*found, strict=True)))
+
+
+def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
+    """The library's constants, all in their range, of unknowns that have none.
+
+    Args:
+        unknowns: `place` (m, 3), mm, of which the last is the softplus inverse of how far under the gel's face; and
+            the softplus inverses of `color` (m, 3), `falloff`, `specular` and `shininess`.
+        near: LEDs; without it the places are far lights' directions and the fall-off counts for nothing.
+    """
+    positive = {k: jax.nn.softplus(v) for k, v in unknowns.items()}
+    place = jnp.concatenate([unknowns["place"][:, :2], -positive["place"][:, 2:]], axis=1)
+    constants = tactile.Phong(specular=positive["specular"], shininess=positive["shininess"])
+    if near:
+        leds = tactile.Leds(
+            positions=1e-3 * place, colors=positive["color"], falloff=positive["falloff"], reference=0.02
+        )
+        return constants, leds
+    return constants, tactile.Lights(directions=place, colors=positive["color"])
+
+
+def change(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
+    """What the press changes: the shader's picture of it less that of the flat skin."""
+    flat = jnp.broadcast_to(jnp.array([[0.0, 0, -1]]), given.normals.shape)
+    normals = jnp.stack([given.normals, flat])
+    points = jnp.stack([given.points, given.points * jnp.array([[1.0, 1, 0]])])
+    both = tactile.phong(constants, lights, normals, points)
+    return both[0] - both[1]
+
+
+def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
+    """Ours, on the real background."""
+    return given.background * (1 + change(constants, lights, given))
+
+
+def psnr(image: Array, truth: Array) -> float:
+    """dB, of values in [0, 1]."""
+    return float(-10 * np.log10(np.mean((np.asarray(image, np.float64) - np.asarray(truth, np.float64)) ** 2)))
+
+
+def _inverse(value: float | np.ndarray) -> Array:
+    """Of the softplus."""
+    return jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
+
+
+def start(given: Pixels, number: int, *, near: bool) -> dict[str, Array]:
+    """Unknowns to begin with: of candidates in rings around the picture, those that least squares makes brightest."""
+    angles = 2 * np.pi * np.arange(12) / 12
+    rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.35, 0.55, 0.8, 1.2)]
+    places = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
+    places = jnp.array(places, jnp.float32)
+    unknowns = {"falloff": _inverse(2.0), "specular": _inverse(0.5), "shininess": _inverse(3.0)}
+    white = jnp.full((1, 3), _inverse(1.0))
+    one = jax.jit(
+        lambda place: change(*shader(unknowns | {"place": place[None], "color": white}, near=near), given)[:, 0]
+    )
+    columns = np.stack([one(place) for place in places], axis=1).astype(np.float64)
+    background = np.asarray(given.background, np.float64)
+    asked = np.asarray(given.color, np.float64) - background
+
+    def colors(chosen: np.ndarray) -> np.ndarray:
+        found = [nnls(background[:, k, None] * columns[:, chosen], asked[:, k])[0] for k in range(3)]
+        return np.stack(found, axis=1)
+
+    everything = np.arange(len(places))
+    brightest = np.sort(np.argsort(-np.sum(colors(everything), axis=1))[:number])
+    color = np.maximum(colors(brightest), 1e-2)
+    return unknowns | {"place": places[brightest], "color": _inverse(color)}
+
+
+@functools.partial(jax.jit, static_argnames=("near", "steps"))
+def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int) -> dict[str, Array]:
+    """Towards the least squared error (Adam, its rate falling along a cosine)."""
+    optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
+
+    def loss(unknowns: dict[str, Array]) -> Array:
+        return jnp.mean((draw(*shader(unknowns, near=near), given) - given.color) ** 2)
+
+    def step(_: Array, carry: tuple) -> tuple:
+        unknowns, state = carry
+        updates, state = optimiser.update(jax.grad(loss)(unknowns), state)
+        return optax.apply_updates(unknowns, updates), state
+
+    return jax.lax.fori_loop(0, steps, step, (unknowns, optimiser.init(unknowns)))[0]
+
+
+def fit(
+    given: Pixels, *, near: bool, number: int = NUMBER, steps: int = STEPS
+) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
+    """The shader's constants for some pixels."""
+    unknowns = start(given, number, near=near)
+    return shader(refine(unknowns, given, near=near, steps=steps), near=near)
+
+
+def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
+    """Real, ours and their difference, one under the other, around a contact; beyond it ours is the background."""
+    given = pixels(presses, np.array([index]), within=1.0)
+    column, row = (int(v) for v in presses.centres[index])
+    shape = presses.background.shape[:2]
+    rows, columns = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
+    inside = np.hypot(columns - presses.centres[index, 0], rows - presses.centres[index, 1]) < presses.radii[index]
+    ours = presses.background.copy()
+    ours[inside] = np.clip(draw(constants, leds, given), 0, 1)
+    real = presses.images[index]
+    parts = [
+        np.pad(v, ((half, half), (half, half), (0, 0))) for v in (real, ours, np.clip(0.5 + 4 * (real - ours), 0, 1))
+    ]
+    return np.concatenate([v[row : row + 2 * half, column : column + 2 * half] for v in parts])
+
+
+def main() -> None:
+    """Fit, print, draw."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    lines: list[str] = []
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+        lines.append(line)
+
+    presses = read()
+    held = held_out(len(presses.images))
+    fitting, asked = pixels(presses, np.flatnonzero(~held), every=8), pixels(presses, np.flatnonzero(held))
+    say(f"fitted: {np.sum(~held)} presses, {len(fitting.color)} pixels; held out: {np.sum(held)}, {len(asked.color)}")
+    say(f"background alone: held out {psnr(asked.background, asked.color):.1f} dB")
+    for name, near in ((f"{NUMBER} far lights", False), (f"{NUMBER} LEDs", True)):
+        began = time.perf_counter()
+        fitted = fit(fitting, near=near)
+        own, other = (psnr(draw(*fitted, v), v.color) for v in (fitting, asked))
+        say(f"{name}: fitted {own:.1f} dB, held out {other:.1f} dB ({time.perf_counter() - began:.0f} s)")
+    constants, leds = fitted
+    assert isinstance(leds, tactile.Leds)
+    say("LEDs: x, y, z (mm), colour at 20 mm")
+    for place, color in zip(np.asarray(leds.positions), np.asarray(leds.colors), strict=True):
+        say("".join(f"{v:8.1f}" for v in 1e3 * place) + "".join(f"{v:8.3f}" for v in color))
+    shine = float(constants.specular), float(constants.shininess)
+    say(f"fall-off {float(leds.falloff):.2f}, specular {shine[0]:.2f}, shininess {shine[1]:.1f}")
+    strip = np.concatenate([panel(presses, index, constants, leds) for index in np.flatnonzero(held)], axis=1)
+    Image.fromarray(np.round(255 * strip).astype(np.uint8)).save(OUT / "presses.png")
+    (OUT / "presses.txt").write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""The real presses: their geometry, and a short fit that beats the background."""
+
+import numpy as np
+import pytest
+
+from benchmarks import presses
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return presses.read()
+
+
+def test_a_balls_normals_are_those_of_its_surface():
+    row, column = np.array([50, 50, 90, 20, 60]), np.array([60, 100, 60, 50, 65])
+    normals, points = presses.skin_under_ball(np.array([60.0, 50.0]), 55.0, row, column, (120, 160))
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
+    np.testing.assert_allclose(normals[0], [0, 0, -1])
+    assert normals[1][0] > 0.5  # right of the middle it faces right
+    assert normals[2][1] > 0.5  # below the middle, down
+    # one centre, a radius away along the normal
+    centres = points - presses.RADIUS * normals
+    np.testing.assert_allclose(centres, np.tile(centres[:1], (5, 1)), atol=1e-9)
+    np.testing.assert_allclose(centres[0, :2], presses.PITCH * (np.array([60, 50]) - [79.5, 59.5]), atol=1e-9)
+    # the contact's rim lies in the gel's face, its middle as deep as the ball's cap is high
+    _, rim = presses.skin_under_ball(np.array([60.0, 50.0]), 55.0, np.array([50]), np.array([115]), (120, 160))
+    assert rim[0, 2] == pytest.approx(0, abs=1e-9)
+    cap = presses.RADIUS - np.sqrt(presses.RADIUS**2 - (55 * presses.PITCH) ** 2)
+    assert -points[0, 2] == pytest.approx(cap)
+
+
+def test_the_normals_are_the_differences_of_the_heights():
+    rows, columns = np.meshgrid(np.arange(30, 70), np.arange(40, 80), indexing="ij")
+    normals, points = presses.skin_under_ball(np.array([60.3, 50.7]), 60.0, rows, columns, (120, 160))
+    down, across = np.gradient(points[..., 2], presses.PITCH)
+    inner = (slice(1, -1), slice(1, -1))
+    np.testing.assert_allclose((-normals[..., 0] / normals[..., 2])[inner], across[inner], atol=1e-3)
+    np.testing.assert_allclose((-normals[..., 1] / normals[..., 2])[inner], down[inner], atol=1e-3)
+
+
+def test_every_fourth_press_is_held_out_and_the_background_alone_is_the_known_figure(recorded):
+    held = presses.held_out(len(recorded.images))
+    assert held.sum() == 12
+    asked = presses.pixels(recorded, np.flatnonzero(held))
+    assert presses.psnr(asked.background, asked.color) == pytest.approx(19.5, abs=0.1)
+
+
+@pytest.mark.parametrize("near", [True, False], ids=["LEDs", "far"])
+def test_a_short_fit_beats_the_background(recorded, near):
+    some, other = (presses.pixels(recorded, np.array(which), every=8) for which in ([4, 12, 20, 28, 36], [0, 21, 33]))
+    drawn = presses.draw(*presses.fit(some, near=near, number=4, steps=50), other)
+    assert presses.psnr(drawn, other.color) > presses.psnr(other.background, other.color) + 5
+
+
+def test_without_the_package_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(presses.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(FileNotFoundError, match="bench"):
+        presses.read()
