@@ -1,15 +1,13 @@
 """Bodies for the tests of optics, tactile and frame, straight from trimesh's primitives."""
 
-import importlib.util
-from pathlib import Path
-
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
+from benchmarks.depth import body_mesh, embree, interior, public_meshes
 from sts_jax.objects.body import FACE_CLASSES, Body
+
+__all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes"]
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
@@ -39,45 +37,3 @@ def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -
         contents_density=jnp.float32(0),
         category=jnp.int32(-1),
     )
-
-
-def body_mesh(body: Body, pose) -> trimesh.Trimesh:
-    """The body's triangles in the sensor frame, in float64."""
-    faces = np.asarray(body.faces)
-    faces = faces[np.any(faces != faces[:, :1], axis=1)]
-    turn = trimesh.transformations.quaternion_matrix(np.asarray(pose[3:], float))[:3, :3]
-    vertices = np.asarray(body.vertices, float) @ turn.T + np.asarray(pose[:3], float)
-    return trimesh.Trimesh(vertices, faces, process=False)
-
-
-def embree(mesh: trimesh.Trimesh, camera, shape: tuple[int, int]) -> np.ndarray:
-    """Depth along the optical axis of the nearest triangle that faces the camera, `inf` where there is none."""
-    towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, camera.distance]) < 0
-    scene = EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles[towards], np.float32))
-    height = 2 * camera.distance * np.tan(camera.fov / 2)
-    width = min(height * camera.aspect, height * shape[1] / shape[0])
-    height = width * shape[0] / shape[1]
-    x = (-width / 2 + (np.arange(shape[1]) + 0.5) / shape[1] * width) / camera.distance
-    y = (-height / 2 + (np.arange(shape[0]) + 0.5) / shape[0] * height) / camera.distance
-    slopes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], -1).astype(np.float32)
-    origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))
-    hit = scene.run(origins, directions, query="DISTANCE")
-    return np.where(hit < 1e3, hit, np.inf).astype(float).reshape(shape)
-
-
-def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
-    """Pixels whose 3x3 neighbourhood is all hit and spans less than `span` of depth (m)."""
-    height, width = depth.shape
-    padded = np.pad(np.where(np.isfinite(depth), depth, 1e9), 1, constant_values=1e9)
-    around = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-    return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
-
-
-def public_meshes() -> Path:
-    """miniworld's folder of meshes (Farama Foundation, Apache 2.0); its code wants a display and is not run."""
-    found = importlib.util.find_spec("miniworld")
-    assert found is not None, "the test extra is not installed: pip install -e .[test]"
-    assert found.origin is not None
-    return Path(found.origin).parent / "meshes"

@@ -167,6 +167,93 @@ def test_grids_of_1_and_half_a_millimetre_agree():
     assert float(one.pressure.max()) == pytest.approx(float(two.pressure.max()), rel=0.02)
 
 
+def odd_height(rng, x, y):
+    """The underside of one to four things of one random kind: ellipsoids, thin bars, points, plates, wedges, cones."""
+    height, kind = np.full(x.shape, np.inf), rng.integers(6)
+    for _ in range(rng.integers(1, 5)):
+        (cx, cy), turn = rng.uniform(-0.05, 0.05, 2), rng.uniform(0, np.pi)
+        u, v = (x - cx) * np.cos(turn) + (y - cy) * np.sin(turn), (y - cy) * np.cos(turn) - (x - cx) * np.sin(turn)
+        a, b, c = rng.uniform(0.005, 0.05, 3)
+        if kind == 1:
+            b = rng.uniform(0.0006, 0.003)
+        square = 1 - (u / a) ** 2 - (v / b) ** 2
+        part = {
+            0: np.where(square > 0, c - c * np.sqrt(np.maximum(square, 0)), np.inf),
+            2: np.where(np.hypot(u, v) == np.hypot(u, v).min(), 0, np.inf),
+            4: np.where((abs(u) < a) & (abs(v) < b), rng.uniform(0.1, 1.5) * abs(v), np.inf),
+            5: np.where(np.hypot(u, v) < 0.02, rng.uniform(0.2, 3) * np.hypot(u, v), np.inf),
+        }.get(int(kind), np.where((abs(u) < a) & (abs(v) < b), 0, np.inf))
+        tilt = rng.normal(size=2) * rng.choice([0, 0.005, 0.03])
+        height = np.minimum(height, part + tilt[0] * u + tilt[1] * v)
+    return height + rng.uniform(-0.003, 0.003)
+
+
+def odd_push(rng, height, x, y):
+    """A load of 0.02 to 50 N, its centre among what is lowest, at a rim of it, or some way off."""
+    low = height < height.min() + 0.001
+    share = rng.dirichlet(np.full(low.sum(), rng.choice([0.05, 1, 10])))
+    shift = rng.normal(size=2) * rng.choice([0, 0, 0, 0.002, 0.03])
+    return push(np.exp(rng.uniform(np.log(0.02), np.log(50))), share @ x[low] + shift[0], share @ y[low] + shift[1])
+
+
+def has_equilibrium(gel, height, wrench):
+    """Whether damped Newton steps in float64 come to balance, well within the gel's limits."""
+    x, y = grid(gel)
+    there = np.isfinite(height)
+    fz, mx, my = (float(w) for w in wrench[2:5])
+    h, load, lever = height[there], fz / (gel.stiffness * 0.15**2 / x.size), 0.02
+    basis = np.stack([np.ones(h.size), (y[there] - mx / fz) / lever, (x[there] + my / fz) / lever])
+
+    def energy(u):
+        return 0.5 * np.sum(np.maximum(u @ basis - h, 0) ** 2) - load * u[0]
+
+    u = np.array([h.min() + 1e-4, 0, 0])
+    for _ in range(300):
+        length = np.maximum(u @ basis - h, 0)
+        gradient = basis @ length - [load, 0, 0]
+        if np.abs(gradient).max() < 1e-6 * load:
+            tilt = np.tan(gel.max_tilt) * lever
+            return (
+                h.min() < 0.98 * gel.max_depth and length.max() < 0.98 * gel.max_depth and max(abs(u[1:])) < 0.98 * tilt
+            )
+        curvature = (basis * (length > 0)) @ basis.T
+        step = -np.linalg.solve(curvature + 1e-9 * (1 + np.trace(curvature)) * np.eye(3), gradient)
+        step *= min(1, 0.01 / np.abs(step).max())
+        while energy(u + step) > energy(u) + 1e-4 * gradient @ step and np.abs(step).max() > 1e-12:
+            step /= 2
+        u = u + step
+    return False
+
+
+def test_odd_things_under_any_load_are_balanced_or_flagged():
+    rng = np.random.default_rng(11)
+    x, y = grid()
+    area = float(tactile.cell_area(GEL))
+    possible, missed, balanced = 0, 0, 0
+    for _ in range(300):
+        height = odd_height(rng, x, y)
+        if not np.any(np.isfinite(height)):
+            continue
+        wrench = odd_push(rng, height, x, y)
+        got = settle(GEL, jnp.asarray(height, jnp.float32), wrench)
+        pressure, force = np.asarray(got.pressure, float), float(wrench[2])
+        assert np.all(np.isfinite(pressure))
+        assert pressure.min() >= 0
+        assert pressure.max() <= GEL.stiffness * GEL.max_depth * 1.001
+        assert np.abs(got.turn).max() <= np.tan(GEL.max_tilt) * 1.001
+        if got.balanced:
+            balanced += 1
+            assert pressure.sum() * area == pytest.approx(force, rel=0.0051)
+            assert (pressure * y).sum() * area == pytest.approx(float(wrench[3]), abs=0.0051 * force * 0.01)
+            assert -(pressure * x).sum() * area == pytest.approx(float(wrench[4]), abs=0.0051 * force * 0.01)
+        if has_equilibrium(GEL, height, wrench):
+            possible += 1
+            missed += not bool(got.balanced)
+    assert possible > 60
+    assert missed <= 0.02 * possible
+    assert balanced < 250
+
+
 @pytest.mark.parametrize("name", ["ball", "box pushed off its middle", "box pushed near its edge"])
 def test_gradients_are_the_finite_differences(name):
     make, wrench = CASES[name]

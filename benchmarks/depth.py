@@ -1,0 +1,217 @@
+"""Depth of whole frames against embree: ten objects in ten poses each, at four sizes.
+
+    python -m benchmarks.depth    # about two minutes on two CPU cores
+
+Prints, for each size, how many pixels of the objects are within what of embree's depth. Interior pixels are those
+whose 3x3 neighbourhood embree hits throughout, within 1 mm of depth. The objects: procedural ones, loaded ones
+(miniworld's meshes, Apache 2.0), a concave and a thin one; the poses: four that touch, with a load, three above the pad
+and three partly out of view. `tests/test_frame_depth.py` holds some of them to the limits.
+"""
+
+import dataclasses
+import importlib.util
+import tempfile
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+import sts_jax as sts
+from sts_jax import _math, objects
+
+SIZES = ((64, 64), (97, 53), (200, 200), (480, 640))
+PROCEDURAL = ("fork", "scissors", "watch", "camera")
+LOADED = ("potion", "key", "office_chair", "duckie")
+MADE = ("bowl", "sheet")
+POSES = ("touching", "above", "out of view")
+NUM_POSES = (4, 3, 3)
+
+
+class Difference(NamedTuple):
+    """How far one depth image is from embree's, in numbers of pixels."""
+
+    interior: int
+    interior_beyond_10um: int
+    interior_beyond_100um: int
+    elsewhere: int  # on the object in both images
+    elsewhere_beyond_1mm: int
+    silhouette: int  # of embree's: a 3x3 neighbourhood hit in part
+    silhouette_differs: int  # on the object in one image and not in the other
+    strays: int  # the same, where the neighbourhood is all alike
+    worst: float  # m, of the interior
+
+
+def public_meshes() -> Path:
+    """miniworld's folder of meshes (Farama Foundation, Apache 2.0); its code wants a display and is not run."""
+    found = importlib.util.find_spec("miniworld")
+    assert found is not None, "the test extra is not installed: pip install -e .[test]"
+    assert found.origin is not None
+    return Path(found.origin).parent / "meshes"
+
+
+def make(name: str) -> objects.Body:
+    """One of the objects, 50 to 130 mm long; without texture, which has no depth."""
+    if name in PROCEDURAL:
+        return objects.make(jax.random.key(5), name)
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
+        warnings.simplefilter("ignore")  # open meshes and materials that are not there
+        if name in LOADED:
+            meshes = public_meshes()
+            body = objects.load(meshes / f"{name}.obj", longest_side=0.08, up="y")
+            return dataclasses.replace(body, texture=jnp.ones((1, 1, 3)))
+        if name == "bowl":
+            profile = [(0.0, 0.0), (20, 0), (36, 12), (40, 30), (38, 30), (34, 13), (19, 2), (0, 2)]
+            mesh = trimesh.creation.revolve(np.array(profile) * 1e-3, sections=48)
+        else:  # a bent sheet without thickness
+            x, y = np.meshgrid(np.linspace(-0.04, 0.04, 17), np.linspace(-0.03, 0.03, 13))
+            k = (np.arange(12)[:, None] * 17 + np.arange(16)).ravel()
+            faces = np.concatenate([np.stack([k, k + 1, k + 18], 1), np.stack([k, k + 18, k + 17], 1)])
+            mesh = trimesh.Trimesh(np.stack([x, y, 8 * x**2 - 5 * y**2], -1).reshape(-1, 3), faces, process=False)
+        path = Path(folder) / f"{name}.ply"
+        mesh.export(path)
+        return objects.load(path, mass=0.1, hollow=False)
+
+
+def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
+    """A pose of a kind and a wrench that goes with it: 1 N under the object's middle where it touches, or none."""
+    quat = rng.normal(size=4)
+    quat /= np.linalg.norm(quat)
+    points = np.asarray(_math.transform(jnp.asarray([0, 0, 0, *quat], jnp.float32), body.vertices))
+    low = -points[:, 2].min()
+    if kind == "touching":
+        x, y, z = *rng.uniform(-0.03, 0.03, 2), low + rng.uniform(-3e-4, 0)
+    elif kind == "above":
+        x, y, z = *rng.uniform(-0.03, 0.03, 2), low + rng.uniform(0.001, 0.08)
+    else:
+        x, y = rng.permutation([rng.choice([-1, 1]) * rng.uniform(0.06, 0.09), rng.uniform(-0.05, 0.05)])
+        z = max(low + rng.uniform(-0.03, 0.02), 0.005 - points[:, 2].max())  # what lies wholly below it has fallen off
+    force = float(kind == "touching")
+    lowest = points[points[:, 2].argmin()]
+    wrench = [0, 0, force, (y + lowest[1]) * force, -(x + lowest[0]) * force, 0]
+    return jnp.asarray([x, y, z, *quat], jnp.float32), jnp.asarray(wrench, jnp.float32)
+
+
+def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
+    """So many poses of each kind, with their wrenches."""
+    rng = np.random.default_rng(seed)
+    for kind, number in zip(POSES, numbers, strict=True):
+        for _ in range(number):
+            yield places(body, rng, kind)
+
+
+def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
+    """The body's triangles in the sensor frame, in float64."""
+    faces = np.asarray(body.faces)
+    faces = faces[np.any(faces != faces[:, :1], axis=1)]
+    turn = trimesh.transformations.quaternion_matrix(np.asarray(pose[3:], float))[:3, :3]
+    vertices = np.asarray(body.vertices, float) @ turn.T + np.asarray(pose[:3], float)
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def embree(
+    mesh: trimesh.Trimesh, camera: sts.optics.Camera, shape: tuple[int, int], *, two_sided: bool = False
+) -> np.ndarray:
+    """Depth along the optical axis of the nearest triangle that faces the camera, `inf` where there is none."""
+    towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, camera.distance]) < 0
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles[towards | two_sided], np.float32))
+    height = 2 * camera.distance * np.tan(camera.fov / 2)
+    width = min(height * camera.aspect, height * shape[1] / shape[0])
+    height = width * shape[0] / shape[1]
+    x = (-width / 2 + (np.arange(shape[1]) + 0.5) / shape[1] * width) / camera.distance
+    y = (-height / 2 + (np.arange(shape[0]) + 0.5) / shape[0] * height) / camera.distance
+    slopes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], -1).astype(np.float32)
+    origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))
+    hit = scene.run(origins, directions, query="DISTANCE")
+    return np.where(hit < 1e3, hit, np.inf).astype(float).reshape(shape)
+
+
+def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
+    """Pixels whose 3x3 neighbourhood is all hit and spans less than `span` of depth (m)."""
+    around = _around(np.where(np.isfinite(depth), depth, 1e9), 1e9)
+    return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
+
+
+def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
+    """How far a depth image is from embree's."""
+    seen, hit = np.isfinite(depth), np.isfinite(truth)
+    inner = interior(truth)
+    other = hit & seen & ~inner
+    error = np.abs(np.where(hit & seen, depth, 1e9) - np.where(hit & seen, truth, 1e9))
+    error[hit != seen] = np.inf
+    around = _around(hit)
+    boundary = np.any(around, 0) & ~np.all(around, 0)
+    return Difference(
+        interior=int(inner.sum()),
+        interior_beyond_10um=int((error[inner] > 1e-5).sum()),
+        interior_beyond_100um=int((error[inner] > 1e-4).sum()),
+        elsewhere=int(other.sum()),
+        elsewhere_beyond_1mm=int((error[other] > 1e-3).sum()),
+        silhouette=int(boundary.sum()),
+        silhouette_differs=int((seen != hit).sum()),
+        strays=int(((seen != hit) & ~boundary).sum()),
+        worst=float(error[inner].max(initial=0)),
+    )
+
+
+def total(differences: Sequence[Difference]) -> Difference:
+    """Numbers of pixels added up, the worst of the interior."""
+    *counts, worst = zip(*differences, strict=True)
+    return Difference(*(sum(c) for c in counts), worst=max(worst))
+
+
+def measure(
+    names: Sequence[str], shape: tuple[int, int], numbers: Sequence[int] = NUM_POSES, *, first_seed: int = 0
+) -> dict[str, Difference]:
+    """What whole frames of objects differ from embree's depth of the balanced pose, by name."""
+    sensor = sts.Sensor()
+    sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))
+    found = {}
+    for name in names:
+        body = make(name)
+        rows = []
+        for pose, wrench in cases(body, first_seed + len(name), numbers):
+            frame = sense(body, pose, wrench)
+            two_sided = bool(body.two_sided)
+            truth = embree(body_mesh(body, frame.pose), sensor.camera, shape, two_sided=two_sided)
+            rows.append(difference(np.asarray(frame.depth, float), truth))
+        found[name] = total(rows)
+    return found
+
+
+def describe(d: Difference) -> str:
+    """One row of the table."""
+    rest = max(d.elsewhere, 1)
+    return (
+        f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "
+        f"{1e6 * d.worst:9.2f} {d.elsewhere:9} {100 * (1 - d.elsewhere_beyond_1mm / rest):8.3f} "
+        f"{d.silhouette:9} {d.silhouette_differs:8} {d.strays:7}"
+    )
+
+
+def _around(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
+    height, width = image.shape
+    fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}
+    padded = np.pad(image, 1, **fill)  # type: ignore[call-overload]
+    return np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
+
+
+def main() -> None:
+    """Print one row per size and object, and one per size."""
+    print(f"{'':28} interior  % <10 um  >100um  worst um elsewhere  % <1 mm silhouette  differs  strays")
+    for shape in SIZES:
+        found = measure(PROCEDURAL + LOADED + MADE, shape)
+        for name, d in (found | {"all": total(list(found.values()))}).items():
+            print(f"{shape[1]:4}x{shape[0]:<4} {name:17} {describe(d)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
