@@ -59,7 +59,8 @@ def _where_active(
     used = jnp.any(flags.reshape(rows, TILE, columns, TILE), axis=(1, 3)).reshape(number)
     end = jnp.sum(used)
     (order,) = jnp.nonzero(used, size=-(-number // BATCH) * BATCH, fill_value=number)
-    # The last row and column of tiles overlap those before them: a tile lies in the image.
+    # The last row and column of tiles overlap those before them, so that a tile lies in the image; what fills up the
+    # last batch is one of them, done once more.
     first_row = jnp.minimum(order // columns * TILE, height - TILE)
     first_column = jnp.minimum(order % columns * TILE, width - TILE)
 
@@ -74,7 +75,7 @@ def _where_active(
 
         parts = jax.tree.map(lambda image: windows(image, TILE + 2 * ring), images)
         values = jax.vmap(function, in_axes=(None, -1), out_axes=-1)(params, parts)
-        wanted = windows(active, TILE) & (base + jnp.arange(BATCH) < end)[None, None, :]
+        wanted = windows(active, TILE)
 
         def put(all_: Array, value: Array) -> Array:
             value = jnp.where(wanted, value, windows(all_, TILE))

@@ -200,7 +200,8 @@ def _draw(
     hidden = optics.hidden_sky(heights, gel.size, jnp.max(points[:, 2]), x[0], y[:, 0])
     empty = _planes(optics.empty_view(sensor.room, place[0] ** 2 + place[1] ** 2, walls, hidden))
     inner = tuple(image[1:-1, 1:-1] for image in (winner, depth, *centres, *slopes, hidden, *empty))
-    params = (sensor, body, corners, _math.quat_matrix(pose[3:]))
+    surface = (body.normals, body.colors, body.uv, body.texture, body.two_sided)
+    params = (sensor, surface, corners, _math.quat_matrix(pose[3:]))
     visual = where_active(_look, (winner >= 0)[1:-1, 1:-1] & on_pad[1:-1, 1:-1], params, inner, list(inner[-3:]))
     visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in _pixels(visual, stride)]
 
@@ -228,9 +229,9 @@ def _depth(corners: Float[Array, "f 9"], images: tuple[Array, Array, Array]) -> 
     return 1 / functools.reduce(operator.add, _shares(corners, *images))
 
 
-def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) -> list[Array]:
+def _look(params: tuple[Sensor, tuple[Array, ...], Array, Array], images: tuple[Array, ...]) -> list[Array]:
     """The object's colour through the skin, linear light."""
-    sensor, body, corners, turn = params
+    sensor, (normals, colors, uv, texture, two_sided), corners, turn = params
     winner, depth, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
     shares = [share * jnp.where(winner >= 0, depth, 1) for share in _shares(corners, winner, column, row)]
@@ -241,14 +242,14 @@ def _look(params: tuple[Sensor, Body, Array, Array], images: tuple[Array, ...]) 
         of_corner = [[share * of_face[..., size * k + i] for k, share in enumerate(shares)] for i in range(size)]
         return [first + second + third for first, second, third in of_corner]
 
-    across = inside(body.normals)
+    across = inside(normals)
     normal = _math.normalize(
         jnp.stack([row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn], -1)
     )
     towards = normal[..., 0] * slope_x + normal[..., 1] * slope_y + normal[..., 2]
-    normal = jnp.where((body.two_sided & (towards > 0))[..., None], -normal, normal)
-    albedo = jnp.stack(inside(body.colors), axis=-1)
-    albedo *= optics.sample_texture(body.texture, jnp.stack(inside(body.uv), axis=-1))
+    normal = jnp.where((two_sided & (towards > 0))[..., None], -normal, normal)
+    albedo = jnp.stack(inside(colors), axis=-1)
+    albedo *= optics.sample_texture(texture, jnp.stack(inside(uv), axis=-1))
     height = jnp.where(winner >= 0, depth, 1) - sensor.camera.distance
     return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
 

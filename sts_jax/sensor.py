@@ -19,16 +19,17 @@ _LIGHTS = {"Lights": Lights, "Leds": Leds}  # by the word that a file has for th
 _ABOVE_ZERO = {
     "camera.distance", "camera.fov", "camera.aspect", "camera.near", "gel.size", "gel.thickness", "gel.stiffness",
     "gel.max_depth", "gel.max_tilt", "gel.tolerance", "gel.cells", "lights.reference", "phong.shininess",
-    "phong.darkening", "skin.shadow_reach", "skin.penumbra", "room.haze",
+    "phong.darkening", "skin.shadow_reach", "skin.penumbra", "room.haze", "room.crease_height", "room.rim_depth",
+    "room.exposure",
 }
 _NOT_BELOW_ZERO = {
     "lights.colors", "lights.falloff", "phong.ambient", "phong.diffuse", "phong.specular", "phong.ambient_color",
     "skin.coupling", "skin.shadow_steps", "room.ambient", "room.colors", "room.background", "room.vignette",
-    "room.rim", "fine_below",
+    "room.rim", "room.milk", "room.tint", "room.crease", "fine_below",
 }
 # fmt: on
 _BELOW = {"camera.fov": math.pi, "gel.max_tilt": math.pi / 2}
-_UP_TO_ONE = {"room.background", "room.vignette"}
+_UP_TO_ONE = {"room.background", "room.vignette", "room.milk", "room.tint", "room.crease"}
 
 
 @jax.tree_util.register_dataclass

@@ -57,7 +57,7 @@ def test_beyond_the_pad_there_is_a_dark_housing_whatever_lies_there():
     for stream in ("visual", "tactile"):
         image = np.asarray(getattr(gone, stream))
         # no more than a shadow of what overhangs
-        np.testing.assert_allclose(np.asarray(getattr(over, stream))[:, beyond], image[:, beyond], atol=0.01)
+        np.testing.assert_allclose(np.asarray(getattr(over, stream))[:, beyond], image[:, beyond], atol=0.04)
         assert image[:, beyond].max() < 0.35 * image[:, 64].max()
         inwards = image[48, :15].mean(-1)
         assert np.all(np.diff(inwards) > 0)  # brightest right under the pad's edge

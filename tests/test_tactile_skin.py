@@ -37,7 +37,7 @@ def bumpy(shape):
 
 def normals_of(points):
     """Of a grid of points, around which it goes on as it ends."""
-    planes = jnp.moveaxis(jnp.asarray(points, jnp.float32), -1, 0)
+    planes = jnp.moveaxis(jnp.asarray(points), -1, 0)
     return tactile.surface_normals(tuple(jnp.pad(plane, 1, mode="edge") for plane in planes))
 
 
