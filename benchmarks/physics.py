@@ -202,7 +202,7 @@ def write_scaling(rows: np.ndarray, device: str, chunk: int) -> None:
     axes.set(xlabel="worlds", ylabel="steps per second", title=title)
     axes.title.set_fontsize(9)
     axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(0.02, 0.52))
     figure.savefig(RESULTS / "scaling.png", dpi=150)
 
 
