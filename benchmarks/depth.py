@@ -164,8 +164,8 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 def total(differences: Sequence[Difference]) -> Difference:
     """Numbers of pixels added up, the worst of the interior."""
-    *counts, worst = zip(*differences, strict=True)
-    return Difference(*(sum(c) for c in counts), worst=max(worst))
+    added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
+    return Difference(**added, worst=max(d.worst for d in differences))
 
 
 def measure(
@@ -200,7 +200,7 @@ def describe(d: Difference) -> str:
 def _around(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
     height, width = image.shape
     fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}
-    padded = np.pad(image, 1, **fill)  # type: ignore[call-overload]
+    padded = np.pad(image, 1, **fill)
     return np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
 
 

@@ -168,9 +168,9 @@ def start(given: Pixels, number: int, *, near: bool) -> dict[str, Array]:
     """Unknowns to begin with: of candidates in rings around the picture, those that least squares makes brightest."""
     angles = 2 * np.pi * np.arange(12) / 12
     rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.35, 0.55, 0.8, 1.2)]
-    places = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
-    places = jnp.array(places, jnp.float32)
-    unknowns = {"falloff": _inverse(2.0), "specular": _inverse(0.5), "shininess": _inverse(3.0)}
+    rows = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
+    places = jnp.array(rows, jnp.float32)
+    unknowns: dict[str, Array] = {"falloff": _inverse(2.0), "specular": _inverse(0.5), "shininess": _inverse(3.0)}
     white = jnp.full((1, 3), _inverse(1.0))
     one = jax.jit(
         lambda place: change(*shader(unknowns | {"place": place[None], "color": white}, near=near), given)[:, 0]
@@ -255,7 +255,7 @@ def main() -> None:
         say("".join(f"{v:8.1f}" for v in 1e3 * place) + "".join(f"{v:8.3f}" for v in color))
     shine = float(constants.specular), float(constants.shininess)
     say(f"fall-off {float(leds.falloff):.2f}, specular {shine[0]:.2f}, shininess {shine[1]:.1f}")
-    strip = np.concatenate([panel(presses, index, constants, leds) for index in np.flatnonzero(held)], axis=1)
+    strip = np.concatenate([panel(presses, int(index), constants, leds) for index in np.flatnonzero(held)], axis=1)
     Image.fromarray(np.round(255 * strip).astype(np.uint8)).save(OUT / "presses.png")
     (OUT / "presses.txt").write_text("\n".join(lines) + "\n")
 

@@ -249,8 +249,8 @@ def main(config: Config) -> None:
             compose(pictures, 3).save(config.out)
         else:
             small = SHEET[0] / config.resolution[0]
-            for stream, image in pictures[:3]:
-                image = Image.fromarray(np.round(255 * image).astype(np.uint8))
+            for stream, values in pictures[:3]:
+                image = Image.fromarray(np.round(255 * values).astype(np.uint8))
                 image = image.resize((round(image.width * small), SHEET[0]), Image.Resampling.BOX)
                 sheet.append((f"{name}, {stream}", np.asarray(image) / 255))
     if sheet:

@@ -261,10 +261,12 @@ def collect(
         because they did so in every draw, or could not be made; of the whole dataset.
 
     Raises:
-        ValueError: The folder holds another collection, the message names the field; or the pad does not have the
+        ValueError: The sensor cannot be (`Sensor.check`); the folder holds another collection, the message names the
+            field; or the pad does not have the
             scenario's symmetries; or no object of a shard can be simulated.
         OSError: The disk is full.
     """
+    sensor.check()
     sides = [float(side) for side in sensor.gel.size]
     quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(collection))
     if quarter_turns and sides[0] != sides[1]:
