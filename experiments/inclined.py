@@ -1,6 +1,6 @@
 """Objects laid on the tilted pad, or let go just above: from the first moment to what the sensor sees at rest.
 
-    python -m experiments.inclined                    # about 15 minutes on two CPU cores
+    python -m experiments.inclined                    # about 15 to 20 minutes on two CPU cores
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
     python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours; a GPU helps
     python -m experiments.inclined --plan             # seconds per stage, measured on a little of each; then stops
