@@ -1,63 +1,131 @@
-"""Frames per second of `sense` beside embree's depth of the same meshes and poses.
+"""Whole frames per second of `sense` beside embree's depth, and what they cost from small to large.
 
-    python -m benchmarks.sensor
+    python -m benchmarks.sensor             # about 4 minutes on two CPU cores
+    python -m benchmarks.sensor --taxim     # a minute: touch from a height map, beside taxim's renderer in JAX
+    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory; writes a plot
+    python -m benchmarks.sensor --compile   # 2 minutes: how often a hundred objects compile
 
-Both in turn, medians, and their ratio (ours over embree's): the ratio is what to compare between machines. Embree
-gives depth alone, with every ray of an image in one call and its scene built beforehand; `sense` gives the balance of
-the gel, both streams, depth and segmentation. About two minutes on two CPU cores.
+The first draws objects at rest on the pad with the wrench of their weight: the gel's balance, both streams, depth and
+segmentation, beside three ways to have embree trace the depth alone of the same faces and poses: `traced`, with
+embreex itself, every ray of an image in one call, its scene built beforehand; `built`, the same with the scene built
+anew for each pose, as a moving object needs it; `trimesh`, as one calls it from Python (`mesh.ray`). All in turn,
+medians; a ratio is embree's seconds over ours. Below it, the share of each stage in ours, and at 640x480 how many times
+quicker than the paper's code, which takes 0.40 s a frame of this size on a CPU of this kind (its own renderer and
+shader, measured by us elsewhere, without its physics).
 """
 
+import argparse
+import dataclasses
 import functools
+import json
+import resource
+import subprocess
+import sys
+import tempfile
 import time
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
+import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from sts_jax import _math, objects, optics
+from sts_jax import _math, objects, optics, tactile
 
 SIZES = ((64, 64), (200, 200), (480, 640))
+FACES = (None, 2000, 5000)  # None: as the class has them
 CATEGORIES = ("bottle", "scissors", "watch")
 POSES = 16  # of each object: resting on the pad, turned about the vertical
 REPEATS = 7
+PAPER = 0.40  # s, a frame of 640x480 of the paper's code
+COST_SIZES = ((64, 64), (120, 160), (240, 320), (480, 640), (960, 1280), (1232, 1640))
+COST_FACES = (500, 1000, 2000, 5000, 10000, 20000, 50000)
+RESULTS = Path(__file__).parent / "results" / "sensor"
+
+Inputs = tuple[jax.Array, jax.Array]
 
 
-def resting(body: objects.Body) -> tuple[jax.Array, jax.Array]:
+def finer(body: objects.Body, faces: int | None) -> objects.Body:
+    """The same surface with about so many faces: subdivided, then decimated."""
+    if faces is None:
+        return body
+    own = np.asarray(body.faces)
+    own = own[np.any(own != own[:, :1], axis=1)]
+    mesh = trimesh.Trimesh(np.asarray(body.vertices, float), own)
+    longest = mesh.extents.max()
+    while len(mesh.faces) < faces:  # the longest edges first, so that faces become alike
+        longest *= 0.8
+        mesh = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it is decimated, and may be open
+        path = Path(folder) / "finer.ply"
+        mesh.export(path)
+        return objects.load(path, faces=faces, mass=float(objects.rigid(body, 0.5, 1.0)[0]), hollow=False)
+
+
+def count(body: objects.Body) -> int:
+    """Faces that are not padding."""
+    return int(jnp.sum(jnp.any(body.faces != body.faces[:, :1], axis=1)))
+
+
+def resting(body: objects.Body, number: int = POSES) -> Inputs:
     """Poses on the pad, upright, and the wrenches that carry the weight."""
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
-    angles = jnp.linspace(0, 2 * jnp.pi, POSES, endpoint=False)
+    angles = jnp.linspace(0, 2 * jnp.pi, number, endpoint=False)
     low = jnp.min(body.vertices[body.faces.ravel(), 2])
     quats = jax.vmap(lambda a: _math.quat_from_rotvec(jnp.stack([0 * a, 0 * a, a])))(angles)
-    poses = jnp.concatenate([jnp.full((POSES, 1), 0.01), jnp.zeros((POSES, 1)), jnp.full((POSES, 1), -low), quats], 1)
-    places = jax.vmap(_math.transform)(poses, jnp.broadcast_to(com, (POSES, 3)))
+    poses = jnp.concatenate(
+        [jnp.full((number, 1), 0.01), jnp.zeros((number, 1)), jnp.full((number, 1), -low), quats], 1
+    )
+    places = jax.vmap(_math.transform)(poses, jnp.broadcast_to(com, (number, 3)))
     force = mass * 9.81
-    zero = jnp.zeros(POSES)
+    zero = jnp.zeros(number)
     return poses, jnp.stack([zero, zero, zero + force, places[:, 1] * force, -places[:, 0] * force, zero], 1)
 
 
-def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> Callable[[], object]:
-    """Depth of every pose, scenes and rays made beforehand."""
+def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, Callable[[], object]]:
+    """Depth of every pose, by name of the way to ask for it."""
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
-    scenes = []
-    for pose in poses:
-        scenes.append(EmbreeScene())
-        TriangleMesh(scenes[-1], np.asarray(_math.transform(pose, body.vertices))[faces])
+    posed = [np.asarray(_math.transform(pose, body.vertices)) for pose in poses]
     slopes = np.asarray(jnp.stack(optics.rays(camera, optics.full_window(camera, shape), shape), -1)).reshape(-1, 2)
     directions = np.concatenate([slopes, np.ones((len(slopes), 1), np.float32)], -1)
     origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))
-    return lambda: [scene.run(origins, directions, query="DISTANCE") for scene in scenes]
+
+    def scene(vertices: np.ndarray) -> EmbreeScene:
+        made = EmbreeScene()
+        TriangleMesh(made, vertices[faces])
+        return made
+
+    def trace(made: EmbreeScene) -> np.ndarray:
+        return made.run(origins, directions, query="DISTANCE")
+
+    def asked(mesh: trimesh.Trimesh) -> np.ndarray:
+        places, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+        depth = np.full(len(slopes), np.inf)
+        depth[ray] = places[:, 2] + camera.distance
+        return depth
+
+    scenes = [scene(vertices) for vertices in posed]
+    meshes = [trimesh.Trimesh(vertices, faces, process=False) for vertices in posed]
+    return {
+        "traced": lambda: [trace(made) for made in scenes],
+        "built": lambda: [trace(scene(vertices)) for vertices in posed],
+        "trimesh": lambda: [asked(mesh) for mesh in meshes],
+    }
 
 
-def median_seconds(*works: Callable[[], object]) -> list[float]:
+def median_seconds(*works: Callable[[], object], repeats: int = REPEATS) -> list[float]:
     """Median seconds of each, run in turn so that a busy machine slows all alike."""
     seconds = []
-    for _ in range(REPEATS + 1):
+    for _ in range(repeats + 1):
         row = []
         for work in works:
             start = time.perf_counter()
@@ -67,29 +135,175 @@ def median_seconds(*works: Callable[[], object]) -> list[float]:
     return [float(s) for s in np.median(seconds[1:], axis=0)]
 
 
-def frame(body: objects.Body, shape: tuple[int, int], inputs: tuple[jax.Array, jax.Array]) -> sts.Frame:
-    """One whole frame."""
-    return sts.sense(sts.Sensor(), body, *inputs, resolution=shape)
+@functools.partial(jax.jit, static_argnames=("shape", "fields", "batched"))
+def frames(
+    body: objects.Body,
+    inputs: Inputs,
+    *,
+    shape: tuple[int, int],
+    fields: tuple[str, ...] = (),
+    batched: bool = False,
+) -> object:
+    """Frames, one after the other or batched; of some fields, what the others alone need is left out."""
+
+    def asked(inputs: Inputs) -> object:
+        whole = sts.sense(sts.Sensor(), body, *inputs, resolution=shape)
+        return tuple(getattr(whole, name) for name in fields) if fields else whole
+
+    return jax.vmap(asked)(inputs) if batched else jax.lax.map(asked, inputs)
 
 
-def main() -> None:
-    """Print one row per object and size."""
-    print(f"{'object':10} {'faces':>6} {'image':>9} {'embree /s':>10} {'map /s':>8} {'vmap /s':>8} {'ratio':>6}")
+def speed() -> None:
+    """Print one row per object and size, then stages."""
+    print(
+        f"{'object':9} {'faces':>6} {'image':>9} | ours /s: map     vmap | {'embree /s: traced':>17}    built  trimesh",
+        end="",
+    )
+    print(" | ratio to traced  built trimesh")
+    stages = []
     for category in CATEGORIES:
-        body = objects.make(jax.random.key(0), category)
-        poses, wrenches = resting(body)
-        faces = int(jnp.sum(jnp.any(body.faces != body.faces[:, :1], axis=1)))
-        for shape in SIZES:
-            one = functools.partial(frame, body, shape)
-            inputs = (poses, wrenches)
-            mapped, batched = jax.jit(functools.partial(jax.lax.map, one)), jax.jit(jax.vmap(one))
-            theirs, by_map, by_vmap = median_seconds(
-                embree(body, poses, shape), functools.partial(mapped, inputs), functools.partial(batched, inputs)
-            )
-            ratio = theirs / min(by_map, by_vmap)
-            rates = f"{POSES / theirs:10.0f} {POSES / by_map:8.1f} {POSES / by_vmap:8.1f} {ratio:6.2f}"
-            print(f"{category:10} {faces:6} {shape[0]:4}x{shape[1]:<4} {rates}", flush=True)
+        for faces in FACES:
+            body = finer(objects.make(jax.random.key(0), category), faces)
+            inputs = resting(body)
+            for shape in SIZES:
+                asked = [(), ("pressure",), ("depth",), ("visual",), ("tactile",)]
+                ours = [functools.partial(frames, body, inputs, shape=shape, fields=fields) for fields in asked]
+                batched = functools.partial(frames, body, inputs, shape=shape, batched=True)
+                others = embree(body, inputs[0], shape)
+                times = median_seconds(*ours, batched, *others.values())
+                whole, gel, depth, visual, touch, by_vmap, *theirs = (seconds / POSES for seconds in times)
+                best = min(whole, by_vmap)
+                rates = f"{1 / whole:12.1f} {1 / by_vmap:8.1f} | {1 / theirs[0]:17.0f}"
+                rates += "".join(f" {1 / seconds:8.0f}" for seconds in theirs[1:])
+                ratios = f"{theirs[0] / best:15.2f} {theirs[1] / best:6.2f} {theirs[2] / best:7.2f}"
+                name = f"{category:9} {count(body):6} {shape[1]:4}x{shape[0]:<4}"
+                print(f"{name} | {rates} | {ratios}", flush=True)
+                shares = [gel, depth - gel, visual - depth, touch - depth]
+                row = " ".join(f"{100 * share / whole:9.0f}" for share in shares)
+                stages.append(
+                    f"{name} | {1e3 * whole:8.2f} ms {row}"
+                    + (f"   {PAPER / best:.1f} times the paper's" if shape == (480, 640) else "")
+                )
+    print("\nshare of each stage, %: the frame less what does without it (they need not sum to 100)")
+    print(f"{'object':9} {'faces':>6} {'image':>9} | {'frame':>11} {'gel':>9} {'depth':>9} {'vision':>9} {'touch':>9}")
+    print("\n".join(stages))
+
+
+def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: float = 1e-3) -> np.ndarray:
+    """Imprint of a ball in the middle of an image (m)."""
+    y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
+    square = radius**2 - x[None, :] ** 2 - y[:, None] ** 2
+    return np.maximum(np.sqrt(np.maximum(square, 0)) - radius + depth, 0).astype(np.float32)
+
+
+def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.ndarray:
+    """An imprint that fills the image (m)."""
+    y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
+    return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)
+
+
+def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
+    """Print how long each takes for the lit skin of a given imprint."""
+    from taxim import Taxim  # imports JAX itself, and nothing else here needs it
+
+    theirs = Taxim(backend="jax")
+    window = pitch * jnp.array([-shape[1] / 2, -shape[0] / 2, shape[1], shape[0]])
+    plain = sts.Sensor(lights=tactile.Leds())
+    smooth = dataclasses.replace(plain, skin=tactile.Skin(coupling=0.0002))
+    shadowed = dataclasses.replace(plain, skin=tactile.Skin(coupling=0.0002, shadow_steps=16))
+    print(f"touch at {shape[1]}x{shape[0]} from a height map, ms: {jax.devices()[0].device_kind}")
+    names = ("ours", "coupled", "shadows", "taxim", "shadows")
+    print(f"{'':6} " + " ".join(f"{name:>8}" for name in names) + " | taxim's over ours: coupled, shadows")
+    for name, make in (("ball", ball), ("waves", waves)):
+        imprint = jnp.asarray(make(shape, pitch))
+        height = -1e3 * imprint + jnp.where(imprint > 0, 0, 1.0)  # mm, as taxim has it
+        ours = [
+            functools.partial(jax.jit(functools.partial(sts.touch, sensor)), imprint, window)
+            for sensor in (plain, smooth, shadowed)
+        ]
+        others = [
+            functools.partial(theirs.render_direct, height, with_shadow=shadow, press_depth=1.0)
+            for shadow in (False, True)
+        ]
+        times = [1e3 * seconds for seconds in median_seconds(*ours, *others, repeats=15)]
+        row = " ".join(f"{value:8.1f}" for value in times)
+        print(f"{name:6} {row} | {times[3] / times[1]:8.2f} {times[4] / times[2]:8.2f}", flush=True)
+
+
+def one(faces: int, shape: tuple[int, int]) -> None:
+    """In a fresh process: print seconds a frame and the most memory held, as JSON."""
+    body = finer(objects.make(jax.random.key(0), "bottle"), faces)
+    poses, wrenches = resting(body, 4)
+    (seconds,) = median_seconds(lambda: frames(body, (poses, wrenches), shape=shape))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print(json.dumps({"faces": count(body), "seconds": seconds / len(poses), "bytes": peak}))
+
+
+def cost() -> None:
+    """Print and plot what a frame costs by pixel and by face, each in a process of its own."""
+
+    def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
+        command = [sys.executable, "-m", "benchmarks.sensor", "--one", str(faces), *map(str, shape)]
+        found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
+        seconds, image = found["seconds"], f"{shape[1]:5}x{shape[0]:<5}"
+        per_pixel = 1e9 * seconds / shape[0] / shape[1]
+        held = f"{found['bytes'] / 2**30:6.2f} GiB held at most"
+        print(
+            f"{found['faces']:6} faces {image} {1e3 * seconds:8.2f} ms {per_pixel:8.1f} ns a pixel {held}", flush=True
+        )
+        return found
+
+    by_size = [(shape, measured(2000, shape)) for shape in COST_SIZES]
+    by_faces = {shape: [measured(faces, shape) for faces in COST_FACES] for shape in ((64, 64), (480, 640))}
+    measured(20000, COST_SIZES[-1])
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
+    pixels = [shape[0] * shape[1] for shape, _ in by_size]
+    left.loglog(pixels, [1e9 * found["seconds"] / n for (_, found), n in zip(by_size, pixels, strict=True)], "o-")
+    left.set(xlabel="pixels", ylabel="ns a pixel", title="2,000 faces, 64x64 to 1640x1232")
+    for shape, found in by_faces.items():
+        right.loglog(
+            [f["faces"] for f in found], [1e3 * f["seconds"] for f in found], "o-", label=f"{shape[1]}x{shape[0]}"
+        )
+    right.set(xlabel="faces", ylabel="ms a frame", title="a bottle at rest")
+    right.legend()
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    figure.savefig(RESULTS / "cost.png", dpi=110)
+
+
+def compilations(number: int = 100) -> None:
+    """Print how often so many different objects compile a frame: procedural ones and public meshes."""
+    from benchmarks.depth import public_meshes
+
+    files = sorted(public_meshes().glob("*.obj"))
+    bodies = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # open meshes and materials that are not there
+        for path in files:
+            bodies.append(objects.load(path, longest_side=0.08, up="y", faces=4096))
+    for index in range(number - len(bodies)):
+        category = objects.CATEGORIES[index % len(objects.CATEGORIES)]
+        bodies.append(objects.make(jax.random.key(index), category))
+    draw = jax.jit(lambda body, pose, wrench: sts.sense(sts.Sensor(), body, pose, wrench))
+    for body in bodies:
+        poses, wrenches = resting(body, 1)
+        draw(body, poses[0], wrenches[0])
+    print(f"{len(bodies)} objects, {len(files)} of them loaded: sense compiled {draw._cache_size()} times")
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--taxim", action="store_true", help="touch from a height map, beside taxim's")
+    parser.add_argument("--cost", action="store_true", help="cost per pixel and per face, memory")
+    parser.add_argument("--compile", action="store_true", help="how often a hundred objects compile")
+    parser.add_argument("--one", type=int, nargs=3, metavar=("FACES", "HEIGHT", "WIDTH"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one:
+        one(arguments.one[0], (arguments.one[1], arguments.one[2]))
+    elif arguments.taxim:
+        beside_taxim()
+    elif arguments.cost:
+        cost()
+    elif arguments.compile:
+        compilations()
+    else:
+        speed()

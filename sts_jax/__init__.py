@@ -1,7 +1,7 @@
 """The See-Through-your-Skin sensor in JAX: simulate it, see with it, learn to predict from it."""
 
 from sts_jax import dataset, evaluation, mvae, objects, optics, physics, tactile, training
-from sts_jax.frame import Frame, expose, sense
+from sts_jax.frame import Frame, expose, sense, touch
 from sts_jax.predict import Prediction, Predictor
 from sts_jax.sensor import Sensor
 
@@ -19,5 +19,6 @@ __all__ = [
     "physics",
     "sense",
     "tactile",
+    "touch",
     "training",
 ]

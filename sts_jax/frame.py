@@ -14,6 +14,7 @@ from sts_jax._tiles import where_active
 from sts_jax.objects.body import Body
 from sts_jax.sensor import Sensor
 
+_Corners = tuple[Float[Array, "v 3"], Int[Array, "f 3"]]  # place on the screen and a third value; faces' corners
 _UNTOUCHED = 1e-8  # m, an imprint that changes no picture: what the skin's coupling leaves far from a contact
 
 
@@ -89,10 +90,10 @@ def sense(
     else:
         window = optics.full_window(sensor.camera, resolution)
 
-    visual, touch, depth = _draw(sensor, body, points, drawn, heights, present, pressing, window, resolution)
+    visual, lit, depth = _draw(sensor, body, points, drawn, heights, present, pressing, window, resolution)
     return Frame(
         visual=visual,
-        tactile=touch,
+        tactile=lit,
         depth=depth,
         segmentation=jnp.isfinite(depth),
         pose=jnp.where(finite, drawn, pose),
@@ -135,6 +136,33 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)
 
 
+def touch(
+    sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"] | None = None
+) -> Float[Array, "h w 3"]:
+    """What the camera sees of the lit skin under a given imprint, from whatever made it.
+
+    Args:
+        sensor: its camera, skin, lights and reflectance.
+        imprint: how deep the skin is pressed in at each pixel (m), 0 where nothing presses; the camera sees it along
+            its rays. Clipped to the gel's thickness; not a number is 0.
+        window: what the image shows, (left, top, width, height) on the gel's face (m); the whole view if not given.
+
+    Returns:
+        Image, in [0, 1]: `Frame.tactile` of this imprint, where images are not so small that `sense` samples finer.
+    """
+    rows, columns = imprint.shape
+    if window is None:
+        window = optics.full_window(sensor.camera, (rows, columns))
+    pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
+    seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])
+    slopes = optics.rays(sensor.camera, seen, (rows + 2, columns + 2))
+    imprint = jnp.where(imprint > 0, jnp.minimum(imprint, sensor.gel.thickness), 0)
+    lit = _lit(sensor, jnp.pad(imprint, 1, mode="edge"), seen, pitch, slopes)
+    x, y = (slope[1:-1, 1:-1] * sensor.camera.distance for slope in slopes)
+    walls = _pad(sensor, x, y)[1]
+    return jnp.stack([jnp.clip(channel * walls, 0, 1) for channel in lit], axis=-1)
+
+
 def underside(
     gel: tactile.Gel, body: Body, points: Float[Array, "v 3"], present: Bool[Array, ""]
 ) -> Float[Array, "r c"]:
@@ -157,9 +185,10 @@ def underside(
     # No part can reach the gel that is higher over first touch than depth and tilts bring it down.
     low, high = jnp.min(points[:, :2], axis=0), jnp.max(points[:, :2], axis=0)
     reach = gel.max_depth + jnp.tan(gel.max_tilt) * jnp.sum(high - low)
-    keep = present & (jnp.min(height[body.faces], axis=1) < jnp.min(height) + reach)
-    winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells)
-    corners = jnp.concatenate([places, height[:, None]], axis=1)[body.faces].reshape(-1, 9)
+    keep = jnp.broadcast_to(present, height.shape)
+    farthest = jnp.min(height) + reach
+    winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells, farthest=farthest)
+    corners = jnp.concatenate([places, height[:, None]], axis=1), body.faces
     images = (winner, *optics.pixel_centres(gel.cells))
     return where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
 
@@ -185,20 +214,18 @@ def _draw(
     seen = jnp.concatenate([window[:2] - before, pitch * jnp.array([shape[1], shape[0]], jnp.float32)])
     pixels, far = optics.to_pixels(camera, seen, shape, points)
     inverse = 1 / jnp.maximum(far, camera.near)
-    keep = present & jnp.all(far[body.faces] > camera.near, axis=1)
-    winner = optics.rasterise(pixels, -inverse, body.faces, keep, body.two_sided, shape)
-    corners = jnp.concatenate([pixels, inverse[:, None]], axis=1)[body.faces].reshape(-1, 9)
+    winner = optics.rasterise(pixels, -inverse, body.faces, present & (far > camera.near), body.two_sided, shape)
+    corners = jnp.concatenate([pixels, inverse[:, None]], axis=1), body.faces
     centres = optics.pixel_centres(shape)
     depth = where_active(_depth, winner >= 0, corners, (winner, *centres), jnp.full(shape, jnp.inf))
 
     # seen through the skin
     slopes = optics.rays(camera, seen, shape)
     x, y = (slope * camera.distance for slope in slopes)  # where the rays cross the gel's face
-    place = x * 2 / gel.size[0], y * 2 / gel.size[1]
-    on_pad = (jnp.abs(place[0]) <= 1.0001) & (jnp.abs(place[1]) <= 1.0001)  # its edge is the image's: no rounding
-    walls = optics.housing(sensor.room, on_pad, jnp.stack([x, y], axis=-1), gel.size, camera.distance)
+    on_pad, walls = _pad(sensor, x, y)
     hidden = optics.hidden_sky(heights, gel.size, jnp.max(points[:, 2]), x[0], y[:, 0])
-    empty = _planes(optics.empty_view(sensor.room, place[0] ** 2 + place[1] ** 2, walls, hidden))
+    square_radius = (x * 2 / gel.size[0]) ** 2 + (y * 2 / gel.size[1]) ** 2
+    empty = _planes(optics.empty_view(sensor.room, square_radius, walls, hidden))
     inner = tuple(image[1:-1, 1:-1] for image in (winner, depth, *centres, *slopes, hidden, *empty))
     surface = (body.normals, body.colors, body.uv, body.texture, body.two_sided)
     params = (sensor, surface, corners, _math.quat_matrix(pose[3:]))
@@ -209,27 +236,49 @@ def _draw(
     face = jnp.asarray(camera.distance)
     touched = on_pad & pressing & (depth < face)
     imprint = jnp.where(touched, jnp.minimum(face - depth, gel.thickness), 0)
+    lit = [channel * walls[1:-1, 1:-1] for channel in _lit(sensor, imprint, seen, pitch, slopes)]
+    lit = [jnp.clip(channel, 0, 1) for channel in _pixels(lit, stride)]
+    depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
+    return jnp.stack(visual, axis=-1), jnp.stack(lit, axis=-1), depth
+
+
+def _pad(
+    sensor: Sensor, x: Float[Array, "a b"], y: Float[Array, "a b"]
+) -> tuple[Bool[Array, "a b"], Float[Array, "a b"]]:
+    """Where rays pass through the pad, and how bright what lies beyond it is over the pad."""
+    width, height = sensor.gel.size
+    # Its edge is the image's: no rounding.
+    on_pad = (jnp.abs(x * 2 / width) <= 1.0001) & (jnp.abs(y * 2 / height) <= 1.0001)
+    places = jnp.stack([x, y], axis=-1)
+    return on_pad, optics.housing(sensor.room, on_pad, places, sensor.gel.size, sensor.camera.distance)
+
+
+def _lit(
+    sensor: Sensor,
+    imprint: Float[Array, "a b"],
+    window: Float[Array, "4"],
+    pitch: Float[Array, "2"],
+    slopes: tuple[Float[Array, "a b"], Float[Array, "a b"]],
+) -> list[Float[Array, "h w"]]:
+    """The lit skin on samples of an imprint, without the outermost, which are there for their neighbours' normals."""
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
-    shares = tactile.shadows(sensor.skin, sensor.lights, imprint, seen) if sensor.skin.shadow_steps else ()
-    flat = jnp.stack([x[1:-1, 1:-1], y[1:-1, 1:-1], jnp.zeros_like(x[1:-1, 1:-1])], axis=-1)
+    shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else ()
+    x, y = (slope[1:-1, 1:-1] * sensor.camera.distance for slope in slopes)
+    flat = jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
     untouched = tactile.phong(
         sensor.phong, sensor.lights, jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape), flat
     )
-    touch = where_active(
-        _skin, _near(imprint > _UNTOUCHED), sensor, (*slopes, imprint, *shares), _planes(untouched), ring=1
-    )
-    touch = [jnp.clip(channel, 0, 1) for channel in _pixels([channel * walls[1:-1, 1:-1] for channel in touch], stride)]
-    depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
-    return jnp.stack(visual, axis=-1), jnp.stack(touch, axis=-1), depth
+    pressed = _near(imprint > _UNTOUCHED)
+    return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), _planes(untouched), ring=1)
 
 
-def _depth(corners: Float[Array, "f 9"], images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
+def _depth(corners: _Corners, images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
     """Depth of the winning faces."""
     return 1 / functools.reduce(operator.add, _shares(corners, *images))
 
 
-def _look(params: tuple[Sensor, tuple[Array, ...], Array, Array], images: tuple[Array, ...]) -> list[Array]:
+def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tuple[Array, ...]) -> list[Array]:
     """The object's colour through the skin, linear light."""
     sensor, (normals, colors, uv, texture, two_sided), corners, turn = params
     winner, depth, column, row, slope_x, slope_y, hidden, *empty = images
@@ -266,18 +315,20 @@ def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Array]:
     return [channel * dark for channel in _planes(light)]
 
 
-def _height(corners: Float[Array, "f 9"], images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
+def _height(corners: _Corners, images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
     """Height of the winning faces, linear on the gel's grid."""
     return functools.reduce(operator.add, _shares(corners, *images))
 
 
 def _shares(
-    corners: Float[Array, "f 9"], winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
+    corners: _Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
     """Weight of each corner of the winning face times its third value; its first two are its place on the screen."""
-    of_face = corners[jnp.maximum(winner, 0)]
-    weights = optics.barycentrics([of_face[..., k : k + 2] for k in (0, 3, 6)], column, row)
-    return [weight * of_face[..., k] for weight, k in zip(weights, (2, 5, 8), strict=True)]
+    values, faces = corners
+    of_face = faces[jnp.maximum(winner, 0)]
+    a, b, c = (values[of_face[..., k]] for k in range(3))
+    weights = optics.barycentrics([corner[..., :2] for corner in (a, b, c)], column, row)
+    return [weight * corner[..., 2] for weight, corner in zip(weights, (a, b, c), strict=True)]
 
 
 def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array, "h w"]]:

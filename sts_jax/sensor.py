@@ -92,6 +92,10 @@ class Sensor:
                     f"-gel.thickness, {-gel.thickness!r}, or x or y beyond the pad's edge."
                 )
 
+    def constants(self) -> dict[str, Any]:
+        """Every constant in lists and numbers: what `save` writes as JSON."""
+        return _plain(self)
+
     def save(self, path: str | os.PathLike) -> None:
         """Write every constant to one JSON file, whole or not at all.
 
@@ -104,7 +108,7 @@ class Sensor:
         self.check()
         path = Path(path)
         part = path.with_name(path.name + ".part")
-        part.write_text(json.dumps(_plain(self), indent=2) + "\n")
+        part.write_text(json.dumps(self.constants(), indent=2) + "\n")
         part.replace(path)
 
     @classmethod

@@ -70,6 +70,10 @@ def test_frames_are_those_that_sense_draws(folder):
     np.testing.assert_array_equal(pairs.object, data.trajectory["body"][pairs.trajectory])
 
 
+def test_the_sensor_of_a_dataset_is_read_as_any_other(folder):
+    assert sts.Sensor.load(folder / "sensor.json").constants() == sts.Sensor().constants()
+
+
 def test_all_frames_of_the_full_ones_and_two_of_the_others(folder):
     data = dataset.load(folder)
     np.testing.assert_array_equal(data.full_trajectories(), [0])

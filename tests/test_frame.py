@@ -261,3 +261,24 @@ def test_gradients_through_the_load_are_the_finite_differences():
     by_force = (value["heavier"] - value["lighter"]) / 0.04
     assert float(gradient[0]) == pytest.approx(float(by_stiffness), rel=0.1)
     assert float(gradient[1]) == pytest.approx(float(by_force), rel=0.1)
+
+
+@pytest.mark.parametrize("crop", [False, True])
+def test_touch_of_an_imprint_is_the_frames(crop):
+    skin = sts.tactile.Skin(coupling=0.0004, shadow_steps=8)
+    sensor = sts.Sensor(lights=sts.tactile.Leds(), skin=skin)
+    body = objects.make(jax.random.key(3), "watch")
+    low = float(jnp.min(body.vertices[:, 2]))
+    pose = jnp.array([0.01, -0.02, -low - 0.0006, 1, 0, 0, 0])
+    frame = jax.jit(lambda pose: sts.sense(sensor, body, pose, resolution=(150, 200), crop=crop))(pose)
+    imprint = jnp.maximum(sensor.camera.distance - frame.depth, 0)
+    drawn = jax.jit(lambda imprint, window: sts.touch(sensor, imprint, window))(imprint, frame.window)
+    inner = np.s_[2:-2, 2:-2]  # a frame knows what lies beyond its border
+    np.testing.assert_allclose(np.asarray(drawn)[inner], np.asarray(frame.tactile)[inner], atol=2e-3)
+    if not crop:
+        np.testing.assert_array_equal(sts.touch(sensor, imprint), sts.touch(sensor, imprint, frame.window))
+
+
+def test_touch_has_no_nan_of_an_imprint_that_has():
+    imprint = jnp.full((20, 30), jnp.nan).at[5:9, 6:12].set(0.1)
+    assert np.isfinite(np.asarray(sts.touch(sts.Sensor(), imprint))).all()

@@ -23,8 +23,7 @@ def draw(vertices, faces, two_sided, pose, shape):
     points = _math.transform(pose, vertices)
     pixels, depth = optics.to_pixels(CAMERA, optics.full_window(CAMERA, shape), shape, points)
     inverse = 1 / jnp.maximum(depth, CAMERA.near)
-    keep = jnp.all(depth[faces] > CAMERA.near, axis=1)
-    winner = optics.rasterise(pixels, -inverse, faces, keep, two_sided, shape)
+    winner = optics.rasterise(pixels, -inverse, faces, depth > CAMERA.near, two_sided, shape)
     corners = pixels[faces][jnp.maximum(winner, 0)]
     weights = optics.barycentrics([corners[..., k, :] for k in range(3)], *optics.pixel_centres(shape))
     corners = inverse[faces][jnp.maximum(winner, 0)]
@@ -110,33 +109,51 @@ def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
         best[closer], winner[closer] = value[closer], k
     got = jax.jit(
         lambda p, o: optics.rasterise(
-            p, o, jnp.arange(180).reshape(60, 3), jnp.ones(60, bool), jnp.bool_(False), shape, chunk=chunk
+            p, o, jnp.arange(180).reshape(60, 3), jnp.ones(180, bool), jnp.bool_(False), shape, chunk=chunk
         )
     )(jnp.asarray(corners.reshape(-1, 2), jnp.float32), jnp.asarray(order.ravel(), jnp.float32))
     assert np.array_equal(np.asarray(got)[~near_edge], winner[~near_edge])
     assert (~near_edge).mean() > 0.5
 
 
-def test_a_surface_has_no_cracks():
-    # a fan of slivers that meet in one point, and a fine grid: every pixel inside is covered
-    angles = np.linspace(0, 2 * np.pi, 101)[:-1]
+@pytest.mark.parametrize("number", [100, 1500])  # one group of faces, and two that overlap
+def test_a_surface_has_no_cracks(number):
+    # a fan of slivers that meet in one point: every pixel inside is covered
+    angles = np.linspace(0, 2 * np.pi, number + 1)[:-1]
     rim = np.stack([32.3 + 29 * np.cos(angles), 31.7 + 29 * np.sin(angles)], -1)
     points = jnp.asarray(np.concatenate([rim, [[32.3, 31.7]]]), jnp.float32)
-    k = np.arange(100)
-    faces = jnp.asarray(np.stack([np.full(100, 100), (k + 1) % 100, k], -1))
+    k = np.arange(number)
+    faces = jnp.asarray(np.stack([np.full(number, number), (k + 1) % number, k], -1))
     winner = jax.jit(
-        lambda p: optics.rasterise(p, jnp.ones(101), faces, jnp.ones(100, bool), jnp.bool_(False), (64, 64))
+        lambda p: optics.rasterise(
+            p, jnp.ones(number + 1), faces, jnp.ones(number + 1, bool), jnp.bool_(False), (64, 64)
+        )
     )(points)
     rows, columns = np.mgrid[:64, :64]
     inside = np.hypot(columns - 32.3, rows - 31.7) < 28.9
     assert np.all(np.asarray(winner)[inside] >= 0)
 
 
+def test_faces_beyond_the_farthest_and_of_vertices_that_are_not_kept_are_left_out():
+    points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]] * 3)
+    order = jnp.repeat(jnp.array([3.0, 2.0, 1.0]), 3).at[8].set(1.5)
+    faces = jnp.arange(9).reshape(3, 3)
+
+    def nearest(keep, farthest):
+        seen = optics.rasterise(points, order, faces, keep, jnp.bool_(True), (16, 16), farthest=farthest)
+        return int(seen[4, 4])
+
+    keep = jnp.ones(9, bool)
+    assert [nearest(keep, f) for f in (jnp.inf, 2.5, 1.2, 1.0)] == [2, 2, 2, -1]
+    assert nearest(keep.at[7].set(False), jnp.inf) == 1
+    assert nearest(keep.at[7].set(False), 2.0) == -1
+
+
 def test_two_sided_faces_are_seen_from_behind():
     points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]])
     faces = jnp.array([[0, 1, 2]])
     for two_sided in (False, True):
-        seen = optics.rasterise(points, jnp.ones(3), faces, jnp.ones(1, bool), jnp.bool_(two_sided), (16, 16))
+        seen = optics.rasterise(points, jnp.ones(3), faces, jnp.ones(3, bool), jnp.bool_(two_sided), (16, 16))
         assert bool(jnp.any(seen >= 0)) == two_sided
 
 

@@ -253,7 +253,8 @@ def collect(
     Args:
         collection: What to make.
         sensor: The sensor that sees it.
-        folder: Where the shards go, with `collection.json`, `sensor.json` and `split.json` beside them.
+        folder: Where the shards go, with `collection.json`, `sensor.json` (for `Sensor.load`) and
+            `split.json` beside them.
         progress: Called as the work goes on.
 
     Returns:
@@ -262,8 +263,7 @@ def collect(
 
     Raises:
         ValueError: The sensor cannot be (`Sensor.check`); the folder holds another collection, the message names the
-            field; or the pad does not have the
-            scenario's symmetries; or no object of a shard can be simulated.
+            field; or the pad does not have the scenario's symmetries; or no object of a shard can be simulated.
         OSError: The disk is full.
     """
     sensor.check()
@@ -275,7 +275,7 @@ def collect(
         raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)}")
     folder.mkdir(parents=True, exist_ok=True)
     claim(folder / "collection.json", _as_json(collection))
-    claim(folder / "sensor.json", jax.tree.map(lambda x: np.asarray(x).tolist(), dataclasses.asdict(sensor)))
+    claim(folder / "sensor.json", sensor.constants())
     claim(
         folder / "split.json",
         {name: [int(i) for i in part] for name, part in split_objects(collection).items()},

@@ -52,8 +52,7 @@ def photograph(
     points = (vertices - eye) @ turn.T - jnp.array([0.0, 0.0, 1.0])
     pixels, depth = to_pixels(camera, window, shape, points)
     inverse = 1 / jnp.maximum(depth, 0.01)
-    keep = jnp.all(depth[faces] > 0.01, axis=1)
-    winner = rasterise(pixels, -inverse, faces, keep, jnp.asarray(two_sided), shape)
+    winner = rasterise(pixels, -inverse, faces, depth > 0.01, jnp.asarray(two_sided), shape)
     nearest = jnp.maximum(winner, 0)
     weights = barycentrics([pixels[faces[:, k]][nearest] for k in range(3)], *pixel_centres(shape))
     shares = [w * inverse[faces[:, k]][nearest] for k, w in enumerate(weights)]

@@ -14,9 +14,10 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 _SLACK = 1e-4  # pixels by which faces are grown, so that no pixel centre on a shared edge falls between two
+_GROUP = 1024  # faces prepared at a time
 _Corner = tuple[Array, Array, Array]  # column, row, order
 _NOTHING = np.uint32(0xFFFFFFFF)
 
@@ -25,21 +26,24 @@ def rasterise(
     points: Float[Array, "v 2"],
     order: Float[Array, "v"],
     faces: Int[Array, "f 3"],
-    keep: Bool[Array, "f"],
+    keep: Bool[Array, "v"],
     two_sided: Bool[Array, ""],
     shape: tuple[int, int],
     *,
-    chunk: int = 2048,
+    farthest: ScalarLike = jnp.inf,
+    chunk: int = 1024,
 ) -> Int[Array, "h w"]:
     """Index of the nearest face at every pixel centre.
 
     Args:
         points: vertices on the screen, (column, row) in pixels.
         order: of each vertex; smaller is nearer.
-        faces: corner indices, counter-clockwise seen from outside the object by a right-handed eye.
-        keep: faces to draw at all.
+        faces: corner indices, counter-clockwise seen from outside the object by a right-handed eye. Faces at the end
+            all of whose corners are one vertex, padding, cost next to nothing.
+        keep: vertices that can be drawn; a face needs all three.
         two_sided: whether faces are seen from behind too.
         shape: (height, width) of the image, pixels.
+        farthest: faces no corner of which is of an order below it are left out.
         chunk: candidates tested at a time.
 
     Returns:
@@ -47,73 +51,87 @@ def rasterise(
     """
     height, width = shape
     num_faces = faces.shape[0]
-    points, order = jax.lax.stop_gradient((points, order))
+    points, order, farthest = jax.lax.stop_gradient((points, order, farthest))
+    across, down = points[:, 0], points[:, 1]
+    first, last = jnp.min(jnp.where(keep, order, jnp.inf)), jnp.max(jnp.where(keep, order, -jnp.inf))
 
-    x, y, o = points[faces, 0], points[faces, 1], order[faces]
-    a, b, c = ((x[:, k], y[:, k], o[:, k]) for k in range(3))
-    area = _cross(a, b, c)
-    # Seen along +z with x right and y down, a face that looks at us runs counter-clockwise: negative area.
-    drawn = keep & jnp.where(two_sided, area != 0, area < 0)
+    group = min(_GROUP, num_faces)
+    different = (faces[:, 0] != faces[:, 1]) | (faces[:, 0] != faces[:, 2])
+    real = jnp.max(jnp.where(different, jnp.arange(1, num_faces + 1), 0))
 
-    a, b = _by_row(a, b)
-    b, c = _by_row(b, c)
-    a, b = _by_row(a, b)
-    (x0, y0, o0), (x1, y1, o1), (x2, y2, o2) = a, b, c
-    area = _cross(a, b, c)
-    safe_area = jnp.where(area == 0, 1, area)
-    slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
-    slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
+    def corners_of(chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
+        a, b, c = ((across[k], down[k], order[k]) for k in (faces[chosen, 0], faces[chosen, 1], faces[chosen, 2]))
+        return a, b, c
 
-    first_row = jnp.clip(jnp.ceil(y0 - _SLACK), 0, height)
-    last_row = jnp.clip(jnp.floor(y2 + _SLACK), -1, height - 1)
-    tall = y2 - y0
-    widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
-    left, right = _lowest(x0, x1, x2), _highest(x0, x1, x2)
-    # Rows that are nearly flat on screen are as wide as the face is.
-    widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
-    outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
-    empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
-    columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
-    rows = jnp.maximum(last_row - first_row + 1, 0)
-    number = jnp.where(drawn & ~outside & ~empty, rows * columns, 0).astype(jnp.int32)
-    end = jnp.cumsum(number)
+    def collect(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        """Of a group of faces, those that have candidates: from which number on, which they are, how wide."""
+        base, count, total, entries = state
+        face = jnp.minimum(base, num_faces - group) + jnp.arange(group)
+        a, b, c = corners_of(face)
+        area = _cross(a, b, c)
+        # Seen along +z with x right and y down, a face that looks at us runs counter-clockwise: negative area.
+        drawn = jnp.where(two_sided, area != 0, area < 0) & jnp.all(keep[faces[face]], axis=1)
+        left, right = _lowest(a[0], b[0], c[0]), _highest(a[0], b[0], c[0])
+        top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
+        tall = bottom - top
+        widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
+        # Rows that are nearly flat on screen are as wide as the face is.
+        widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
+        outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
+        empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
+        columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
+        rows = jnp.clip(jnp.floor(bottom + _SLACK), -1, height - 1) - _first_row(top, height) + 1
+        drawn &= (face >= base) & (_lowest(a[2], b[2], c[2]) < farthest) & ~outside & ~empty & (rows > 0)
+        number = jnp.where(drawn, rows * columns, 0).astype(jnp.int32)
+        upto = jnp.cumsum(jnp.stack([number, number > 0], axis=1), axis=0)
+        place = jnp.where(number > 0, count + upto[:, 1] - 1, len(entries))
+        entry = jnp.stack([total + upto[:, 0] - number, face, columns.astype(jnp.int32)], axis=1)
+        return base + group, count + upto[-1, 1], total + upto[-1, 0], entries.at[place].set(entry, mode="drop")
+
+    zero = jnp.int32(0)
+    none = jnp.full((num_faces + chunk, 3), jnp.iinfo(jnp.int32).max)
+    _, _, total, entries = jax.lax.while_loop(lambda state: state[0] < real, collect, (zero, zero, zero, none))
 
     face_bits = max((num_faces - 1).bit_length(), 1)
     levels = 2.0 ** min(32 - face_bits, 23) - 2
-    used = number > 0
-    lowest, highest = _lowest(o0, o1, o2), _highest(o0, o1, o2)
-    nearest = jnp.min(jnp.where(used, lowest, jnp.inf))
-    farthest = jnp.max(jnp.where(used, highest, -jnp.inf))
-    scale = levels / jnp.where(farthest > nearest, farthest - nearest, 1)
-    table = jnp.stack([x0, x1, x2, y0, y1, y2, o0, slope_x, slope_y, lowest, highest, first_row, columns], axis=1)
+    scale = levels / jnp.where(last > first, last - first, 1)
 
-    def body(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        base, image = state
+    def body(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        base, current, image = state
         candidate = base + jnp.arange(chunk, dtype=jnp.int32)
-        face = jnp.searchsorted(end, candidate, side="right").astype(jnp.int32)
-        live = face < num_faces
-        face = jnp.minimum(face, num_faces - 1)
-        x0, x1, x2, y0, y1, y2, o0, sx, sy, low, high, row0, cols = jnp.moveaxis(table[face], 1, 0)
-        local = candidate - (end[face] - number[face])
-        cols = jnp.maximum(cols.astype(jnp.int32), 1)
-        down = local // cols
-        row = row0 + down
+        # Every face has a candidate, so no more than `chunk` faces begin among these: the next ones of the list.
+        begins = jax.lax.dynamic_slice(entries, (current + 1, 0), (chunk, 1))[:, 0] - base
+        of = current + jnp.cumsum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"))
+        following = of[-1] + (entries[of[-1] + 1, 0] == base + chunk)
+        begin, face, columns = (entries[of, k] for k in range(3))
+        a, b, c = corners_of(face)
+        a, b = _by_row(a, b)
+        b, c = _by_row(b, c)
+        a, b = _by_row(a, b)
+        (x0, y0, o0), (x1, y1, o1), (x2, y2, o2) = a, b, c
+        area = _cross(a, b, c)
+        safe_area = jnp.where(area == 0, 1, area)
+        slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
+        slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
+        line = (candidate - begin) // columns
+        row = _first_row(y0, height) + line
         long = x0 + (x2 - x0) * _fraction(row, y0, y2)
         short = jnp.where(row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2))
         # A face that lies within one row's slack covers that row from end to end.
         flat = y2 - y0 <= 1e-3
         start = jnp.where(flat, _lowest(x0, x1, x2), jnp.minimum(long, short))
         stop = jnp.where(flat, _highest(x0, x1, x2), jnp.maximum(long, short))
-        column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + (local - down * cols)
-        live &= (column <= stop + _SLACK) & (column < width)
-        value = jnp.clip(o0 + sx * (column - x0) + sy * (row - y0), low, high)
-        level = jnp.clip((value - nearest) * scale, 0, levels).astype(jnp.uint32)
+        column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + (candidate - begin - line * columns)
+        live = (candidate < total) & (column <= stop + _SLACK) & (column < width)
+        value = o0 + slope_x * (column - x0) + slope_y * (row - y0)
+        value = jnp.clip(value, _lowest(o0, o1, o2), _highest(o0, o1, o2))
+        level = jnp.clip((value - first) * scale, 0, levels).astype(jnp.uint32)
         key = (level << face_bits) | face.astype(jnp.uint32)
         pixel = jnp.where(live, row.astype(jnp.int32) * width + column.astype(jnp.int32), height * width)
-        return base + chunk, image.at[pixel].min(key, mode="drop")
+        return base + chunk, following, image.at[pixel].min(key, mode="drop")
 
     blank = jnp.full(height * width, _NOTHING)
-    _, image = jax.lax.while_loop(lambda state: state[0] < end[-1], body, (jnp.int32(0), blank))
+    _, _, image = jax.lax.while_loop(lambda state: state[0] < total, body, (zero, zero, blank))
     winner = (image & jnp.uint32(2**face_bits - 1)).astype(jnp.int32)
     return jnp.where(image == _NOTHING, -1, winner).reshape(shape)
 
@@ -150,6 +168,10 @@ def pixel_centres(shape: tuple[int, int]) -> tuple[Float[Array, "h w"], Float[Ar
 
 def _cross(a: tuple[Array, ...], b: tuple[Array, ...], c: tuple[Array, ...]) -> Array:
     return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+
+
+def _first_row(top: Array, height: int) -> Array:
+    return jnp.clip(jnp.ceil(top - _SLACK), 0, height)
 
 
 def _by_row(a: _Corner, b: _Corner) -> tuple[_Corner, _Corner]:
