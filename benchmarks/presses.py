@@ -36,8 +36,7 @@ PITCH = 0.0295e-3  # m a pixel (taxim/calib/gelsight/params.json)
 RADIUS = 2e-3  # m, of the ball
 TRUSTED = 0.92  # share of a contact's radius within which its normals count as known
 EVERY = 4  # of the presses is held out: the fourth, the eighth, ...
-NUMBER = 12  # of lights
-STEPS = 1500
+STEPS = 1000
 RATE = 0.1
 OUT = Path(__file__).parent / "results" / "presses"
 
@@ -140,18 +139,28 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
     return constants, tactile.Lights(directions=place, colors=positive["color"])
 
 
-def change(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
-    """What the press changes: the shader's picture of it less that of the flat skin."""
+def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
+    """What the press changes of each light, were it white: the shader's picture less that of the flat skin.
+
+    One program for all lights: the shader's own loop over so many takes minutes to compile with its gradient.
+    """
     flat = jnp.broadcast_to(jnp.array([[0.0, 0, -1]]), given.normals.shape)
     normals = jnp.stack([given.normals, flat])
     points = jnp.stack([given.points, given.points * jnp.array([[1.0, 1, 0]])])
-    both = tactile.phong(constants, lights, normals, points)
-    return both[0] - both[1]
+    name = "positions" if isinstance(lights, tactile.Leds) else "directions"
+
+    def change(place: Float[Array, "3"]) -> Float[Array, "p"]:
+        light = dataclasses.replace(lights, colors=jnp.ones((1, 3)), **{name: place[None]})
+        both = tactile.phong(constants, light, normals, points)[..., 0]
+        return both[0] - both[1]
+
+    return jax.vmap(change)(getattr(lights, name))
 
 
+@jax.jit
 def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
     """Ours, on the real background."""
-    return given.background * (1 + change(constants, lights, given))
+    return given.background * (1 + changes(constants, lights, given).T @ lights.colors)
 
 
 def psnr(image: Array, truth: Array) -> float:
@@ -164,29 +173,20 @@ def _inverse(value: float | np.ndarray) -> Array:
     return jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
 
 
-def start(given: Pixels, number: int, *, near: bool) -> dict[str, Array]:
-    """Unknowns to begin with: of candidates in rings around the picture, those that least squares makes brightest."""
+def start(given: Pixels, *, near: bool) -> dict[str, Array]:
+    """Unknowns to begin with: of candidates in rings around the picture, those that least squares lets shine."""
+    rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.2, 0.5, 1.0, 2.0)]
     angles = 2 * np.pi * np.arange(12) / 12
-    rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.35, 0.55, 0.8, 1.2)]
     rows = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
-    places = jnp.array(rows, jnp.float32)
-    unknowns: dict[str, Array] = {"falloff": _inverse(2.0), "specular": _inverse(0.5), "shininess": _inverse(3.0)}
-    white = jnp.full((1, 3), _inverse(1.0))
-    one = jax.jit(
-        lambda place: change(*shader(unknowns | {"place": place[None], "color": white}, near=near), given)[:, 0]
-    )
-    columns = np.stack([one(place) for place in places], axis=1).astype(np.float64)
-    background = np.asarray(given.background, np.float64)
-    asked = np.asarray(given.color, np.float64) - background
-
-    def colors(chosen: np.ndarray) -> np.ndarray:
-        found = [nnls(background[:, k, None] * columns[:, chosen], asked[:, k])[0] for k in range(3)]
-        return np.stack(found, axis=1)
-
-    everything = np.arange(len(places))
-    brightest = np.sort(np.argsort(-np.sum(colors(everything), axis=1))[:number])
-    color = np.maximum(colors(brightest), 1e-2)
-    return unknowns | {"place": places[brightest], "color": _inverse(color)}
+    places = np.array(rows, np.float32)
+    unknowns = {"falloff": _inverse(2.0), "specular": _inverse(0.1), "shininess": _inverse(3.0)}
+    white = {"place": jnp.asarray(places), "color": jnp.ones((len(places), 3))}
+    each = np.asarray(jax.jit(changes)(*shader(unknowns | white, near=near), given), np.float64).T
+    background, color = (np.asarray(v, np.float64) for v in (given.background, given.color))
+    found = [nnls(background[:, k, None] * each, color[:, k] - background[:, k])[0] for k in range(3)]
+    colors = np.stack(found, axis=1)
+    shines = np.any(colors > 0, axis=1)
+    return unknowns | {"place": jnp.asarray(places[shines]), "color": _inverse(np.maximum(colors[shines], 1e-3))}
 
 
 @functools.partial(jax.jit, static_argnames=("near", "steps"))
@@ -205,12 +205,9 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
     return jax.lax.fori_loop(0, steps, step, (unknowns, optimiser.init(unknowns)))[0]
 
 
-def fit(
-    given: Pixels, *, near: bool, number: int = NUMBER, steps: int = STEPS
-) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
+def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
     """The shader's constants for some pixels."""
-    unknowns = start(given, number, near=near)
-    return shader(refine(unknowns, given, near=near, steps=steps), near=near)
+    return shader(refine(start(given, near=near), given, near=near, steps=steps), near=near)
 
 
 def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
