@@ -14,7 +14,8 @@ squares; then places, colours, the lights' fall-off, specular share and shinines
 lights that explain the pictures, not where the sensor's own LEDs are: a few end up under the picture. Printed: the peak
 signal-to-noise ratio within 0.92 of the contacts' radii, of all pixels of all held-out presses together, for the
 background alone, far lights and near ones. `presses.png` has the held-out presses, a column each: real, ours, and four
-times their difference on grey. A minute and a half on two cores. Number of steps and rate were chosen on the 36 alone.
+times their difference on grey; beside the contact, where the skin's shape is not known, ours is the background. Half a
+minute of processor time. What is chosen here (candidates, steps, rate) was chosen on the 36 alone.
 """
 
 import dataclasses
