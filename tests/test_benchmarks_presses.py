@@ -1,9 +1,11 @@
 """The real presses: their geometry, and a short fit that beats the background."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from benchmarks import presses
+from sts_jax import tactile
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +47,28 @@ def test_every_fourth_press_is_held_out_and_the_background_alone_is_the_known_fi
     assert presses.psnr(asked.background, asked.color) == pytest.approx(19.5, abs=0.1)
 
 
-@pytest.mark.parametrize("near", [True, False], ids=["LEDs", "far"])
+@pytest.mark.parametrize("near", [True, False], ids=["near", "far"])
+def test_changes_are_the_shaders_own_picture_less_that_of_the_flat_skin(recorded, near):
+    given = presses.pixels(recorded, np.array([5]), every=8)
+    place = jnp.array([[14.0, 3, -5], [-9, 12, -8]])
+    colors = jnp.array([[0.5, 0.2, 0.1], [0.0, 0.3, 0.9]])
+    lights = tactile.Leds(1e-3 * place, colors) if near else tactile.Lights(place, colors)
+    constants = tactile.Phong()
+    pressed = tactile.phong(constants, lights, given.normals, given.points)
+    face = given.points * jnp.array([[1.0, 1, 0]])
+    flat = tactile.phong(constants, lights, jnp.zeros_like(face).at[:, 2].set(-1), face)
+    expected = given.background * (1 + pressed - flat)
+    np.testing.assert_allclose(presses.draw(constants, lights, given), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("near", [True, False], ids=["near", "far"])
 def test_a_short_fit_beats_the_background(recorded, near):
-    some, other = (presses.pixels(recorded, np.array(which), every=8) for which in ([4, 12, 20, 28, 36], [0, 21, 33]))
-    drawn = presses.draw(*presses.fit(some, near=near, number=4, steps=50), other)
+    some, other = (presses.pixels(recorded, np.array(which), every=16) for which in ([4, 12, 20, 28, 36], [0, 21, 33]))
+    before = presses.draw(*presses.shader(presses.start(some, near=near), near=near), some)
+    constants, lights = presses.fit(some, near=near, steps=50)
+    after = presses.draw(constants, lights, some)
+    assert presses.psnr(after, some.color) > presses.psnr(before, some.color) + 0.3
+    drawn = presses.draw(constants, lights, other)
     assert presses.psnr(drawn, other.color) > presses.psnr(other.background, other.color) + 5
 
 
