@@ -77,7 +77,7 @@ def read() -> Presses:
             "the presses are in the package taxim 1.4.1: pip install -e '.[bench]' -c constraints.txt"
         )
     with np.load(path) as pack:
-        background, images = pack["f0"] / np.float32(255), pack["imgs"] / np.float32(255)
+        background, images = (pack[name][..., ::-1] / np.float32(255) for name in ("f0", "imgs"))  # blue is first
         return Presses(background, images, pack["touch_center"], pack["touch_radius"].astype(np.float64))
 
 
