@@ -15,7 +15,6 @@ shader, measured by us elsewhere, without its physics).
 """
 
 import argparse
-import dataclasses
 import functools
 import json
 import resource
@@ -208,26 +207,31 @@ def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) 
 
     theirs = Taxim(backend="jax")
     window = pitch * jnp.array([-shape[1] / 2, -shape[0] / 2, shape[1], shape[0]])
-    plain = sts.Sensor(lights=tactile.Leds())
-    smooth = dataclasses.replace(plain, skin=tactile.Skin(coupling=0.0002))
-    shadowed = dataclasses.replace(plain, skin=tactile.Skin(coupling=0.0002, shadow_steps=16))
+    skin, shadowed = tactile.Skin(coupling=0.0002), tactile.Skin(coupling=0.0002, shadow_steps=16)
+    sensors = {
+        "sharp": sts.Sensor(),
+        "far": sts.Sensor(skin=skin),
+        "LEDs": sts.Sensor(lights=tactile.Leds(), skin=skin),
+        "shadows": sts.Sensor(lights=tactile.Leds(), skin=shadowed),
+    }
     print(f"touch at {shape[1]}x{shape[0]} from a height map, ms: {jax.devices()[0].device_kind}")
-    names = ("ours", "coupled", "shadows", "taxim", "shadows")
-    print(f"{'':6} " + " ".join(f"{name:>8}" for name in names) + " | taxim's over ours: coupled, shadows")
+    names = (*sensors, "taxim", "shadows")
+    print(f"{'':6} " + " ".join(f"{name:>8}" for name in names) + " | taxim's over ours: far, LEDs, shadows")
     for name, make in (("ball", ball), ("waves", waves)):
         imprint = jnp.asarray(make(shape, pitch))
         height = -1e3 * imprint + jnp.where(imprint > 0, 0, 1.0)  # mm, as taxim has it
         ours = [
             functools.partial(jax.jit(functools.partial(sts.touch, sensor)), imprint, window)
-            for sensor in (plain, smooth, shadowed)
+            for sensor in sensors.values()
         ]
         others = [
             functools.partial(theirs.render_direct, height, with_shadow=shadow, press_depth=1.0)
             for shadow in (False, True)
         ]
         times = [1e3 * seconds for seconds in median_seconds(*ours, *others, repeats=15)]
+        _, far, leds, shadows, taxim, taxim_shadows = times
         row = " ".join(f"{value:8.1f}" for value in times)
-        print(f"{name:6} {row} | {times[3] / times[1]:8.2f} {times[4] / times[2]:8.2f}", flush=True)
+        print(f"{name:6} {row} | {taxim / far:8.2f} {taxim / leds:8.2f} {taxim_shadows / shadows:8.2f}", flush=True)
 
 
 def one(faces: int, shape: tuple[int, int]) -> None:
