@@ -123,7 +123,7 @@ def _check_shapes(body: Body, pose: Any, wrench: Any, resolution: Any) -> None:
         )
     if jnp.shape(pose) != (7,):
         raise ValueError(
-            f"pose has the shape {jnp.shape(pose)}; it takes (7,), position (m) and quaternion. For several use jax.vmap"
+            f"pose has the shape {jnp.shape(pose)}; it takes (7,), position (m), quaternion. For several use jax.vmap"
         )
     if wrench is not None and jnp.shape(wrench) != (6,):
         raise ValueError(

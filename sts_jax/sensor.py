@@ -1,6 +1,7 @@
 """All constants of one sensor."""
 
 import dataclasses
+import functools
 import json
 import math
 import os
@@ -66,7 +67,7 @@ class Sensor:
         """
         _insist(_conditions(self))
 
-    def guard(self) -> tuple["Sensor", Bool[Array | np.ndarray, ""]]:
+    def guard(self) -> tuple["Sensor", Bool[Array, ""] | bool]:
         """`check` under `jit`: what is known is checked, of what is traced a flag tells.
 
         Returns:
@@ -83,7 +84,7 @@ class Sensor:
             elif not holds:
                 raise ValueError(says())
         if not flags:
-            return self, np.bool_(True)
+            return self, True
         sound = jnp.all(jnp.stack(flags))
 
         def safe(value: Any, default: Any) -> Any:
@@ -95,7 +96,7 @@ class Sensor:
 
         leaves, structure = jax.tree.flatten(self)
         known = jax.tree.leaves(_default(self))
-        return structure.unflatten([safe(*pair) for pair in zip(leaves, known, strict=True)]), sound
+        return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, known, strict=True)]), sound
 
     def save(self, path: str | os.PathLike) -> None:
         """Write every constant to one JSON file, whole or not at all.
@@ -268,7 +269,7 @@ def _of_value(default: Any, value: Any, name: str) -> Iterator[_Condition]:
     if name in _UP_TO_ONE:
         must.append(((array <= 1).all(), "it must not be above 1"))
     for holds, words in must:
-        yield holds, lambda words=words: f"field {name} is {value!r}; {words}."
+        yield holds, functools.partial("field {} is {!r}; {}.".format, name, value, words)
 
 
 def _of_rows(name: str, fields: dict[str, Any]) -> Iterator[_Condition]:
