@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import operator
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _math, optics, tactile
 from sts_jax._tiles import where_active
-from sts_jax.objects.body import Body
+from sts_jax.objects.body import FACE_CLASSES, Body
 from sts_jax.sensor import Sensor
 
 _Corners = tuple[Float[Array, "v 3"], Int[Array, "f 3"]]  # place on the screen and a third value; faces' corners
@@ -28,7 +30,8 @@ class Frame:
     depth: Float[Array, "*n h w"]  # m along the optical axis from the pinhole to the object, inf where there is none
     segmentation: Bool[Array, "*n h w"]  # the object
     pose: Float[Array, "*n 7"]  # the pose drawn: the object's mesh frame in the sensor frame, gel in balance
-    balanced: Bool[Array, "*n"]  # whether the gel carries the wrench within its limits; False for a non-finite input
+    # whether the gel carries the wrench within its limits; False for a non-finite input or a sensor that cannot be
+    balanced: Bool[Array, "*n"]
     pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid (tactile.cell_centres)
     window: Float[Array, "*n 4"]  # m, (left, top, width, height) on the gel's face that the images show
 
@@ -49,6 +52,10 @@ def sense(
     gel's face has fallen off: the images are those of an empty sensor. So they are where pose or wrench are not
     finite; `balanced` is False then.
 
+    A sensor that cannot be (`Sensor.check`) raises an error. Constants that are traced, as all are when a sensor is an
+    argument of a jitted function, are not known in time for that: where they make a sensor that cannot be, the images
+    are those of an empty one with the default's constants in their place, never NaN, and `balanced` is False.
+
     Args:
         sensor: its constants.
         body: what touches it.
@@ -59,8 +66,14 @@ def sense(
 
     Returns:
         Frame.
+
+    Raises:
+        ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
+            more faces than can be drawn, all of this under `jit` too; or the sensor cannot be, of what is known of it.
     """
-    finite = jnp.all(jnp.isfinite(pose)) & (_math.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
+    _check_shapes(body, pose, wrench, resolution)
+    sensor, sound = sensor.guard()
+    finite = sound & jnp.all(jnp.isfinite(pose)) & (_math.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
     if wrench is not None:
         finite &= jnp.all(jnp.isfinite(wrench))
         wrench = jnp.where(finite, wrench, 0)
@@ -101,6 +114,28 @@ def sense(
         pressure=contact.pressure,
         window=window,
     )
+
+
+def _check_shapes(body: Body, pose: Any, wrench: Any, resolution: Any) -> None:
+    whole = isinstance(resolution, Sequence) and all(isinstance(n, int | np.integer) for n in resolution)
+    if not whole or len(resolution) != 2 or min(resolution) < 1:
+        raise ValueError(
+            f"resolution is {resolution!r}; it takes two whole numbers of pixels, (height, width), above 0"
+        )
+    if jnp.shape(pose) != (7,):
+        raise ValueError(
+            f"pose has the shape {jnp.shape(pose)}; it takes (7,), position (m), quaternion. For several use jax.vmap"
+        )
+    if wrench is not None and jnp.shape(wrench) != (6,):
+        raise ValueError(
+            f"wrench has the shape {jnp.shape(wrench)}; it takes (6,), force (N) and moment (N m). For several use "
+            "jax.vmap"
+        )
+    if len(body.faces) > FACE_CLASSES[-1]:
+        raise ValueError(
+            f"body has {len(body.faces):,} faces; at most {FACE_CLASSES[-1]:,} can be drawn. objects.load decimates a "
+            "mesh file with faces="
+        )
 
 
 def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n h w 3"]:

@@ -1,15 +1,18 @@
 """All constants of one sensor."""
 
 import dataclasses
+import functools
 import json
 import math
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from sts_jax.optics import Camera, Room
 from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
@@ -30,6 +33,10 @@ _NOT_BELOW_ZERO = {
 # fmt: on
 _BELOW = {"camera.fov": math.pi, "gel.max_tilt": math.pi / 2}
 _UP_TO_ONE = {"room.background", "room.vignette", "room.milk", "room.tint", "room.crease"}
+_LARGEST, _LEAST = (float(x) for x in (np.finfo(np.float32).max, np.finfo(np.float32).tiny))  # beyond: inf and 0
+_ROUNDED = 1 + 1e-6  # float32's last digit
+
+_Condition = tuple[Any, Callable[[], str]]  # whether it holds, and what to say where it does not
 
 
 @jax.tree_util.register_dataclass
@@ -58,39 +65,38 @@ class Sensor:
         Raises:
             ValueError: the field, its value and what it may be.
         """
-        lights = Leds() if isinstance(self.lights, Leds) else Lights()
-        _check_fields(dataclasses.replace(type(self)(), lights=lights), self, "")
-        camera, gel = self.camera, self.gel
-        if camera.distance <= gel.thickness:
-            raise ValueError(
-                f"field camera.distance is {camera.distance!r}, so the pinhole is in the gel or behind it; it must be "
-                f"above gel.thickness, {gel.thickness!r}."
-            )
-        if camera.near > camera.distance - gel.thickness:
-            raise ValueError(
-                f"field camera.near is {camera.near!r}, so that what presses on the gel may not be drawn; it must not "
-                f"be above camera.distance - gel.thickness, {camera.distance - gel.thickness:g}."
-            )
-        if gel.max_depth > gel.thickness:
-            raise ValueError(
-                f"field gel.max_depth is {gel.max_depth!r}; it must not be above gel.thickness, {gel.thickness!r}."
-            )
-        near = isinstance(self.lights, Leds)
-        place = "positions" if near else "directions"
-        _check_rows("lights", vars(self.lights))
-        _check_rows("room", vars(self.room))
-        half = (1 + 1e-6) * np.asarray(gel.size, np.float64) / 2  # float32's last digit
-        for row in np.asarray(getattr(self.lights, place), np.float64):
-            if row[2] > 0:
-                raise ValueError(
-                    f"field lights.{place} has the row {row.tolist()}, from outside of the skin, which lets no light "
-                    "in; z must not be above 0 (the camera's side is negative)."
-                )
-            if near and np.all(np.abs(row[:2]) <= half) and row[2] >= -(1 + 1e-6) * gel.thickness:
-                raise ValueError(
-                    f"field lights.{place} has the row {row.tolist()}, inside the gel; over the pad z must be below "
-                    f"-gel.thickness, {-gel.thickness!r}, or x or y beyond the pad's edge."
-                )
+        _insist(_conditions(self))
+
+    def guard(self) -> tuple["Sensor", Bool[Array, ""] | bool]:
+        """`check` under `jit`: what is known is checked, of what is traced a flag tells.
+
+        Returns:
+            This sensor, with the default's constants in the place of all traced ones where it cannot be; and whether
+            it can be.
+
+        Raises:
+            ValueError: see `check`, of what is known: concrete values, and shapes.
+        """
+        flags = []
+        for holds, says in _conditions(self):
+            if isinstance(holds, jax.core.Tracer):
+                flags.append(holds)
+            elif not holds:
+                raise ValueError(says())
+        if not flags:
+            return self, True
+        sound = jnp.all(jnp.stack(flags))
+
+        def safe(value: Any, default: Any) -> Any:
+            if not isinstance(value, jax.core.Tracer):
+                return value
+            if value.shape != jnp.shape(default):  # another number of lights
+                default = jnp.broadcast_to(default[:1], value.shape)
+            return jnp.where(sound, value, default)
+
+        leaves, structure = jax.tree.flatten(self)
+        known = jax.tree.leaves(_default(self))
+        return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, known, strict=True)]), sound
 
     def constants(self) -> dict[str, Any]:
         """Every constant in lists and numbers: what `save` writes as JSON."""
@@ -152,7 +158,7 @@ def _plain(value: Any) -> Any:
 def _typed(default: Any, value: Any, name: str) -> Any:
     """What a file says, of the default's types."""
     if not dataclasses.is_dataclass(default):
-        _check_value(default, value, name)
+        _insist(_of_value(default, value, name))
         if isinstance(default, tuple):
             return tuple(type(d)(v) for d, v in zip(default, value, strict=True))
         return type(default)(value) if isinstance(default, int | float) else jnp.asarray(value, jnp.float32)
@@ -175,51 +181,121 @@ def _typed(default: Any, value: Any, name: str) -> Any:
         raise ValueError(f"field {prefix}{unknown} is not known; known are {', '.join(known)}.")
     fields = {k: _typed(getattr(default, k), value[k], prefix + k) for k in known}
     if "colors" in fields:
-        _check_rows(name, fields)
+        _insist(_of_rows(name, fields))
     return dataclasses.replace(default, **fields)
 
 
-def _check_fields(default: Any, value: Any, name: str) -> None:
+def _insist(conditions: Iterator[_Condition]) -> None:
+    for holds, says in conditions:
+        if not holds:
+            raise ValueError(says())
+
+
+def _default(sensor: Sensor) -> Sensor:
+    return dataclasses.replace(type(sensor)(), lights=Leds() if isinstance(sensor.lights, Leds) else Lights())
+
+
+def _conditions(sensor: Sensor) -> Iterator[_Condition]:
+    """All that a sensor must fulfil; of traced values, traced."""
+    yield from _of_fields(_default(sensor), sensor, "")
+    distance, near = _array(sensor.camera.distance), _array(sensor.camera.near)
+    thickness, max_depth = _array(sensor.gel.thickness), _array(sensor.gel.max_depth)
+    yield (
+        distance > thickness,
+        lambda: (
+            f"field camera.distance is {distance:g}, so the pinhole is in the gel or behind it; it must be above "
+            f"gel.thickness, {thickness:g}."
+        ),
+    )
+    yield (
+        near <= _ROUNDED * (distance - thickness),
+        lambda: (
+            f"field camera.near is {near:g}, so that what presses on the gel may not be drawn; it must not be above "
+            f"camera.distance - gel.thickness, {distance - thickness:g}."
+        ),
+    )
+    yield (
+        max_depth <= thickness,
+        lambda: f"field gel.max_depth is {max_depth:g}; it must not be above gel.thickness, {thickness:g}.",
+    )
+    yield from _of_rows("lights", vars(sensor.lights))
+    yield from _of_rows("room", vars(sensor.room))
+    leds = isinstance(sensor.lights, Leds)
+    name = "lights.positions" if leds else "lights.directions"
+    rows = _array(sensor.lights.positions if isinstance(sensor.lights, Leds) else sensor.lights.directions)
+    yield (
+        (rows[:, 2] <= 0).all(),
+        lambda: (
+            f"field {name} has the row {rows[rows[:, 2] > 0][0].tolist()}, from outside of the skin, which lets no "
+            "light in; z must not be above 0 (the camera's side is negative)."
+        ),
+    )
+    if leds:
+        half = _ROUNDED * _array(sensor.gel.size) / 2
+        inside = (abs(rows[:, :2]) <= half[None, :]).all(axis=1) & (rows[:, 2] >= -_ROUNDED * thickness)
+        yield (
+            (~inside).all(),
+            lambda: (
+                f"field {name} has the row {rows[inside][0].tolist()}, inside the gel; over the pad z must be below "
+                f"-gel.thickness, {-thickness:g}, or x or y beyond the pad's edge."
+            ),
+        )
+
+
+def _of_fields(default: Any, value: Any, name: str) -> Iterator[_Condition]:
     if not dataclasses.is_dataclass(default):
-        _check_value(default, value, name)
+        yield from _of_value(default, value, name)
         return
     if type(value) is not type(default):
         raise ValueError(f"field {name} is {value!r}; it takes a {type(default).__name__}.")
     for field in dataclasses.fields(default):
         inner = f"{name}.{field.name}" if name else field.name
-        _check_fields(getattr(default, field.name), getattr(value, field.name), inner)
+        yield from _of_fields(getattr(default, field.name), getattr(value, field.name), inner)
 
 
-def _check_value(default: Any, value: Any, name: str) -> None:
+def _of_value(default: Any, value: Any, name: str) -> Iterator[_Condition]:
     """Numbers of the default's shape (of lights and lamps any number of rows), finite, in the field's range."""
+    array, shape = _array(value), np.shape(default)
+    wanted = "a finite number" if shape == () else f"finite numbers of shape {shape}"
+    fits = array.shape == shape or (len(shape) == 2 and array.shape[1:] == shape[1:] and len(array) > 0)
+    if array.dtype.kind not in "iuf" or not fits:
+        raise ValueError(f"field {name} is {value!r}; it takes {wanted}.")
+    whole = all(isinstance(d, int) for d in default) if isinstance(default, tuple) else isinstance(default, int)
+    must: list[tuple[Any, str]] = [((abs(array) <= _LARGEST).all(), f"it takes {wanted}")]
+    if whole:
+        must.append(((array == array.round()).all(), "it takes whole numbers"))
+    if name in _ABOVE_ZERO:
+        must.append(((array >= _LEAST).all(), "it must be above 0"))
+    if name in _NOT_BELOW_ZERO:
+        must.append(((array >= 0).all(), "it must not be below 0"))
+    if name in _BELOW:
+        must.append(((array < _BELOW[name]).all(), f"it must be below {_BELOW[name]:.4f}"))
+    if name in _UP_TO_ONE:
+        must.append(((array <= 1).all(), "it must not be above 1"))
+    for holds, words in must:
+        yield holds, functools.partial("field {} is {!r}; {}.".format, name, value, words)
+
+
+def _of_rows(name: str, fields: dict[str, Any]) -> Iterator[_Condition]:
+    place = "positions" if "positions" in fields else "directions"
+    rows, colors = _array(fields[place]), _array(fields["colors"])
+    if len(rows) != len(colors):
+        raise ValueError(
+            f"fields {name}.{place}, {name}.colors have {(len(rows), len(colors))} rows; a light has one of both."
+        )
+    if place == "directions":
+        yield (
+            (rows != 0).any(axis=1).all(),
+            lambda: f"field {name}.directions has a row of zeros: {rows.tolist()}; a direction needs a length.",
+        )
+
+
+def _array(value: Any) -> Any:
+    """An array: traced if any of it is, else NumPy's, whose numbers are float64."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
+        return jnp.asarray(value)
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths
         array = np.asarray(None)
-    shape = np.shape(default)
-    fits = array.shape == shape or (len(shape) == 2 and array.shape[1:] == shape[1:] and len(array) > 0)
-    if array.dtype.kind not in "iuf" or not fits or not np.all(np.isfinite(array)):
-        wanted = "a finite number" if shape == () else f"finite numbers of shape {shape}"
-        raise ValueError(f"field {name} is {value!r}; it takes {wanted}.")
-    array = array.astype(np.float64)
-    whole = all(isinstance(d, int) for d in default) if isinstance(default, tuple) else isinstance(default, int)
-    if whole and np.any(array != np.round(array)):
-        raise ValueError(f"field {name} is {value!r}; it takes whole numbers.")
-    if name in _ABOVE_ZERO and not np.all(array > 0):
-        raise ValueError(f"field {name} is {value!r}; it must be above 0.")
-    if name in _NOT_BELOW_ZERO and not np.all(array >= 0):
-        raise ValueError(f"field {name} is {value!r}; it must not be below 0.")
-    if name in _BELOW and not np.all(array < _BELOW[name]):
-        raise ValueError(f"field {name} is {value!r}; it must be below {_BELOW[name]:.4f}.")
-    if name in _UP_TO_ONE and not np.all(array <= 1):
-        raise ValueError(f"field {name} is {value!r}; it must not be above 1.")
-
-
-def _check_rows(name: str, fields: dict[str, Any]) -> None:
-    place = "positions" if "positions" in fields else "directions"
-    rows = len(fields[place]), len(fields["colors"])
-    if rows[0] != rows[1]:
-        raise ValueError(f"fields {name}.{place}, {name}.colors have {rows} rows; a light has one of both.")
-    if place == "directions" and not np.all(np.any(np.asarray(fields[place]) != 0, axis=1)):
-        given = np.asarray(fields[place]).tolist()
-        raise ValueError(f"field {name}.directions has a row of zeros: {given}; a direction needs a length.")
+    return array.astype(np.float64) if array.dtype.kind in "iuf" else array

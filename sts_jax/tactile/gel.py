@@ -61,7 +61,7 @@ def cell_centres(gel: Gel) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
 
 def cell_area(gel: Gel) -> Float[Array, ""]:
     """Area of one cell (m^2)."""
-    return jnp.asarray(gel.size[0] * gel.size[1] / (gel.cells[0] * gel.cells[1]), jnp.float32)
+    return jnp.asarray(gel.size[0] * gel.size[1] / (gel.cells[0] * gel.cells[1]), float)
 
 
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
@@ -210,14 +210,14 @@ def _newton(
             return jnp.array(_STEP_LENGTHS)[jnp.argmin(slopes)]
 
         whole = slope(1.0) <= _ENOUGH * jnp.abs(jnp.sum(step * gradient))
-        u = u + jax.lax.cond(whole, lambda: jnp.float32(1), shorter) * step
+        u = u + jax.lax.cond(whole, lambda: jnp.ones(()), shorter) * step
         return count + 1, u, jnp.max(jnp.abs(step))
 
     def unsettled(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
         return (state[0] < _NEWTON_STEPS) & (state[2] > _SETTLED)
 
     fixed_basis, fixed_height, fixed_target = jax.lax.stop_gradient((basis, height, target))
-    first = (jnp.int32(0), jax.lax.stop_gradient(start), jnp.float32(jnp.inf))
+    first = (jnp.int32(0), jax.lax.stop_gradient(start), jnp.array(jnp.inf))
     u = jax.lax.stop_gradient(jax.lax.while_loop(unsettled, newton, first)[1])
 
     length = plane(u, basis) - height

@@ -1,0 +1,212 @@
+"""Derivatives of whole frames by pose, wrench and every constant, against finite differences in float64.
+
+A pixel has a derivative where the differences forward and backward agree. Where they do not, another face comes to be
+seen, the skin begins to be touched, or a light or a value meets its limit, all within the step: such pixels are left
+out, and there are few of them.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from optics_bodies import from_trimesh
+
+import sts_jax as sts
+from sts_jax import optics, tactile
+
+SHAPE = (40, 40)
+STEP = 1e-5  # of what a parameter is moved by to be seen
+RELATIVE = 3e-3  # the gel's implicit derivative is damped by as much: `_newton` adds 1e-5 to its matrix
+FLOOR = 1e-6  # of a value, which is about 1, per such a move
+SETTLED = 1e-4  # the same by a pose, much of which the gel takes back
+# What a pose and a wrench are moved by: m, quaternion, N, N m.
+UNITS = np.array([1e-3] * 3 + [0.05] * 4), np.array([0.1] * 3 + [1e-3] * 3)
+
+# Off the gel's plane: in it flat skin is at the edge of light, where no derivative is.
+FAR = tactile.Lights(directions=jnp.array([[-1.0, 0.1, -0.2], [1, 0, -0.1], [0.2, -1, -0.1], [0.1, 1, -0.3]]))
+COLORS = 0.05 + 0.3 * FAR.colors  # inside their range, as the room's tint
+FAR = dataclasses.replace(FAR, colors=COLORS)
+NEAR = tactile.Leds(colors=COLORS, falloff=1.5)
+GEL = tactile.Gel(size=(0.13, 0.12))  # the housing's walls are seen
+ROOM = optics.Room(tint=jnp.array([0.8, 0.85, 0.95]))
+SKIN = tactile.Skin(coupling=0.001, shadow_steps=6, shadow_reach=0.02, penumbra=0.3)
+DIM = tactile.Phong(ambient=0.5)  # nothing reaches 1, where pixels end
+SENSORS = {
+    name: sts.Sensor(gel=GEL, lights=lights, skin=SKIN, phong=DIM, room=ROOM)
+    for name, lights in (("far", FAR), ("near", NEAR))
+}
+
+
+@pytest.fixture(autouse=True)
+def strict_ranks():
+    with jax.numpy_rank_promotion("raise"):
+        yield
+
+
+# Of one class: what is compiled for the one serves the other.
+BALL = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=0.025))
+BOX = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.02)).subdivide().subdivide().subdivide().subdivide())
+
+
+def at(x, y, z, turn=(1.0, 0, 0, 0)):
+    return jnp.array([x, y, z, *turn], jnp.float32)
+
+
+def weight(force, x, y):
+    return jnp.array([0.0, 0.0, force, y * force, -x * force, 0.0], jnp.float32)
+
+
+def seen(sensor, body, pose, wrench, crop):
+    """All that a frame says that can have a derivative."""
+    frame = sts.sense(sensor, body, pose, wrench, resolution=SHAPE, crop=crop)
+    x, y = tactile.cell_centres(sensor.gel)
+    force = frame.pressure * tactile.cell_area(sensor.gel)
+    return {
+        "tactile": frame.tactile,
+        "visual": frame.visual,
+        "depth": jnp.where(frame.segmentation, frame.depth, 0),
+        "moments": jnp.stack([jnp.sum(force), jnp.sum(force * y), -jnp.sum(force * x)]),
+        "pose": frame.pose,
+    }
+
+
+@functools.partial(jax.jit, static_argnames="crop")
+def pushed(point, body, tangent, crop):
+    """The frame's values, and their derivatives along a tangent of (sensor, pose, wrench)."""
+    return jax.jvp(lambda sensor, pose, wrench: seen(sensor, body, pose, wrench, crop), point, tangent)
+
+
+def weights(like):
+    key = jax.random.key(0)
+    return jax.tree.map(lambda v: jax.random.normal(key, v.shape, jnp.float32), like)
+
+
+@jax.jit
+def slopes(sensor, pose, wrench, body):
+    """Gradient of a weighted sum of all values, in reverse."""
+
+    def total(*point):
+        values = seen(point[0], body, *point[1:], False)
+        return sum(
+            jnp.sum(v * w) for v, w in zip(jax.tree.leaves(values), jax.tree.leaves(weights(values)), strict=True)
+        )
+
+    return jax.grad(total, argnums=(0, 1, 2))(sensor, pose, wrench)
+
+
+def double(tree):
+    return jax.tree.map(
+        lambda v: jnp.asarray(np.asarray(v, np.float64) if np.asarray(v).dtype.kind == "f" else v), tree
+    )
+
+
+def directions(point):
+    """Each leaf's name and a tangent along it alone, as long as what it is moved by to be seen."""
+    leaves, structure = jax.tree.flatten(point)
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(point)]
+    for index, (name, leaf) in enumerate(zip(names, leaves, strict=True)):
+        rng = np.random.default_rng(index)
+        if name.startswith("[0]"):
+            sides = [0.1 * max(float(jnp.max(jnp.abs(leaf))), 1e-3) * rng.choice([-1.0, 1.0], leaf.shape)]
+        else:
+            unit = UNITS[int(name[1]) - 1]
+            sides = [unit[k] * np.eye(len(unit))[k] for k in range(len(unit))]
+        for k, side in enumerate(sides):
+            zeros = [jnp.zeros_like(v) for v in leaves]
+            zeros[index] = jnp.asarray(side, leaf.dtype)
+            yield f"{name}[{k}]", structure.unflatten(zeros)
+
+
+def compare(point, body, crop):
+    """Of every leaf and stream: the derivative, the difference, and where there is one."""
+    with jax.enable_x64(True):
+        point, body = double(point), double(body)
+        for name, tangent in directions(point):
+            here, along = pushed(point, body, tangent, crop)
+            ahead, behind = (
+                pushed(jax.tree.map(lambda v, t, s=s: v + s * STEP * t, point, tangent), body, tangent, crop)[0]
+                for s in (1, -1)
+            )
+            for stream, slope in along.items():
+                forward, backward = (ahead[stream] - here[stream]) / STEP, (here[stream] - behind[stream]) / STEP
+                numeric = np.asarray(forward + backward) / 2
+                defined = np.abs(np.asarray(forward - backward)) <= FLOOR + RELATIVE * np.abs(numeric)
+                yield name, stream, np.asarray(slope), numeric, defined
+
+
+# What changes nothing within its limits, or takes no part.
+STILL = {f"[0].{leaf}[0]" for leaf in ("camera.aspect", "camera.near", "gel.thickness", "gel.max_depth")}
+STILL |= {"[0].gel.max_tilt[0]", "[0].gel.tolerance[0]", "[0].room.exposure[0]", "[2][0]", "[2][1]", "[2][5]"}
+# Sensor, body, pose, wrench, crop, and what more does nothing there.
+POINTS = {
+    # a contact's edge runs through tiles of the image, and off the directions of grids and pixels
+    "ball": ("far", BALL, at(0.0031, -0.0022, 0.0249, (1, 0.1, 0.05, 0.2)), weight(0.5, 0.003, -0.002), False, set()),
+    # a face that lies flat on the gel: the imprint is the same all over it
+    "flat box": (
+        "far",
+        BOX,
+        at(0.0031, -0.0022, 0.01, (1, 0, 0, 0.1)),
+        weight(0.5, 0.0031, -0.0022),
+        False,
+        {"[0].skin.shadow_reach[0]", "[0].skin.penumbra[0]", "[0].room.haze[0]", "[0].room.crease_height[0]", "[1][2]"},
+    ),
+    "ball among LEDs, cropped": (
+        "near",
+        BALL,
+        at(0.0031, -0.0022, 0.0249),
+        weight(0.5, 0.003, -0.002),
+        True,
+        {"[0].camera.fov[0]", "[0].room.rim[0]", "[0].room.rim_depth[0]", "[1][3]"},
+    ),
+    "ball in its place": ("far", BALL, at(0.0031, -0.0022, 0.0239, (1, 0.1, 0.05, 0.2)), None, False, set()),
+}
+
+
+@pytest.mark.parametrize("name", POINTS)
+def test_derivatives_are_the_differences(name):
+    sensor, body, pose, wrench, crop, more = POINTS[name]
+    leaves, moving = set(), set()
+    for leaf, stream, slope, numeric, defined in compare((SENSORS[sensor], pose, wrench), body, crop):
+        words = f"{leaf}, {stream}"
+        assert np.all(np.isfinite(slope)), words
+        assert np.mean(defined) > 0.99, words
+        slope, numeric = slope[defined], numeric[defined]
+        largest = np.abs(numeric).max(initial=0)
+        floor = SETTLED if leaf.startswith("[1]") and wrench is not None else FLOOR
+        assert np.all(np.abs(slope - numeric) <= RELATIVE * (np.abs(numeric) + largest) + floor), words
+        leaves.add(leaf)
+        if largest > 10 * FLOOR:
+            moving.add(leaf)
+    assert leaves - moving == {leaf for leaf in STILL | more if leaf in leaves}
+
+
+FINITE = {
+    "nothing": (BALL, at(5.0, 0.0, 0.1), weight(0, 0, 0)),
+    "above": (BALL, at(0.01, 0.0, 0.06), weight(0, 0, 0)),
+    "below": (BALL, at(0.01, 0.0, -0.06), weight(0.5, 0.01, 0)),
+    "exactly flat": (BOX, at(0, 0, 0.01), weight(0.5, 0, 0)),
+    "exactly flat, not pressed": (BOX, at(0, 0, 0.01), weight(0, 0, 0)),
+    "exactly flat on a pixel's edge": (BOX, at(0.00375, 0.00375, 0.009), weight(0.5, 0.00375, 0.00375)),
+    "round": (BALL, at(0.0031, -0.0022, 0.025), weight(0.5, 0.003, -0.002)),
+    "partly out of view": (BALL, at(0.07, -0.06, 0.025), weight(0.5, 0.07, -0.06)),
+    "more than the gel carries": (BALL, at(0, 0, 0.025), weight(50, 0.01, 0)),
+    "pose not finite": (BALL, at(jnp.nan, 0, 0.025), weight(0.5, 0, 0)),
+    "no rotation": (BALL, at(0, 0, 0.025, (0, 0, 0, 0)), weight(0.5, 0, 0)),
+    "wrench not finite": (BALL, at(0, 0, 0.025), weight(jnp.inf, 0, 0)),
+}
+
+
+def test_gradients_by_all_leaves_are_finite_everywhere():
+    sensor = SENSORS["far"]
+    # The paper's lights, in the gel's plane, too.
+    plane = dataclasses.replace(sensor, lights=tactile.Lights())
+    soft = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, stiffness=0.0))  # cannot be
+    for words, (body, pose, wrench) in FINITE.items():
+        for given in (sensor, plane, soft):
+            found = slopes(given, pose, wrench, body)
+            for path, leaf in jax.tree_util.tree_leaves_with_path(found):
+                assert np.all(np.isfinite(leaf)), f"{words}: {jax.tree_util.keystr(path)}"

@@ -1,0 +1,146 @@
+"""What `sense` refuses, and what it does where a sensor that cannot be is traced; meshes with too many faces."""
+
+import dataclasses
+import functools
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from optics_bodies import from_trimesh
+
+import sts_jax as sts
+from sts_jax import objects, tactile
+
+# As its users call it: without the tests' own checks of types and shapes.
+sense = inspect.unwrap(sts.sense)
+SENSOR = sts.Sensor()
+BODY = from_trimesh(trimesh.creation.box((0.05, 0.03, 0.02)))
+POSE = jnp.array([0.003, 0.002, 0.01, 1, 0, 0, 0], jnp.float32)
+WRENCH = jnp.array([0.0, 0, 0.5, 0.001, -0.0015, 0], jnp.float32)
+IMAGES = ("visual", "tactile", "pressure", "window", "pose")
+
+
+@pytest.mark.parametrize(
+    "resolution", [(0, 64), (64, -1), (64.0, 64), (64,), (64, 64, 3), 64, "64x64", None, (float("nan"), 64)]
+)
+def test_a_resolution_that_cannot_be_is_named(resolution):
+    draw = functools.partial(sense, resolution=resolution)
+    for call in (draw, jax.jit(draw)):
+        with pytest.raises(ValueError, match=r"resolution is .*whole numbers of pixels"):
+            call(SENSOR, BODY, POSE, WRENCH)
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (8,), (1, 7), (3, 7)])
+def test_a_pose_of_another_shape_is_named(shape):
+    for call in (sense, jax.jit(sense)):
+        with pytest.raises(ValueError, match=r"pose has the shape .*\(7,\).*vmap"):
+            call(SENSOR, BODY, jnp.zeros(shape), WRENCH)
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (7,), (2, 6)])
+def test_a_wrench_of_another_shape_is_named(shape):
+    for call in (sense, jax.jit(sense)):
+        with pytest.raises(ValueError, match=r"wrench has the shape .*\(6,\).*vmap"):
+            call(SENSOR, BODY, POSE, jnp.zeros(shape))
+
+
+def test_a_body_with_too_many_faces_is_refused():
+    number = objects.FACE_CLASSES[-1] + 1
+    many = {name: jnp.zeros((number, *getattr(BODY, name).shape[1:])) for name in ("normals", "colors", "uv")}
+    body = dataclasses.replace(BODY, faces=jnp.zeros((number, 3), jnp.int32), **many)
+    for call in (sense, jax.jit(sense)):
+        with pytest.raises(ValueError, match=r"body has 131,073 faces; at most 131,072.*faces="):
+            call(SENSOR, body, POSE, WRENCH)
+
+
+def with_field(sensor, field, value):
+    room, name = field.split(".")
+    return dataclasses.replace(sensor, **{room: dataclasses.replace(getattr(sensor, room), **{name: value})})
+
+
+NEAR = dataclasses.replace(SENSOR, lights=tactile.Leds())
+IMPOSSIBLE = [
+    (SENSOR, "camera.distance", 0.004),
+    (SENSOR, "camera.fov", float("nan")),
+    (SENSOR, "gel.stiffness", 0.0),
+    (SENSOR, "gel.max_depth", 0.006),
+    (SENSOR, "lights.directions", jnp.array([[0.0, 0, 1]] * 4)),
+    (NEAR, "lights.positions", jnp.array([[0.0, 0, -0.004]] * 4)),
+]
+
+
+@pytest.mark.parametrize(("sensor", "field", "value"), IMPOSSIBLE)
+def test_a_known_sensor_that_cannot_be_is_an_error(sensor, field, value):
+    bad = with_field(sensor, field, value)
+    with pytest.raises(ValueError, match=f"field {field}") as checked:
+        bad.check()
+    for call in (functools.partial(sense, bad), jax.jit(functools.partial(sense, bad))):
+        with pytest.raises(ValueError, match=f"field {field}") as error:
+            call(BODY, POSE, WRENCH)
+        assert str(error.value) == str(checked.value)
+
+
+@jax.jit
+def traced(sensor, pose):
+    return sense(sensor, BODY, pose, WRENCH, resolution=(16, 16))
+
+
+def possible(sensor):
+    try:
+        sensor.check()
+    except ValueError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
+def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(lights):
+    start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
+    assert bool(traced(start, POSE).balanced)
+    empty = traced(start, POSE.at[2].set(-1))
+    leaves, structure = jax.tree.flatten(start)
+    refused = 0
+    for index, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(start)):
+        for value in (np.nan, np.inf, -np.inf, 0.0, -1.0, 10.0):
+            bad = value if isinstance(leaf, float) else jnp.full(leaf.shape, value)
+            sensor = structure.unflatten([bad if k == index else v for k, v in enumerate(leaves)])
+            frame = traced(sensor, POSE)
+            words = f"{jax.tree_util.keystr(path)} is {value}"
+            assert all(np.all(np.isfinite(getattr(frame, name))) for name in IMAGES), words
+            if possible(sensor):
+                assert np.any(frame.segmentation) or value == 10, words  # from 10 m away it is smaller than a pixel
+            else:
+                assert not np.any(frame.segmentation), words
+                refused += 1
+                assert not bool(frame.balanced), words
+                np.testing.assert_allclose(frame.visual, empty.visual, atol=1e-6)
+                np.testing.assert_allclose(frame.tactile, empty.tactile, atol=1e-6)
+    assert refused > 3 * len(leaves)  # of six: three are not finite
+
+
+def stl_of_a_million(path):
+    """A ball of a thousand rings, without any help of a library that would take its time."""
+    polar, around = np.meshgrid(np.linspace(0, np.pi, 1002), np.linspace(0, 2 * np.pi, 502), indexing="ij")
+    points = 0.04 * np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
+    a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
+    triangles = np.concatenate([np.stack([a, b, c], -2).reshape(-1, 3, 3), np.stack([a, c, d], -2).reshape(-1, 3, 3)])
+    record = np.zeros(len(triangles), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    record["corners"] = triangles
+    path.write_bytes(bytes(80) + np.uint32(len(record)).tobytes() + record.tobytes())
+    return len(record)
+
+
+def test_a_mesh_of_a_million_faces_is_refused_or_decimated_with_a_line(tmp_path):
+    path = tmp_path / "ball.stl"
+    number = stl_of_a_million(path)
+    assert number > 1_000_000
+    with pytest.raises(ValueError, match=rf"ball\.stl: {number:,} faces, at most 131,072.*faces="):
+        objects.load(path)
+    with pytest.warns(UserWarning, match=r"ball\.stl: decimated from 1,00\d,\d{3} to [\d,]+ faces"):
+        body = objects.load(path, faces=4096)
+    assert body.faces.shape == (4096, 3)
+    # From a million to four thousand at once it grows: here by 4 %, of 20,480 faces by less than 0.5 %.
+    np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), 0.08, rtol=0.05)
