@@ -25,6 +25,7 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -287,7 +288,7 @@ def compilations(number: int = 100) -> None:
     for index in range(number - len(bodies)):
         category = objects.CATEGORIES[index % len(objects.CATEGORIES)]
         bodies.append(objects.make(jax.random.key(index), category))
-    draw = jax.jit(lambda body, pose, wrench: sts.sense(sts.Sensor(), body, pose, wrench))
+    draw: Any = jax.jit(lambda body, pose, wrench: sts.sense(sts.Sensor(), body, pose, wrench))
     for body in bodies:
         poses, wrenches = resting(body, 1)
         draw(body, poses[0], wrenches[0])

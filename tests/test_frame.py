@@ -282,3 +282,25 @@ def test_touch_of_an_imprint_is_the_frames(crop):
 def test_touch_has_no_nan_of_an_imprint_that_has():
     imprint = jnp.full((20, 30), jnp.nan).at[5:9, 6:12].set(0.1)
     assert np.isfinite(np.asarray(sts.touch(sts.Sensor(), imprint))).all()
+
+
+def test_a_touchs_derivative_is_the_finite_difference_at_upright_walls_too():
+    # On the average over pixels: what is compared is smoothed, and its differences are a mean over several steps.
+    sensor = dataclasses.replace(SENSOR, skin=sts.tactile.Skin(coupling=0.001))
+    body, resolution, pitch = letter(), (120, 120), jnp.full(2, 0.15 / 120)
+
+    def touch(shift):
+        turn = jnp.stack([jnp.cos(shift[2] / 2), 0 * shift[2], 0 * shift[2], jnp.sin(shift[2] / 2)])
+        pose = jnp.concatenate([jnp.array([0.0073, -0.0041]) + shift[:2], jnp.full(1, -0.0005), turn])
+        image = sts.sense(sensor, body, pose, resolution=resolution, moving_edges=True).tactile
+        return jnp.stack([sts.tactile.couple(image[..., k], 0.0015, pitch) for k in range(3)])
+
+    here, image = jnp.array([0.0, 0.0, 0.4]), jax.jit(touch)
+    exact = jax.jit(jax.jacfwd(touch))(here)
+    for k, step in enumerate((1e-4, 1e-4, 5e-3)):
+        steps = step * jnp.arange(1, 9)
+        ways = [(image(here.at[k].add(s)) - image(here.at[k].add(-s))) / (2 * s) for s in steps]
+        numeric = sum(ways) / len(ways)
+        lengths = jnp.linalg.norm(exact[..., k]), jnp.linalg.norm(numeric)
+        assert float(jnp.sum(exact[..., k] * numeric) / (lengths[0] * lengths[1])) > 0.98
+        assert float(lengths[0] / lengths[1]) == pytest.approx(1, abs=0.05)

@@ -1,0 +1,244 @@
+"""Where an object lies on the sensor, by descending the derivatives of what the sensor would see of it.
+
+    python -m experiments.fit scissors --out fit.png     # two minutes; any class or mesh file, as experiments.sense
+    python -m experiments.fit mug.obj --longest-side 0.1 --mass 0.3 --sensor soft.json
+
+One tactile image is the target: of the object at rest under its weight, in eight bits. Known are the object, the face
+it rests on and its weight; x, y and yaw are sought from ten starts, each 3 mm and 10 degrees off. Prints a line a start
+and how many end within 0.2 mm and 1 degree (all ten of scissors), and draws the target, the first start, where it ended
+and every start's way. To fit an image of your own, give it to `descend`.
+"""
+
+import dataclasses
+import functools
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+import sts_jax as sts
+from experiments import compilation, sense
+from sts_jax import tactile
+
+# m, of the Gaussian that images are compared under: first as far as the tips of what is 12 cm long move in 10 degrees
+BLURS = (0.012, 0.006, 0.003, 0.0015)
+STEPS = 10  # at most, with each blur
+SETTLED = (1e-5, 1e-5, 1e-3)  # m, m, rad: a step that is shorter is the last with a blur
+OFF = (0.003, 10.0)  # m, degrees: how far off a start is
+GOAL = (0.0002, 1.0)  # m, degrees: what counts as found
+FAINT = 0.25  # of what 3 mm change in the image: if 10 degrees change less, there is no telling the yaw
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(sense.Config):
+    """What lies where, and how often it is sought."""
+
+    mesh: Annotated[str, tyro.conf.Positional]  # a mesh file or the name of a class
+    out: Path = Path("fit.png")  # the picture
+    resolution: tuple[int, int] = (240, 240)  # height and width, pixels
+    position: tuple[float, float] = (0.0073, -0.0041)  # m, of the middle of its bounding box: what is sought
+    turn: float = 23.7  # degrees, about the vertical: what is sought
+    starts: int = 10
+
+    # of experiments.sense alone
+    crop: Annotated[bool, tyro.conf.Suppress] = False
+    light: Annotated[float, tyro.conf.Suppress] = 1.0
+    height: Annotated[float, tyro.conf.Suppress] = 0.0
+
+
+class Slope(NamedTuple):
+    """How an image differs from the target, and how that changes with (x, y, yaw)."""
+
+    image: jax.Array  # (h, w, 3)
+    loss: jax.Array  # (), mean squared difference r
+    gradient: jax.Array  # (3,), J^T r / n
+    curvature: jax.Array  # (3, 3), Gauss and Newton's J^T J / n
+
+
+@functools.partial(jax.jit, static_argnames="resolution")
+def touch(
+    sensor: sts.Sensor, body: sts.objects.Body, pose: jax.Array, wrench: jax.Array, *, resolution: tuple[int, int]
+) -> jax.Array:
+    """The tactile image as a camera has it, in eight bits."""
+    return jnp.round(255 * sts.sense(sensor, body, pose, wrench, resolution=resolution).tactile) / 255
+
+
+def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
+    """A pose shifted by `at[:2]` (m) and turned by `at[2]` (rad) about the vertical through its own origin."""
+    cos, sin = jnp.cos(at[2] / 2), jnp.sin(at[2] / 2)
+    w, x, y, z = pose[3:]
+    turn = jnp.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
+    return jnp.concatenate([pose[:2] + at[:2], pose[2:3], turn])
+
+
+def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
+    """A vertical force whose line of action goes with the object, see `moved`."""
+    force = wrench[2]
+    x, y = -wrench[4] / force - pose[0], wrench[3] / force - pose[1]
+    cos, sin = jnp.cos(at[2]), jnp.sin(at[2])
+    x, y = pose[0] + at[0] + cos * x - sin * y, pose[1] + at[1] + sin * x + cos * y
+    return jnp.stack([jnp.zeros(()), jnp.zeros(()), force, y * force, -x * force, jnp.zeros(())])
+
+
+@functools.partial(jax.jit, static_argnames="resolution")
+def slope(
+    sensor: sts.Sensor,
+    body: sts.objects.Body,
+    pose: jax.Array,
+    wrench: jax.Array,
+    at: jax.Array,
+    target: jax.Array,
+    blur: float,
+    *,
+    resolution: tuple[int, int],
+) -> Slope:
+    """The image of the object moved by `at`, beside the target under a blur (m).
+
+    How deep it sinks in and how it leans is found anew wherever it is. In the derivative both stay what they are: the
+    pad is the same everywhere.
+    """
+    frame = sts.sense(sensor, body, moved(pose, at), carried(wrench, pose, at), resolution=resolution)
+    pitch = frame.window[2:] / jnp.array([resolution[1], resolution[0]])
+
+    def residual(step: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        image = sts.sense(sensor, body, moved(frame.pose, step), resolution=resolution, moving_edges=True).tactile
+        channels = [tactile.couple((image - target)[..., k], blur, pitch) for k in range(3)]
+        return jnp.stack(channels), (jnp.stack(channels), image)
+
+    jacobian, (r, image) = jax.jacfwd(residual, has_aux=True)(jnp.zeros(3))
+    jacobian, r = jacobian.reshape(-1, 3), r.reshape(-1)
+    return Slope(image, jnp.mean(r * r), r @ jacobian / r.size, jacobian.T @ jacobian / r.size)
+
+
+def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> list[tuple[np.ndarray, Slope]]:
+    """Levenberg and Marquardt's steps down the slope, with less and less blur.
+
+    Args:
+        look: the slope at (x, y, yaw) under a blur (m).
+        start: (x, y, yaw): m, m, rad.
+
+    Returns:
+        Where it was, and what it saw there; the start first, and again with each blur.
+    """
+    path, at = [], start
+    for blur in BLURS:
+        here, damping = look(at, blur), 1e-3
+        path.append((at, here))
+        for _ in range(STEPS):
+            curvature = np.asarray(here.curvature, float)
+            matrix = curvature + np.diag(damping * np.diag(curvature) + 1e-12)
+            step = -np.linalg.solve(matrix, np.asarray(here.gradient, float))
+            there = look(at + step, blur)
+            if there.loss < here.loss:
+                at, here, damping = at + step, there, damping / 5
+                path.append((at, here))
+            else:
+                damping *= 10
+            if np.all(np.abs(step) < SETTLED):
+                break
+    return path
+
+
+def errors(at: np.ndarray) -> tuple[float, float]:
+    """How far off (x, y, yaw) is: mm and degrees."""
+    return 1e3 * float(np.hypot(at[0], at[1])), float((np.rad2deg(at[2]) + 180) % 360 - 180)
+
+
+def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
+    """The target, the first start and where it ended, what they lack of it, and all ways in x and y."""
+    (_, first), (_, last) = paths[0][0], paths[0][-1]
+    flat = np.median(target, axis=(0, 1))
+    touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > 0.02
+    rows, columns = (np.flatnonzero(touched.any(axis)) for axis in (1, 0))
+    part = slice(max(rows[0] - 5, 0), rows[-1] + 6), slice(max(columns[0] - 5, 0), columns[-1] + 6)
+
+    figure = Figure(figsize=(13, 8), layout="constrained")
+    axes = figure.subplots(2, 3).ravel()
+    off = ["{:.3f} mm, {:+.2f} degrees off".format(*errors(at)) for at, _ in (paths[0][0], paths[0][-1])]
+    panels = [
+        ("target", target),
+        (f"start, {off[0]}", first.image),
+        (f"end, {off[1]}", last.image),
+        ("start less target", 0.5 + (first.image - target) / 2),
+        ("end less target", 0.5 + (last.image - target) / 2),
+    ]
+    for axis, (title, image) in zip(axes, panels, strict=False):
+        axis.imshow(np.clip(np.asarray(image), 0, 1)[part], interpolation="nearest")
+        axis.set_title(title)
+        axis.set_axis_off()
+    for path in paths:
+        ways = 1e3 * np.stack([at for at, _ in path])
+        axes[5].plot(ways[:, 0], ways[:, 1], "-", color="0.8", zorder=1)
+        turns = [abs(errors(at)[1]) for at, _ in path]
+        points = axes[5].scatter(ways[:, 0], ways[:, 1], c=turns, s=14, vmin=0, vmax=OFF[1], cmap="viridis")
+    figure.colorbar(points, ax=axes[5], label="yaw off by (degrees)")
+    axes[5].set(
+        title=f"the ways of {len(paths)} starts", xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal"
+    )
+    figure.savefig(config.out, dpi=100)
+
+
+def main(config: Config) -> None:
+    """Lay the object on the pad, look once, seek it from every start, draw.
+
+    Raises:
+        ValueError: see `sense.check`; or nothing presses on the pad, or there is no start.
+    """
+    sense.check(config)
+    if config.starts < 1:
+        raise ValueError(f"starts is {config.starts}: give at least 1")
+    if config.force == 0:
+        raise ValueError("force is 0: what does not press leaves no imprint to fit, give one above 0")
+    sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
+    body = sense.read(config, config.mesh)
+    pose, wrench, words = sense.lay(config, body)
+    given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
+    target = touch(sensor, body, *given, resolution=config.resolution)
+    print(f"{config.mesh} on {words}", flush=True)
+
+    def look(at: np.ndarray, blur: float) -> Slope:
+        shift = jnp.asarray(at, jnp.float32)
+        return slope(sensor, body, *given, shift, target, blur, resolution=config.resolution)
+
+    by_shift, by_turn = (
+        np.sqrt(float(look(np.array(at), BLURS[-1]).loss)) for at in ((OFF[0], 0, 0), (0, 0, np.deg2rad(OFF[1])))
+    )
+    if by_turn < FAINT * by_shift:
+        print(
+            f"note: {OFF[1]:g} degrees change the image {by_turn / by_shift:.2f} times as much as {1e3 * OFF[0]:g} mm: "
+            "the footprint is nearly round, and there is no telling its yaw"
+        )
+    random = np.random.default_rng(config.seed)
+    paths, found = [], 0
+    for number in range(config.starts):
+        began, way, sign = time.perf_counter(), random.uniform(0, 2 * np.pi), random.choice([-1, 1])
+        start = np.array([OFF[0] * np.cos(way), OFF[0] * np.sin(way), sign * np.deg2rad(OFF[1])])
+        path = descend(look, start)
+        paths.append(path)
+        (far, turned), loss = errors(path[-1][0]), float(path[-1][1].loss)
+        found += far <= 1e3 * GOAL[0] and abs(turned) <= GOAL[1]
+        print(
+            f"start {number}: {1e3 * start[0]:+.2f}, {1e3 * start[1]:+.2f} mm, {sign * OFF[1]:+.0f} degrees off; end: "
+            f"{far:.3f} mm, {turned:+.2f} degrees off, loss {loss:.1e}; {time.perf_counter() - began:.0f} s",
+            flush=True,
+        )
+    print(f"{found} of {config.starts} within {1e3 * GOAL[0]:g} mm and {GOAL[1]:g} degree")
+    draw(config, np.asarray(target), paths)
+    print(config.out)
+
+
+if __name__ == "__main__":
+    compilation.keep()
+    warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except (OSError, ValueError, ImportError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,95 @@
+"""x, y and yaw found again by descent through the tactile image."""
+
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from experiments import fit
+
+SMALL = (64, 64)
+
+
+@pytest.fixture
+def seven(tmp_path):
+    """A flat 7, 40 mm tall, with upright walls: nothing but its edges tells where it is."""
+    stem, arm = trimesh.creation.box((0.008, 0.04, 0.01)), trimesh.creation.box((0.025, 0.008, 0.01))
+    arm.apply_translation((0.01, 0.016, 0))
+    path = tmp_path / "seven.stl"
+    trimesh.util.concatenate([stem, arm]).export(path)
+    return str(path)
+
+
+def starts(text):
+    """Of each start's line: how far off it began (mm, mm, degrees) and ended (mm, degrees)."""
+    line = r"start \d: (\S+), (\S+) mm, (\S+) degrees off; end: (\S+) mm, (\S+) degrees off, loss \S+; \d+ s\n"
+    return np.array(re.findall(line, text), float)
+
+
+@pytest.mark.parametrize("mesh", ["seven", "scissors"])
+def test_starts_3_mm_and_10_degrees_off_end_within_a_fifth_and_one(mesh, seven, tmp_path, capsys):
+    out = tmp_path / "fit.png"
+    mass = 0.1 if mesh == "seven" else None
+    fit.main(fit.Config(seven if mesh == "seven" else mesh, out=out, mass=mass, resolution=SMALL, starts=3))
+    text = capsys.readouterr().out
+    found = starts(text)
+    np.testing.assert_allclose(np.hypot(found[:, 0], found[:, 1]), 3, atol=0.02)
+    np.testing.assert_allclose(np.abs(found[:, 2]), 10)
+    assert len(np.unique(found[:, 0])) == 3
+    assert np.all(found[:, 3] <= 0.2)
+    assert np.all(np.abs(found[:, 4]) <= 1)
+    assert "3 of 3 within 0.2 mm and 1 degree" in text
+    assert "no telling" not in text
+    picture = np.asarray(Image.open(out).convert("RGB"), float)
+    # lower row: the start differs from the target somewhere, the end (almost) nowhere
+    middle = picture[picture.shape[0] // 2 + 40 : -20]
+    third = picture.shape[1] // 3
+    grey = [np.abs(middle[:, k * third + 40 : (k + 1) * third - 40] - 128).max(-1) for k in range(2)]
+    inside = [(values > 20) & (values < 126) for values in grey]  # neither grey nor paper
+    assert inside[0].mean() > 5 * inside[1].mean()
+
+
+def test_what_is_round_is_said_to_have_no_yaw(tmp_path, capsys):
+    path = tmp_path / "can.stl"
+    trimesh.creation.cylinder(0.02, 0.05, sections=64).export(path)
+    fit.main(fit.Config(str(path), out=tmp_path / "can.png", mass=0.1, resolution=SMALL, starts=1))
+    text = capsys.readouterr().out
+    assert "nearly round, and there is no telling its yaw" in text
+    assert starts(text)[0, 3] <= 0.2  # its place is found all the same
+
+
+def test_pose_and_wrench_go_together():
+    pose = np.array([0.01, -0.02, 0.003, *Rotation.from_euler("xyz", [0.3, -0.2, 1.0]).as_quat()[[3, 0, 1, 2]]])
+    point = np.array([0.004, 0.007])  # where the force acts, relative to the pose's place
+    x, y = pose[:2] + point
+    wrench = np.array([0, 0, 2.0, 2 * y, -2 * x, 0])
+    at = np.array([0.003, -0.001, 0.4])
+    turn = Rotation.from_euler("z", 0.4)
+
+    new = np.asarray(fit.moved(jnp.asarray(pose), jnp.asarray(at)))
+    np.testing.assert_allclose(new[:3], [0.013, -0.021, 0.003], atol=1e-7)
+    wanted = (turn * Rotation.from_quat(pose[[4, 5, 6, 3]])).as_matrix()
+    np.testing.assert_allclose(Rotation.from_quat(new[[4, 5, 6, 3]]).as_matrix(), wanted, atol=1e-6)
+
+    x, y = new[:2] + turn.apply([*point, 0])[:2]
+    force = fit.carried(jnp.asarray(wrench), jnp.asarray(pose), jnp.asarray(at))
+    np.testing.assert_allclose(force, [0, 0, 2, 2 * y, -2 * x, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"starts": 0}, "starts is 0: give at least 1"),
+        ({"force": 0.0}, "force is 0: what does not press"),
+        ({"mesh": "teapot"}, "teapot: no such file, nor one of the classes"),
+        ({"resolution": (0, 64)}, "at least 1 pixel"),
+    ],
+)
+def test_what_cannot_be_fitted_is_named(tmp_path, changes, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        fit.main(fit.Config(**{"mesh": "scissors", "out": tmp_path / "a.png"} | changes))
+    assert not list(tmp_path.iterdir())
