@@ -1,6 +1,6 @@
 """What cannot be seen: whether it decides the outcome, whether touch tells it, whether pictures give it away.
 
-    python -m benchmarks.hidden                 # the jerked pad, about 25 minutes on two CPU cores
+    python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
     python -m benchmarks.hidden outcomes truth  # some of: outcomes truth pictures fill
     python -m benchmarks.hidden --keep FOLDER   # keep how the starts began and ended there, and go on from that
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # of what `benchmarks.soak` kept
@@ -58,8 +58,8 @@ class Counts:
     objects: int = 200
     num: int = 16  # starts of each
     again: int = 8  # of these, rolled again
-    others: int = 400  # objects that networks learn on
-    steps: int = 1000  # of the networks
+    others: int = 800  # objects that networks learn on
+    steps: int = 1500  # of the networks
 
 
 class Lesson(NamedTuple):
