@@ -5,8 +5,8 @@
 
 One tactile image is the target: of the object at rest under its weight, in eight bits. Known are the object, the face
 it rests on and its weight; x, y and yaw are sought from ten starts, each 3 mm and 10 degrees off. Prints a line a start
-and how many end within 0.2 mm and 1 degree (of scissors, fork and mouse all ten; of scissors with `--seed 1` eight), and
-draws the target, the first start, where it ended and every start's way. To fit an image of your own, give it to
+and how many end within 0.2 mm and 1 degree (of scissors, fork and mouse all ten; of scissors with `--seed 1` eight),
+and draws the target, the first start, where it ended and every start's way. To fit an image of your own, give it to
 `descend`.
 """
 
