@@ -57,7 +57,7 @@ def rasterise(
 
     group = min(_GROUP, num_faces)
     different = (faces[:, 0] != faces[:, 1]) | (faces[:, 0] != faces[:, 2])
-    real = jnp.max(jnp.where(different, jnp.arange(1, num_faces + 1), 0))
+    real = jnp.max(jnp.where(different, jnp.arange(1, num_faces + 1, dtype=jnp.int32), 0))
 
     def corners_of(chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
         a, b, c = ((across[k], down[k], order[k]) for k in (faces[chosen, 0], faces[chosen, 1], faces[chosen, 2]))
@@ -66,7 +66,7 @@ def rasterise(
     def collect(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         """Of a group of faces, those that have candidates: from which number on, which they are, how wide."""
         base, count, total, entries = state
-        face = jnp.minimum(base, num_faces - group) + jnp.arange(group)
+        face = jnp.minimum(base, num_faces - group) + jnp.arange(group, dtype=jnp.int32)
         a, b, c = corners_of(face)
         area = _cross(a, b, c)
         # Seen along +z with x right and y down, a face that looks at us runs counter-clockwise: negative area.
@@ -83,13 +83,13 @@ def rasterise(
         rows = jnp.clip(jnp.floor(bottom + _SLACK), -1, height - 1) - _first_row(top, height) + 1
         drawn &= (face >= base) & (_lowest(a[2], b[2], c[2]) < farthest) & ~outside & ~empty & (rows > 0)
         number = jnp.where(drawn, rows * columns, 0).astype(jnp.int32)
-        upto = jnp.cumsum(jnp.stack([number, number > 0], axis=1), axis=0)
+        upto = jnp.cumsum(jnp.stack([number, number > 0], axis=1), axis=0, dtype=jnp.int32)
         place = jnp.where(number > 0, count + upto[:, 1] - 1, len(entries))
         entry = jnp.stack([total + upto[:, 0] - number, face, columns.astype(jnp.int32)], axis=1)
         return base + group, count + upto[-1, 1], total + upto[-1, 0], entries.at[place].set(entry, mode="drop")
 
     zero = jnp.int32(0)
-    none = jnp.full((num_faces + chunk, 3), jnp.iinfo(jnp.int32).max)
+    none = jnp.full((num_faces + chunk, 3), jnp.iinfo(jnp.int32).max, jnp.int32)
     _, _, total, entries = jax.lax.while_loop(lambda state: state[0] < real, collect, (zero, zero, zero, none))
 
     face_bits = max((num_faces - 1).bit_length(), 1)
@@ -100,8 +100,8 @@ def rasterise(
         base, current, image = state
         candidate = base + jnp.arange(chunk, dtype=jnp.int32)
         # Every face has a candidate, so no more than `chunk` faces begin among these: the next ones of the list.
-        begins = jax.lax.dynamic_slice(entries, (current + 1, 0), (chunk, 1))[:, 0] - base
-        of = current + jnp.cumsum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"))
+        begins = jax.lax.dynamic_slice(entries, (current + 1, zero), (chunk, 1))[:, 0] - base
+        of = current + jnp.cumsum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"), dtype=jnp.int32)
         following = of[-1] + (entries[of[-1] + 1, 0] == base + chunk)
         begin, face, columns = (entries[of, k] for k in range(3))
         a, b, c = corners_of(face)
