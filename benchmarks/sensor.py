@@ -1,6 +1,6 @@
 """Whole frames per second of `sense` beside embree's depth, and what they cost from small to large.
 
-    python -m benchmarks.sensor             # about 4 minutes on two CPU cores
+    python -m benchmarks.sensor             # about 10 minutes on two CPU cores, most of it compilation
     python -m benchmarks.sensor --taxim     # a minute: touch from a height map, beside taxim's renderer in JAX
     python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory; writes a plot
     python -m benchmarks.sensor --compile   # 2 minutes: how often a hundred objects compile
