@@ -8,15 +8,19 @@
 The first draws objects at rest on the pad with the wrench of their weight: the gel's balance, both streams, depth and
 segmentation, beside three ways to have embree trace the depth alone of the same faces and poses: `traced`, with
 embreex itself, every ray of an image in one call, its scene built beforehand; `built`, the same with the scene built
-anew for each pose, as a moving object needs it; `trimesh`, as one calls it from Python (`mesh.ray`). All in turn,
-medians; a ratio is embree's seconds over ours. Below it, the share of each stage in ours, and at 640x480 how many times
-quicker than the paper's code, which takes 0.40 s a frame of this size on a CPU of this kind (its own renderer and
-shader, measured by us elsewhere, without its physics).
+anew for each pose, as a moving object needs it; `trimesh`, as one calls it from Python (`mesh.ray`). Each in one
+thread, and in as many as there are cores: a call of ours keeps little more than one busy, and `dataset.collect` draws
+so too. All in turn, medians; a ratio is embree's seconds over ours, in as many threads. Off the CPU ours are batched
+instead. Below it, the share of each stage in ours, and at 640x480 how many times quicker than the paper's code, which
+takes 0.40 s a frame of this size on a CPU of this kind (its own renderer and shader, measured by us elsewhere, without
+its physics).
 """
 
 import argparse
+import concurrent.futures
 import functools
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -36,7 +40,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from sts_jax import _math, objects, optics, tactile
+from sts_jax import _math, frame, objects, optics, tactile
 
 SIZES = ((64, 64), (200, 200), (480, 640))
 FACES = (None, 2000, 5000)  # None: as the class has them
@@ -89,8 +93,8 @@ def resting(body: objects.Body, number: int = POSES) -> Inputs:
     return poses, jnp.stack([zero, zero, zero + force, places[:, 1] * force, -places[:, 0] * force, zero], 1)
 
 
-def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, Callable[[], object]]:
-    """Depth of every pose, by name of the way to ask for it."""
+def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, list[Callable[[], object]]]:
+    """What gives the depth of each pose, by name of the way to ask for it."""
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
@@ -116,9 +120,9 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
     scenes = [scene(vertices) for vertices in posed]
     meshes = [trimesh.Trimesh(vertices, faces, process=False) for vertices in posed]
     return {
-        "traced": lambda: [trace(made) for made in scenes],
-        "built": lambda: [trace(scene(vertices)) for vertices in posed],
-        "trimesh": lambda: [asked(mesh) for mesh in meshes],
+        "traced": [functools.partial(trace, made) for made in scenes],
+        "built": [functools.partial(lambda vertices: trace(scene(vertices)), vertices) for vertices in posed],
+        "trimesh": [functools.partial(asked, mesh) for mesh in meshes],
     }
 
 
@@ -155,12 +159,23 @@ def frames(
 
 def speed() -> None:
     """Print one row per object and size, then stages."""
-    print(
-        f"{'object':9} {'faces':>6} {'image':>9} | ours /s: map     vmap | {'embree /s: traced':>17}    built  trimesh",
-        end="",
-    )
-    print(" | ratio to traced  built trimesh")
+    cores = os.cpu_count() or 1
+    on_cpu = jax.default_backend() == "cpu"
+    every = f"{cores} threads" if on_cpu else "batched"
+    print(f"frames /s, and embree's seconds over ours: traced, built, trimesh; {jax.devices()[0].device_kind}")
+    print(f"{'object':9} {'faces':>6} {'image':>9} | {'one thread':>37} | {every:>37}")
     stages = []
+    pool = concurrent.futures.ThreadPoolExecutor(cores)
+
+    def call(work: Callable[[], object]) -> object:
+        return jax.block_until_ready(work())
+
+    def in_turn(works: list[Callable[[], object]]) -> Callable[[], object]:
+        return lambda: [call(work) for work in works]
+
+    def in_threads(works: list[Callable[[], object]]) -> Callable[[], object]:
+        return lambda: list(pool.map(call, works))
+
     for category in CATEGORIES:
         for faces in FACES:
             body = finer(objects.make(jax.random.key(0), category), faces)
@@ -169,21 +184,25 @@ def speed() -> None:
                 asked = [(), ("pressure",), ("depth",), ("visual",), ("tactile",)]
                 ours = [functools.partial(frames, body, inputs, shape=shape, fields=fields) for fields in asked]
                 batched = functools.partial(frames, body, inputs, shape=shape, batched=True)
-                others = embree(body, inputs[0], shape)
-                times = median_seconds(*ours, batched, *others.values())
-                whole, gel, depth, visual, touch, by_vmap, *theirs = (seconds / POSES for seconds in times)
-                best = min(whole, by_vmap)
-                rates = f"{1 / whole:12.1f} {1 / by_vmap:8.1f} | {1 / theirs[0]:17.0f}"
-                rates += "".join(f" {1 / seconds:8.0f}" for seconds in theirs[1:])
-                ratios = f"{theirs[0] / best:15.2f} {theirs[1] / best:6.2f} {theirs[2] / best:7.2f}"
+                at_once = in_threads([ours[0]] * cores) if on_cpu else batched
+                others = list(embree(body, inputs[0], shape).values())
+                threaded = [in_threads(works * cores) for works in others]
+                times = median_seconds(*ours, at_once, *map(in_turn, others), *threaded)
+                whole, gel, depth, visual, touch = (seconds / POSES for seconds in times[:5])
+                best = times[5] / POSES / (cores if on_cpu else 1)
+                alone, together = (np.array(some) / POSES for some in (times[6:9], times[9:]))
                 name = f"{category:9} {count(body):6} {shape[1]:4}x{shape[0]:<4}"
-                print(f"{name} | {rates} | {ratios}", flush=True)
+                row = [f"{name} |"]
+                for mine, theirs in ((whole, alone), (best, together / cores)):
+                    row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
+                print(" ".join(row[:-1]), flush=True)
                 shares = [gel, depth - gel, visual - depth, touch - depth]
-                row = " ".join(f"{100 * share / whole:9.0f}" for share in shares)
+                line = " ".join(f"{100 * share / whole:9.0f}" for share in shares)
                 stages.append(
-                    f"{name} | {1e3 * whole:8.2f} ms {row}"
+                    f"{name} | {1e3 * whole:8.2f} ms {line}"
                     + (f"   {PAPER / best:.1f} times the paper's" if shape == (480, 640) else "")
                 )
+    pool.shutdown()
     print("\nshare of each stage, %: the frame less what does without it (they need not sum to 100)")
     print(f"{'object':9} {'faces':>6} {'image':>9} | {'frame':>11} {'gel':>9} {'depth':>9} {'vision':>9} {'touch':>9}")
     print("\n".join(stages))
@@ -288,11 +307,11 @@ def compilations(number: int = 100) -> None:
     for index in range(number - len(bodies)):
         category = objects.CATEGORIES[index % len(objects.CATEGORIES)]
         bodies.append(objects.make(jax.random.key(index), category))
-    draw: Any = jax.jit(lambda body, pose, wrench: sts.sense(sts.Sensor(), body, pose, wrench))
     for body in bodies:
         poses, wrenches = resting(body, 1)
-        draw(body, poses[0], wrenches[0])
-    print(f"{len(bodies)} objects, {len(files)} of them loaded: sense compiled {draw._cache_size()} times")
+        sts.sense(sts.Sensor(), body, poses[0], wrenches[0])
+    program: Any = frame._sense
+    print(f"{len(bodies)} objects, {len(files)} of them loaded: sense compiled {program._cache_size()} times")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Work where there is something to see: an image function on the tiles that need it, with the whole image's gradient.
 
 Most of a sensor's image is empty. `where_active` cuts it into square tiles and walks, batch by batch, those that hold
-an active pixel, so that an image costs what is on it and not its size.
+an active pixel, so that an image costs what is on it and not its size. Where much of it is active, and under `vmap`,
+the function is called once, with the whole image.
 """
 
 import functools
@@ -14,6 +15,7 @@ from jaxtyping import Array, Bool
 
 TILE = 8  # pixels, side of a tile
 BATCH = 8  # tiles done at a time
+CROWDED = 0.4  # of the tiles; with more of them active the whole image is done at once, on all cores
 
 Images = Any  # a tree of images (height, width)
 Function = Callable[[Any, Images], Images]
@@ -52,6 +54,27 @@ def _dense(function: Function, active: Bool[Array, "h w"], params: Any, images: 
 def _where_active(
     function: Function, ring: int, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images
 ) -> Images:
+    leaves, structure = jax.tree.flatten((active, params, images, otherwise))
+
+    @jax.custom_batching.custom_vmap
+    def chosen(*leaves: Array) -> Images:
+        return _sparse(function, ring, *jax.tree.unflatten(structure, leaves))
+
+    @chosen.def_vmap
+    def batched(_size: int, in_batched: list[bool], *leaves: Array) -> tuple[Images, Images]:
+        # A loop over batched tiles goes on until the last image is done, and copies all of them in every turn.
+        def whole(*leaves: Array) -> Images:
+            return _dense(function, *jax.tree.unflatten(structure, leaves))
+
+        result = jax.vmap(whole, in_axes=[0 if one else None for one in in_batched])(*leaves)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return chosen(*leaves)
+
+
+def _sparse(
+    function: Function, ring: int, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images
+) -> Images:
     height, width = active.shape
     rows, columns = -(-height // TILE), -(-width // TILE)
     number = rows * columns
@@ -85,7 +108,11 @@ def _where_active(
 
         return base + BATCH, jax.tree.map(put, result, values)
 
-    return jax.lax.while_loop(lambda state: state[0] < end, body, (jnp.int32(0), otherwise))[1]
+    return jax.lax.cond(
+        end > CROWDED * number,
+        lambda: _dense(function, active, params, images, otherwise),
+        lambda: jax.lax.while_loop(lambda state: state[0] < end, body, (jnp.int32(0), otherwise))[1],
+    )
 
 
 @_where_active.defjvp

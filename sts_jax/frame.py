@@ -53,6 +53,9 @@ def sense(
     gel's face has fallen off: the images are those of an empty sensor. So they are where pose or wrench are not
     finite; `balanced` is False then.
 
+    It compiles itself, once for every resolution and size class of bodies (their faces and texture), and serves as
+    well inside other compiled functions, `vmap` and `grad`.
+
     A sensor that cannot be (`Sensor.check`) raises an error. Constants that are traced, as all are when a sensor is an
     argument of a jitted function, are not known in time for that: where they make a sensor that cannot be, the images
     are those of an empty one with the default's constants in their place, never NaN, and `balanced` is False.
@@ -77,6 +80,26 @@ def sense(
     """
     _check_shapes(body, pose, wrench, resolution)
     sensor, sound = sensor.guard()
+    # What is not drawn is left out: things of one size then share a program, whatever collides or is inside.
+    body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
+    height, width = (int(n) for n in resolution)
+    return _sense(
+        sensor, sound, body, pose, wrench, resolution=(height, width), crop=bool(crop), moving_edges=bool(moving_edges)
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("resolution", "crop", "moving_edges"))
+def _sense(
+    sensor: Sensor,
+    sound: Bool[Array, ""] | bool,
+    body: Body,
+    pose: Float[Array, "7"],
+    wrench: Float[Array, "6"] | None,
+    *,
+    resolution: tuple[int, int],
+    crop: bool,
+    moving_edges: bool,
+) -> Frame:
     finite = sound & jnp.all(jnp.isfinite(pose)) & (_math.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
     if wrench is not None:
         finite &= jnp.all(jnp.isfinite(wrench))
@@ -190,9 +213,14 @@ def touch(
     Returns:
         Image, in [0, 1]: `Frame.tactile` of this imprint, where images are not so small that `sense` samples finer.
     """
-    rows, columns = imprint.shape
     if window is None:
-        window = optics.full_window(sensor.camera, (rows, columns))
+        window = optics.full_window(sensor.camera, imprint.shape)
+    return _touch(sensor, imprint, window)
+
+
+@jax.jit
+def _touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"]) -> Float[Array, "h w 3"]:
+    rows, columns = imprint.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])
     slopes = optics.rays(sensor.camera, seen, (rows + 2, columns + 2))

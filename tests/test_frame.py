@@ -10,7 +10,8 @@ import trimesh
 from optics_bodies import body_mesh, embree, from_trimesh, interior
 
 import sts_jax as sts
-from sts_jax import objects
+from sts_jax import frame as frame_module
+from sts_jax import objects, tactile
 
 SENSOR = sts.Sensor()
 SIZES = [(64, 64), (97, 53), (200, 200)]
@@ -304,3 +305,14 @@ def test_a_touchs_derivative_is_the_finite_difference_at_upright_walls_too():
         lengths = jnp.linalg.norm(exact[..., k]), jnp.linalg.norm(numeric)
         assert float(jnp.sum(exact[..., k] * numeric) / (lengths[0] * lengths[1])) > 0.98
         assert float(lengths[0] / lengths[1]) == pytest.approx(1, abs=0.05)
+
+
+def test_one_program_serves_bodies_that_collide_and_hold_otherwise():
+    body, other = (sts.objects.make(jax.random.key(0), category) for category in ("bottle", "fork"))
+    other = dataclasses.replace(other, hulls=other.hulls[:, :32], interior=other.interior[:8])
+    assert body.hulls.shape != other.hulls.shape
+    pose = jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
+    sts.sense(SENSOR, body, pose, resolution=(24, 24))
+    before = frame_module._sense._cache_size()
+    sts.sense(dataclasses.replace(SENSOR, phong=tactile.Phong(ambient=0.7)), other, pose, resolution=(24, 24))
+    assert frame_module._sense._cache_size() == before
