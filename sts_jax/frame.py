@@ -214,7 +214,8 @@ def touch(
         Image, in [0, 1]: `Frame.tactile` of this imprint, where images are not so small that `sense` samples finer.
     """
     if window is None:
-        window = optics.full_window(sensor.camera, imprint.shape)
+        rows, columns = imprint.shape
+        window = optics.full_window(sensor.camera, (rows, columns))
     return _touch(sensor, imprint, window)
 
 
