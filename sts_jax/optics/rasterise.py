@@ -1,9 +1,9 @@
 """Which face each pixel sees: a z-buffer in plain JAX, for triangles of any size on screen.
 
-Every face is cut into the pixel centres it can cover, row by row: as many columns as its widest row is wide. The list
-of these (face, pixel) candidates is walked in chunks, so the work follows what is covered and not the number of faces
-times pixels. Each chunk is one scatter-min of a 32-bit key, depth in its high bits and the face's index in its low
-ones. All of this decides and has no gradient; what is interpolated from the winning face has.
+Every face is cut into its rows of pixels, and these, where it is wide, into runs of a few pixels. The list of runs is
+walked in chunks, and a chunk column by column, so the work follows what is covered and not the number of faces times
+pixels. Each step is one scatter-min of a 32-bit key, depth in its high bits and the face's index in its low ones. All
+of this decides and has no gradient; what is interpolated from the winning face has.
 
 Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. `order` is smaller for
 what is nearer and affine across a face on the screen: -1/depth in a pinhole's view, depth itself in a parallel one.
@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 _SLACK = 1e-4  # pixels by which faces are grown, so that no pixel centre on a shared edge falls between two
 _GROUP = 1024  # faces prepared at a time
+_RUN = 8  # pixels, longest run
 _Corner = tuple[Array, Array, Array]  # column, row, order
 _NOTHING = np.uint32(0xFFFFFFFF)
 
@@ -31,7 +32,7 @@ def rasterise(
     shape: tuple[int, int],
     *,
     farthest: ScalarLike = jnp.inf,
-    chunk: int = 1024,
+    chunk: int = 512,
 ) -> Int[Array, "h w"]:
     """Index of the nearest face at every pixel centre.
 
@@ -44,7 +45,7 @@ def rasterise(
         two_sided: whether faces are seen from behind too.
         shape: (height, width) of the image, pixels.
         farthest: faces no corner of which is of an order below it are left out.
-        chunk: candidates tested at a time.
+        chunk: runs walked at a time.
 
     Returns:
         Face indices, -1 where no face is seen. No gradient.
@@ -52,19 +53,19 @@ def rasterise(
     height, width = shape
     num_faces = faces.shape[0]
     points, order, farthest = jax.lax.stop_gradient((points, order, farthest))
-    across, down = points[:, 0], points[:, 1]
-    first, last = jnp.min(jnp.where(keep, order, jnp.inf)), jnp.max(jnp.where(keep, order, -jnp.inf))
+    points_x, points_y = points[:, 0], points[:, 1]
+    nearest, last = jnp.min(jnp.where(keep, order, jnp.inf)), jnp.max(jnp.where(keep, order, -jnp.inf))
 
     group = min(_GROUP, num_faces)
     different = (faces[:, 0] != faces[:, 1]) | (faces[:, 0] != faces[:, 2])
     real = jnp.max(jnp.where(different, jnp.arange(1, num_faces + 1, dtype=jnp.int32), 0))
 
     def corners_of(chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
-        a, b, c = ((across[k], down[k], order[k]) for k in (faces[chosen, 0], faces[chosen, 1], faces[chosen, 2]))
+        a, b, c = ((points_x[k], points_y[k], order[k]) for k in faces[chosen].T)
         return a, b, c
 
     def collect(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        """Of a group of faces, those that have candidates: from which number on, which they are, how wide."""
+        """Of a group of faces, those that have runs: from which number on, which they are, runs in a row."""
         base, count, total, entries = state
         face = jnp.minimum(base, num_faces - group) + jnp.arange(group, dtype=jnp.int32)
         a, b, c = corners_of(face)
@@ -82,10 +83,11 @@ def rasterise(
         columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
         rows = jnp.clip(jnp.floor(bottom + _SLACK), -1, height - 1) - _first_row(top, height) + 1
         drawn &= (face >= base) & (_lowest(a[2], b[2], c[2]) < farthest) & ~outside & ~empty & (rows > 0)
-        number = jnp.where(drawn, rows * columns, 0).astype(jnp.int32)
+        across = jnp.ceil(columns / _RUN)
+        number = jnp.where(drawn, rows * across, 0).astype(jnp.int32)
         upto = jnp.cumsum(jnp.stack([number, number > 0], axis=1), axis=0, dtype=jnp.int32)
         place = jnp.where(number > 0, count + upto[:, 1] - 1, len(entries))
-        entry = jnp.stack([total + upto[:, 0] - number, face, columns.astype(jnp.int32)], axis=1)
+        entry = jnp.stack([total + upto[:, 0] - number, face, across.astype(jnp.int32)], axis=1)
         return base + group, count + upto[-1, 1], total + upto[-1, 0], entries.at[place].set(entry, mode="drop")
 
     zero = jnp.int32(0)
@@ -94,16 +96,16 @@ def rasterise(
 
     face_bits = max((num_faces - 1).bit_length(), 1)
     levels = 2.0 ** min(32 - face_bits, 23) - 2
-    scale = levels / jnp.where(last > first, last - first, 1)
+    scale = levels / jnp.where(last > nearest, last - nearest, 1)
 
     def body(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         base, current, image = state
-        candidate = base + jnp.arange(chunk, dtype=jnp.int32)
-        # Every face has a candidate, so no more than `chunk` faces begin among these: the next ones of the list.
+        run = base + jnp.arange(chunk, dtype=jnp.int32)
+        # Every face has a run, so no more than `chunk` faces begin among these: the next ones of the list.
         begins = jax.lax.dynamic_slice(entries, (current + 1, zero), (chunk, 1))[:, 0] - base
         of = current + jnp.cumsum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"), dtype=jnp.int32)
         following = of[-1] + (entries[of[-1] + 1, 0] == base + chunk)
-        begin, face, columns = (entries[of, k] for k in range(3))
+        begin, face, across = (entries[of, k] for k in range(3))
         a, b, c = corners_of(face)
         a, b = _by_row(a, b)
         b, c = _by_row(b, c)
@@ -113,7 +115,7 @@ def rasterise(
         safe_area = jnp.where(area == 0, 1, area)
         slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
         slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
-        line = (candidate - begin) // columns
+        line = (run - begin) // across
         row = _first_row(y0, height) + line
         long = x0 + (x2 - x0) * _fraction(row, y0, y2)
         short = jnp.where(row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2))
@@ -121,14 +123,20 @@ def rasterise(
         flat = y2 - y0 <= 1e-3
         start = jnp.where(flat, _lowest(x0, x1, x2), jnp.minimum(long, short))
         stop = jnp.where(flat, _highest(x0, x1, x2), jnp.maximum(long, short))
-        column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + (candidate - begin - line * columns)
-        live = (candidate < total) & (column <= stop + _SLACK) & (column < width)
+        column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + _RUN * (run - begin - line * across)
+        length = jnp.clip(jnp.minimum(jnp.floor(stop + _SLACK), width - 1) - column + 1, 0, _RUN)
+        length = jnp.where(run < total, length, 0).astype(jnp.int32)
         value = o0 + slope_x * (column - x0) + slope_y * (row - y0)
-        value = jnp.clip(value, _lowest(o0, o1, o2), _highest(o0, o1, o2))
-        level = jnp.clip((value - first) * scale, 0, levels).astype(jnp.uint32)
-        key = (level << face_bits) | face.astype(jnp.uint32)
-        pixel = jnp.where(live, row.astype(jnp.int32) * width + column.astype(jnp.int32), height * width)
-        return base + chunk, following, image.at[pixel].min(key, mode="drop")
+        least, most = _lowest(o0, o1, o2), _highest(o0, o1, o2)
+        pixel = row.astype(jnp.int32) * width + column.astype(jnp.int32)
+
+        def step(along: Array, image: Array) -> Array:
+            level = jnp.clip((jnp.clip(value + slope_x * along, least, most) - nearest) * scale, 0, levels)
+            key = (level.astype(jnp.uint32) << face_bits) | face.astype(jnp.uint32)
+            return image.at[jnp.where(along < length, pixel + along, height * width)].min(key, mode="drop")
+
+        image = jax.lax.fori_loop(zero, jnp.max(length), step, image)
+        return base + chunk, following, image
 
     blank = jnp.full(height * width, _NOTHING)
     _, _, image = jax.lax.while_loop(lambda state: state[0] < total, body, (zero, zero, blank))

@@ -8,15 +8,12 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, ScalarLike
 
 _NEWTON_STEPS = 20  # at most
 _SETTLED = 1e-7  # m, a step shorter than this is the last
 _ENOUGH = 0.5  # of the energy's slope along a whole step may be left at its end; else a shorter one is tried
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
-_SIDE = 10  # cells, of the squares that are solved for, or left out, as one
-_FEW = 32  # squares solved for at first
-_NEAR = 0.003  # m over the deepest imprint: what lies within it is solved for at first
 _LEVER = 0.02  # m, by which tilts are scaled
 _BOTTOM = 300.0  # how many times stiffer the springs are beyond the deepest imprint
 _FAR = 1.0  # m, stands for the height where there is no object
@@ -118,29 +115,10 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     tilt = jnp.tan(gel.max_tilt) * _LEVER
     bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
 
-    # Few cells are pressed: first only squares of cells near the lowest one are solved for. That is the whole solution
-    # if it presses none that was left out; else all are solved for.
-    squares, squares_x, squares_y = _squares(height, x, y)
-    lowest = jnp.min(squares, axis=1)
-    touch = jnp.min(lowest)
+    touch = jnp.min(height)
     reach = touch <= gel.max_depth
     start = jnp.stack([touch + gel.max_depth, jnp.float32(0), jnp.float32(0)])
-    number = len(lowest)
-
-    def solve(chosen: Int[Array, "n"]) -> Float[Array, "3"]:
-        cells = squares.at[chosen].get(mode="fill", fill_value=_FAR)
-        shape = (len(chosen), _SIDE, _SIDE)
-        own_x = jnp.broadcast_to(squares_x[chosen % len(squares_x)][:, None, :], shape)
-        own_y = jnp.broadcast_to(squares_y[chosen // len(squares_x) % len(squares_y)][:, :, None], shape)
-        basis = jnp.stack([jnp.ones(cells.size), own_y.reshape(-1), own_x.reshape(-1)])
-        return _newton(cells.reshape(-1), basis, target, start, bound, gel.max_depth)
-
-    (few,) = jnp.nonzero(lowest < touch + gel.max_depth + _NEAR, size=min(_FEW, number), fill_value=number)
-    u = solve(few)
-    left_out = jnp.ones(number, bool).at[few].set(False, mode="drop").reshape(len(squares_y), len(squares_x))
-    left_out = left_out.repeat(_SIDE, axis=0).repeat(_SIDE, axis=1)[: gel.cells[0], : gel.cells[1]]
-    missed = jnp.any(left_out & (_plane(u, x, y) > height))
-    u = jax.lax.cond(missed, lambda: solve(jnp.arange(number)), lambda: u)
+    u = _newton(height, x, y, target, start, bound, gel.max_depth)
 
     u = jnp.where(pressed & reach, u, 0)
     length = jnp.where(pressed & reach, jnp.clip(_plane(u, x, y) - height, 0, gel.max_depth), 0)
@@ -156,89 +134,80 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     )
 
 
-def _squares(
-    height: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]
-) -> tuple[Float[Array, "n k"], Float[Array, "a s"], Float[Array, "b s"]]:
-    """Heights square by square, and the x and y of each column and row of squares; beyond the grid nothing is near."""
-    down, across = ((0, -n % _SIDE) for n in height.shape)
-    column, row = jnp.pad(x, across).reshape(-1, _SIDE), jnp.pad(y, down).reshape(-1, _SIDE)
-    squares = jnp.pad(height, (down, across), constant_values=_FAR).reshape(len(row), _SIDE, len(column), _SIDE)
-    return squares.swapaxes(1, 2).reshape(-1, _SIDE * _SIDE), column, row
-
-
 def _newton(
-    height: Float[Array, "n"],
-    basis: Float[Array, "3 n"],
+    height: Float[Array, "r c"],
+    x: Float[Array, "c"],
+    y: Float[Array, "r"],
     target: Float[Array, "3"],
     start: Float[Array, "3"],
     bound: Float[Array, "3"],
     limit: Scalar,
 ) -> Float[Array, "3"]:
-    """The plane `u . basis` whose springs to `height` have the moments `target`, or what comes nearest in bounds."""
+    """The plane `u0 + u1 y + u2 x` whose springs to `height` have the moments `target`, or what comes nearest."""
     near_bound = 0.9999 * bound
-
-    def plane(u: Float[Array, "3"], basis: Float[Array, "3 n"]) -> Float[Array, "n"]:
-        return u[0] * basis[0] + u[1] * basis[1] + u[2] * basis[2]
 
     def pushed(length: Array) -> Array:
         return jnp.maximum(length, 0) + _BOTTOM * jnp.maximum(length - limit, 0)
 
-    def curvature(length: Float[Array, "n"], basis: Float[Array, "3 n"]) -> Float[Array, "3 3"]:
+    def slopes(
+        u: Float[Array, "3"], height: Array, x: Array, y: Array, target: Array
+    ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        """Of the energy: its gradient and its Hessian, a little stiffened."""
+        length = _plane(u, x, y) - height
         weight = (length > 0) + _BOTTOM * (length > limit)
-        full = (weight[None, :] * basis) @ basis.T
-        return full + (1e-6 + 1e-5 * full[0, 0]) * jnp.eye(3)
+        gradient = _moments(pushed(length), x, y) - target
+        s = _sums(weight, x, y, 2)
+        full = jnp.stack([s[0, 0], s[1, 0], s[0, 1], s[1, 0], s[2, 0], s[1, 1], s[0, 1], s[1, 1], s[0, 2]])
+        return gradient, full.reshape(3, 3) + (1e-6 + 1e-5 * s[0, 0]) * jnp.eye(3)
 
-    def newton(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, u, _ = state
-        length = plane(u, fixed_basis) - fixed_height
-        gradient = fixed_basis @ pushed(length) - fixed_target
+    def newton(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        count, u, _, gradient, matrix = state
         held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
-        matrix = curvature(length, fixed_basis)
         step = -_solve(matrix, gradient, held)
         # At a limit, and still led beyond it by the other unknowns: without this one.
         held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
         step = -_solve(matrix, gradient, held)
         room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
         step = step * jnp.clip(jnp.min(jnp.where(step == 0, 1, room)), 0, 1)
-        along = plane(step, fixed_basis)
 
-        def slope(part: float) -> Float[Array, ""]:
-            return jnp.abs(jnp.sum(pushed(length + part * along) * along) - jnp.sum(step * fixed_target))
+        def at(part: ScalarLike) -> tuple[Array, tuple[Array, Array]]:
+            return u + part * step, slopes(u + part * step, *fixed)
 
-        def shorter() -> Float[Array, ""]:
-            slopes = jnp.stack([slope(part) for part in _STEP_LENGTHS])
-            return jnp.array(_STEP_LENGTHS)[jnp.argmin(slopes)]
+        def shorter() -> tuple[Array, tuple[Array, Array]]:
+            parts = jnp.array(_STEP_LENGTHS)
+            left = jax.lax.map(lambda part: jnp.abs(jnp.sum(step * at(part)[1][0])), parts)
+            return at(parts[jnp.argmin(left)])
 
-        whole = slope(1.0) <= _ENOUGH * jnp.abs(jnp.sum(step * gradient))
-        u = u + jax.lax.cond(whole, lambda: jnp.ones(()), shorter) * step
-        return count + 1, u, jnp.max(jnp.abs(step))
+        whole = at(1.0)
+        enough = jnp.abs(jnp.sum(step * whole[1][0])) <= _ENOUGH * jnp.abs(jnp.sum(step * gradient))
+        u, (gradient, matrix) = jax.lax.cond(enough, lambda: whole, shorter)
+        return count + 1, u, jnp.max(jnp.abs(step)), gradient, matrix
 
-    def unsettled(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+    def unsettled(state: tuple[Array, ...]) -> Bool[Array, ""]:
         return (state[0] < _NEWTON_STEPS) & (state[2] > _SETTLED)
 
-    fixed_basis, fixed_height, fixed_target = jax.lax.stop_gradient((basis, height, target))
-    first = (jnp.int32(0), jax.lax.stop_gradient(start), jnp.array(jnp.inf))
-    u = jax.lax.stop_gradient(jax.lax.while_loop(unsettled, newton, first)[1])
+    fixed = jax.lax.stop_gradient((height, x, y, target))
+    first = jax.lax.stop_gradient(start)
+    state = jax.lax.while_loop(unsettled, newton, (jnp.int32(0), first, jnp.array(jnp.inf), *slopes(first, *fixed)))
+    u = jax.lax.stop_gradient(state[1])
 
-    length = plane(u, basis) - height
-    gradient = basis @ pushed(length) - target
-    matrix = jax.lax.stop_gradient(curvature(length, basis))
-    return jnp.clip(u - _solve(matrix, gradient, jnp.abs(u) >= near_bound), -bound, bound)
+    gradient, matrix = slopes(u, height, x, y, target)
+    return jnp.clip(u - _solve(jax.lax.stop_gradient(matrix), gradient, jnp.abs(u) >= near_bound), -bound, bound)
 
 
 def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "r c"]:
     return (u[0] + u[1] * y)[:, None] + (u[2] * x)[None, :]
 
 
-def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3 3"]:
-    """`sum value y^i x^j`, as two matrix products."""
-    powers_x = jnp.stack([jnp.ones_like(x), x, x * x], axis=1)
-    powers_y = jnp.stack([jnp.ones_like(y), y, y * y], axis=0)
-    return powers_y @ (value @ powers_x)
+def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"], degree: int) -> Float[Array, "k k"]:
+    """`sum value y^i x^j` at [i, j]."""
+    # Sums along columns, one by one: products of matrices as narrow as this are several times slower on a CPU.
+    rows = [jnp.sum(value, axis=0), *(y**power @ value for power in range(1, degree + 1))]
+    return jnp.stack(rows) @ jnp.stack([x**power for power in range(degree + 1)], axis=1)
 
 
 def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"]) -> Float[Array, "3"]:
-    sums = _sums(value, x, y)
+    sums = _sums(value, x, y, 1)
     return jnp.stack([sums[0, 0], sums[1, 0], sums[0, 1]])
 
 
