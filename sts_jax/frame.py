@@ -410,14 +410,16 @@ def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tup
         of_corner = [[share * of_face[..., size * k + i] for k, share in enumerate(shares)] for i in range(size)]
         return [first + second + third for first, second, third in of_corner]
 
+    # Plane by plane, and stacked for what takes vectors: an axis of three, if worked on, is slow on a CPU.
     across = inside(normals)
-    normal = _math.normalize(
-        jnp.stack([row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn], -1)
-    )
-    towards = normal[..., 0] * slope_x + normal[..., 1] * slope_y + normal[..., 2]
-    normal = jnp.where((two_sided & (towards > 0))[..., None], -normal, normal)
-    albedo = jnp.stack(inside(colors), axis=-1)
-    albedo *= optics.sample_texture(texture, jnp.stack(inside(uv), axis=-1))
+    normal = [row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn]
+    square = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
+    towards = normal[0] * slope_x + normal[1] * slope_y + normal[2]
+    scale = jnp.where(square > 0, jax.lax.rsqrt(jnp.where(square > 0, square, 1)), 0)
+    scale = jnp.where(two_sided & (towards > 0), -scale, scale)
+    normal = jnp.stack([scale * part for part in normal], axis=-1)
+    sampled = optics.sample_texture(texture, jnp.stack(inside(uv), axis=-1))
+    albedo = jnp.stack([color * sampled[..., k] for k, color in enumerate(inside(colors))], axis=-1)
     height = jnp.where(winner >= 0, depth, 1) - sensor.camera.distance
     return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
 
