@@ -34,7 +34,7 @@ def where_active(
             comes by its arguments.
         active: where the result is wanted.
         params: passed on, whole.
-        images: tree of (h + 2 ring, w + 2 ring).
+        images: tree of (h + 2 ring, w + 2 ring); one of a single row or column stands for an image of such.
         otherwise: tree of (h, w), as `function` returns them.
         ring: pixels around each pixel.
 
@@ -47,7 +47,9 @@ def where_active(
 
 
 def _dense(function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images) -> Images:
-    return jax.tree.map(lambda value, other: jnp.where(active, value, other), function(params, images), otherwise)
+    shape = jnp.broadcast_shapes(*(image.shape for image in jax.tree.leaves(images)))
+    values = function(params, jax.tree.map(lambda image: jnp.broadcast_to(image, shape), images))
+    return jax.tree.map(lambda value, other: jnp.where(active, value, other), values, otherwise)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
@@ -87,23 +89,24 @@ def _sparse(
     first_row = jnp.minimum(order // columns * TILE, height - TILE)
     first_column = jnp.minimum(order % columns * TILE, width - TILE)
 
-    def places(corners: list[Array], side: int) -> Array:
-        """Where a batch's pixels lie in an image of `side - TILE` more pixels a row, read row by row."""
-        # Tiles along the last axis: there a processor's vector units work best.
-        row, column = (corner + jnp.arange(side, dtype=jnp.int32)[:, None] for corner in corners)
-        return row[:, None] * (width + side - TILE) + column[None, :]
-
     def body(state: tuple[Array, Images]) -> tuple[Array, Images]:
         base, result = state
-        corners = [jax.lax.dynamic_slice(first, (base,), (BATCH,)) for first in (first_row, first_column)]
-        around, own = places(corners, TILE + 2 * ring), places(corners, TILE)
-        if ring == 0:
-            around = around.reshape(1, -1)
-        parts = jax.tree.map(lambda image: image.reshape(-1).at[around].get(mode="promise_in_bounds"), images)
-        if ring == 0:
-            values = function(params, parts)
-        else:
-            values = jax.vmap(function, in_axes=(None, -1), out_axes=-1)(params, parts)
+        # Tiles along the last axis: there a processor's vector units work best.
+        row, column = (jax.lax.dynamic_slice(first, (base,), (BATCH,)) for first in (first_row, first_column))
+        inside = jnp.arange(TILE, dtype=jnp.int32)[:, None]
+        own = (row + inside)[:, None] * width + (column + inside)[None, :]
+
+        def take(image: Array) -> Array:
+            side = jnp.arange(TILE + 2 * ring, dtype=jnp.int32)[:, None]
+            down = (row + side)[:, None] * (image.shape[1] if image.shape[0] > 1 else 0)
+            across = (column + side)[None, :] * (1 if image.shape[1] > 1 else 0)
+            # What no neighbour takes part in is done in one line.
+            place = down + across if ring else (down + across).reshape(1, -1)
+            return image.reshape(-1).at[place].get(mode="promise_in_bounds")
+
+        parts = jax.tree.map(take, images)
+        many = jax.vmap(function, in_axes=(None, -1), out_axes=-1) if ring else function
+        values = many(params, parts)
         wanted = active.reshape(-1).at[own].get(mode="promise_in_bounds")
         own = jnp.where(wanted, own, height * width).reshape(-1)
 

@@ -16,7 +16,8 @@ from sts_jax._tiles import where_active
 from sts_jax.objects.body import FACE_CLASSES, Body
 from sts_jax.sensor import Sensor
 
-_Corners = tuple[Float[Array, "v 3"], Int[Array, "f 3"]]  # place on the screen and a third value; faces' corners
+# vertices' column and row on the screen and a third value; faces' corners
+_Corners = tuple[tuple[Float[Array, "v"], Float[Array, "v"], Float[Array, "v"]], Int[Array, "f 3"]]
 _UNTOUCHED = 1e-8  # m, an imprint that changes no picture: what the skin's coupling leaves far from a contact
 
 
@@ -109,7 +110,7 @@ def _sense(
     safe_pose = jnp.concatenate([safe_pose[:3], _math.normalize(safe_pose[3:])])
 
     points = _math.transform(safe_pose, body.vertices)
-    present = jnp.max(points[:, 2]) > 0
+    present = _math.most(points[:, 2]) > 0
     heights = underside(sensor.gel, body, points, present)
     if wrench is None:
         contact = tactile.indent(sensor.gel, heights)
@@ -224,11 +225,11 @@ def _touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4
     rows, columns = imprint.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])
-    slopes = optics.rays(sensor.camera, seen, (rows + 2, columns + 2))
+    slopes = _lines(optics.rays(sensor.camera, seen, (rows + 2, columns + 2)))
     imprint = jnp.where(imprint > 0, jnp.minimum(imprint, sensor.gel.thickness), 0)
     lit = _lit(sensor, jnp.pad(imprint, 1, mode="edge"), seen, pitch, slopes)
-    x, y = (slope[1:-1, 1:-1] * sensor.camera.distance for slope in slopes)
-    walls = _pad(sensor, x, y)[1]
+    x, y = (slope * sensor.camera.distance for slope in slopes)
+    walls = _pad(sensor, x[:, 1:-1], y[1:-1])[1]
     return jnp.stack([jnp.clip(channel * walls, 0, 1) for channel in lit], axis=-1)
 
 
@@ -247,18 +248,17 @@ def underside(
         Heights (m), `inf` where nothing within the gel's reach lies over a cell.
     """
     rows, columns = gel.cells
-    scale = jnp.stack([columns / jnp.asarray(gel.size[0]), rows / jnp.asarray(gel.size[1])])
-    middle = jnp.array([columns, rows], jnp.float32) / 2
-    places = points[:, :2] * scale[None, :] + middle[None, :] - 0.5
-    height = points[:, 2]
+    across, down, height = (points[:, k] for k in range(3))
     # No part can reach the gel that is higher over first touch than depth and tilts bring it down.
-    low, high = jnp.min(points[:, :2], axis=0), jnp.max(points[:, :2], axis=0)
-    reach = gel.max_depth + jnp.tan(gel.max_tilt) * jnp.sum(high - low)
+    extent = sum(_math.most(part) - _math.least(part) for part in (across, down))
+    farthest = _math.least(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
+    across = (across / gel.size[0] + 0.5) * columns - 0.5
+    down = (down / gel.size[1] + 0.5) * rows - 0.5
     keep = jnp.broadcast_to(present, height.shape)
-    farthest = jnp.min(height) + reach
+    places = jnp.stack([across, down], axis=-1)
     winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells, farthest=farthest)
-    corners = jnp.concatenate([places, height[:, None]], axis=1), body.faces
-    images = (winner, *optics.pixel_centres(gel.cells))
+    corners = (across, down, height), body.faces
+    images = (winner, *_lines(optics.pixel_centres(gel.cells)))
     return where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
 
 
@@ -285,21 +285,21 @@ def _draw(
     pixels, far = optics.to_pixels(camera, seen, shape, points)
     inverse = 1 / jnp.maximum(far, camera.near)
     winner = optics.rasterise(pixels, -inverse, body.faces, present & (far > camera.near), body.two_sided, shape)
-    corners = jnp.concatenate([pixels, inverse[:, None]], axis=1), body.faces
-    centres = optics.pixel_centres(shape)
+    corners = (pixels[:, 0], pixels[:, 1], inverse), body.faces
+    centres = _lines(optics.pixel_centres(shape))
     depth = where_active(_depth, winner >= 0, corners, (winner, *centres), jnp.full(shape, jnp.inf))
 
     # seen through the skin
-    slopes = optics.rays(camera, seen, shape)
+    slopes = _lines(optics.rays(camera, seen, shape))
     x, y = (slope * camera.distance for slope in slopes)  # where the rays cross the gel's face
     on_pad, walls = _pad(sensor, x, y)
-    hidden = optics.hidden_sky(heights, gel.size, jnp.max(points[:, 2]), x[0], y[:, 0])
+    hidden = optics.hidden_sky(heights, gel.size, _math.most(points[:, 2]), x[0], y[:, 0])
     square_radius = (x * 2 / gel.size[0]) ** 2 + (y * 2 / gel.size[1]) ** 2
     empty = _planes(optics.empty_view(sensor.room, square_radius, walls, hidden))
-    inner = tuple(image[1:-1, 1:-1] for image in (winner, depth, *centres, *slopes, hidden, *empty))
     surface = (body.normals, body.colors, body.uv, body.texture, body.two_sided)
     params = (sensor, surface, corners, _math.quat_matrix(pose[3:]))
-    visual = where_active(_look, (winner >= 0)[1:-1, 1:-1] & on_pad[1:-1, 1:-1], params, inner, list(inner[-3:]))
+    images = (winner, depth, *centres, *slopes, hidden, *empty)
+    visual = [v[1:-1, 1:-1] for v in where_active(_look, (winner >= 0) & on_pad, params, images, empty)]
     visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in _pixels(visual, stride)]
 
     # the skin itself
@@ -309,7 +309,7 @@ def _draw(
     imprint = jnp.where(touched, jnp.minimum(face - followed, gel.thickness), 0)
     if moving_edges:
         follows = touched & (face - depth < gel.thickness)
-        imprint = _carried(imprint, corners, (winner, *centres), depth, on_pad, follows)
+        imprint = _carried(imprint, corners, (winner, *optics.pixel_centres(shape)), depth, on_pad, follows)
     lit = [channel * walls[1:-1, 1:-1] for channel in _lit(sensor, imprint, seen, pitch, slopes)]
     lit = [jnp.clip(channel, 0, 1) for channel in _pixels(lit, stride)]
     depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
@@ -317,14 +317,18 @@ def _draw(
 
 
 def _pad(
-    sensor: Sensor, x: Float[Array, "a b"], y: Float[Array, "a b"]
+    sensor: Sensor, x: Float[Array, "1 b"], y: Float[Array, "a 1"]
 ) -> tuple[Bool[Array, "a b"], Float[Array, "a b"]]:
     """Where rays pass through the pad, and how bright what lies beyond it is over the pad."""
     width, height = sensor.gel.size
     # Its edge is the image's: no rounding.
     on_pad = (jnp.abs(x * 2 / width) <= 1.0001) & (jnp.abs(y * 2 / height) <= 1.0001)
-    places = jnp.stack([x, y], axis=-1)
-    return on_pad, optics.housing(sensor.room, on_pad, places, sensor.gel.size, sensor.camera.distance)
+    # Of two walls the one is seen that the ray is farther out over: the darker.
+    sides = (jnp.stack([x, 0 * x], axis=-1), jnp.stack([0 * y, y], axis=-1))
+    walls = (
+        optics.housing(sensor.room, jnp.bool_(False), side, sensor.gel.size, sensor.camera.distance) for side in sides
+    )
+    return on_pad, jnp.where(on_pad, 1, jnp.minimum(*walls))
 
 
 def _lit(
@@ -332,14 +336,14 @@ def _lit(
     imprint: Float[Array, "a b"],
     window: Float[Array, "4"],
     pitch: Float[Array, "2"],
-    slopes: tuple[Float[Array, "a b"], Float[Array, "a b"]],
+    slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
     """The lit skin on samples of an imprint, without the outermost, which are there for their neighbours' normals."""
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
     shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else ()
-    x, y = (slope[1:-1, 1:-1] * sensor.camera.distance for slope in slopes)
-    flat = jnp.stack([x, y, jnp.zeros_like(x)], axis=-1)
+    x, y = slopes[0][:, 1:-1] * sensor.camera.distance, slopes[1][1:-1] * sensor.camera.distance
+    flat = jnp.stack(jnp.broadcast_arrays(x, y, jnp.zeros(())), axis=-1)
     untouched = tactile.phong(
         sensor.phong, sensor.lights, jnp.broadcast_to(jnp.array([[[0.0, 0.0, -1.0]]]), flat.shape), flat
     )
@@ -378,10 +382,11 @@ def _carried(
 def _carried_jvp(primals: tuple, tangents: tuple) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     imprint, (values, faces), (winner, column, row), depth, on_pad, follows = primals
     of_face = faces[jnp.maximum(winner, 0)]
-    weights = optics.barycentrics([values[of_face[..., k], :2] for k in range(3)], column, row)
-    motion = [tangents[1][0][of_face[..., k]] for k in range(3)]
+    of_face = [of_face[..., k] for k in range(3)]
+    weights = optics.barycentrics([(values[0][k], values[1][k]) for k in of_face], column, row)
+    motion = [[part[k] for part in tangents[1][0]] for k in of_face]
     across, down, nearing = (
-        functools.reduce(operator.add, (weight * m[..., i] for weight, m in zip(weights, motion, strict=True)))
+        functools.reduce(operator.add, (weight * m[i] for weight, m in zip(weights, motion, strict=True)))
         for i in range(3)
     )
     change = tangents[0] + jnp.where(follows, nearing * jnp.where(follows, depth, 1) ** 2, 0)
@@ -447,9 +452,9 @@ def _shares(
     """Weight of each corner of the winning face times its third value; its first two are its place on the screen."""
     values, faces = corners
     of_face = faces[jnp.maximum(winner, 0)]
-    a, b, c = (values[of_face[..., k]] for k in range(3))
-    weights = optics.barycentrics([corner[..., :2] for corner in (a, b, c)], column, row)
-    return [weight * corner[..., 2] for weight, corner in zip(weights, (a, b, c), strict=True)]
+    corner = [of_face[..., k] for k in range(3)]
+    weights = optics.barycentrics([(values[0][k], values[1][k]) for k in corner], column, row)
+    return [weight * values[2][k] for weight, k in zip(weights, corner, strict=True)]
 
 
 def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array, "h w"]]:
@@ -458,6 +463,11 @@ def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array
         return samples
     rows = [0.5 * s[1:-1:2] + 0.25 * (s[:-2:2] + s[2::2]) for s in samples]
     return [0.5 * r[:, 1:-1:2] + 0.25 * (r[:, :-2:2] + r[:, 2::2]) for r in rows]
+
+
+def _lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
+    """Of an image of columns and one of rows, one row and one column: the others are alike."""
+    return images[0][:1], images[1][:, :1]
 
 
 def _planes(image: Float[Array, "h w 3"]) -> list[Float[Array, "h w"]]:

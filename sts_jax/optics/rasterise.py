@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
+from sts_jax import _math
+
 _SLACK = 1e-4  # pixels by which faces are grown, so that no pixel centre on a shared edge falls between two
 _GROUP = 1024  # faces prepared at a time
 _RUN = 8  # pixels, longest run
@@ -54,11 +56,11 @@ def rasterise(
     num_faces = faces.shape[0]
     points, order, farthest = jax.lax.stop_gradient((points, order, farthest))
     points_x, points_y = points[:, 0], points[:, 1]
-    nearest, last = jnp.min(jnp.where(keep, order, jnp.inf)), jnp.max(jnp.where(keep, order, -jnp.inf))
+    nearest, last = _math.least(jnp.where(keep, order, jnp.inf)), _math.most(jnp.where(keep, order, -jnp.inf))
 
     group = min(_GROUP, num_faces)
     different = (faces[:, 0] != faces[:, 1]) | (faces[:, 0] != faces[:, 2])
-    real = jnp.max(jnp.where(different, jnp.arange(1, num_faces + 1, dtype=jnp.int32), 0))
+    real = _math.most(jnp.where(different, jnp.arange(1, num_faces + 1, dtype=jnp.int32), 0))
 
     def corners_of(chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
         a, b, c = ((points_x[k], points_y[k], order[k]) for k in faces[chosen].T)
@@ -145,7 +147,9 @@ def rasterise(
 
 
 def barycentrics(
-    corners: Sequence[Float[Array, "*n 2"]], column: Float[Array, "*n"], row: Float[Array, "*n"]
+    corners: Sequence[tuple[Float[Array, "*n"], Float[Array, "*n"]]],
+    column: Float[Array, "*n"],
+    row: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
     """Weights of a face's corners at a place on the screen, affine on the screen.
 
@@ -159,7 +163,7 @@ def barycentrics(
         without area.
     """
     # Relative to the place: in absolute pixels float32 loses per cents on slivers.
-    a, b, c = ((corner[..., 0] - column, corner[..., 1] - row) for corner in corners)
+    a, b, c = ((x - column, y - row) for x, y in corners)
     area = _cross(a, b, c)
     ok = area != 0
     area = jnp.where(ok, area, 1)

@@ -4,6 +4,8 @@ Light is added up in linear units; `to_srgb` is the last step of an image. What 
 """
 
 import dataclasses
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -113,8 +115,8 @@ def hidden_sky(
 
     def pool(value: Float[Array, "r c"]) -> Float[Array, "a b"]:
         value = jnp.pad(value, padding)
-        shape = (value.shape[0] // blocks[0], blocks[0], value.shape[1] // blocks[1], blocks[1])
-        return jnp.sum(value.reshape(shape), axis=(1, 3))
+        value = functools.reduce(operator.add, (value[k :: blocks[0]] for k in range(blocks[0])))
+        return functools.reduce(operator.add, (value[:, k :: blocks[1]] for k in range(blocks[1])))
 
     there = jnp.isfinite(heights)
     count = pool(there.astype(jnp.float32))
@@ -123,16 +125,15 @@ def hidden_sky(
     rows, columns = covered.shape
     pitch_y, pitch_x = (s / n * b for s, n, b in zip(size[::-1], heights.shape, blocks, strict=True))
 
-    lowest = jnp.clip(jnp.min(heights), _LOWEST, 1)
+    lowest = jnp.clip(_math.least(jnp.min(heights, axis=0)), _LOWEST, 1)
     highest = jnp.maximum(top, lowest)
     hidden = jnp.zeros_like(covered)
     for share in (k / (_SLICES - 1) for k in range(_SLICES)):
         z = lowest ** (1 - share) * highest**share
         part = covered * jnp.clip(2 - height / z, 0, 1) * (top > 0)
         hidden = jnp.maximum(hidden, _cast(rows, pitch_y / z) @ part @ _cast(columns, pitch_x / z).T)
-    down = _spline(rows, (y + size[1] / 2) / pitch_y - 0.5)
-    across = _spline(columns, (x + size[0] / 2) / pitch_x - 0.5)
-    return down @ hidden @ across.T
+    across = _spline(jnp.eye(columns), (x + size[0] / 2) / pitch_x - 0.5)
+    return _spline(hidden @ across.T, (y + size[1] / 2) / pitch_y - 0.5)
 
 
 def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
@@ -143,11 +144,16 @@ def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
     return 0.5 * (edge / jnp.sqrt(edge * edge + 1) - away / jnp.sqrt(away * away + 1))
 
 
-def _spline(number: int, place: Float[Array, "n"]) -> Float[Array, "n m"]:
-    """Weights of so many samples, at whole numbers, at each place between them."""
-    off = jnp.abs(jnp.clip(place, 0, number - 1)[:, None] - jnp.arange(number)[None, :])
-    weights = jnp.where(off < 0.5, 0.75 - off * off, 0.5 * jnp.maximum(1.5 - off, 0) ** 2)
-    return weights / jnp.sum(weights, axis=1, keepdims=True)
+def _spline(rows: Float[Array, "n k"], place: Float[Array, "m"]) -> Float[Array, "m k"]:
+    """Quadratic spline between rows, which lie at whole numbers; beyond the ends is the last of them."""
+    last = rows.shape[0] - 1
+    place = jnp.clip(place, 0, last)
+    nearest = jnp.round(place)
+    off = (place - nearest)[:, None]
+    weights = 0.5 * (0.5 - off) ** 2, 0.75 - off * off, 0.5 * (0.5 + off) ** 2
+    index = nearest.astype(jnp.int32)
+    before, behind = jnp.maximum(index - 1, 0), jnp.minimum(index + 1, last)
+    return weights[0] * rows[before] + weights[1] * rows[index] + weights[2] * rows[behind]
 
 
 def housing(

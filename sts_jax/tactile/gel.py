@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, ScalarLike
 
+from sts_jax import _math
+
 _NEWTON_STEPS = 20  # at most
 _SETTLED = 1e-7  # m, a step shorter than this is the last
 _ENOUGH = 0.5  # of the energy's slope along a whole step may be left at its end; else a shorter one is tried
@@ -115,7 +117,7 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     tilt = jnp.tan(gel.max_tilt) * _LEVER
     bound = jnp.stack([jnp.float32(jnp.inf), tilt, tilt])
 
-    touch = jnp.min(height)
+    touch = _math.least(jnp.min(height, axis=0))
     reach = touch <= gel.max_depth
     start = jnp.stack([touch + gel.max_depth, jnp.float32(0), jnp.float32(0)])
     u = _newton(height, x, y, target, start, bound, gel.max_depth)
