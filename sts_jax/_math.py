@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 _LANES = 32  # numbers that a reduction takes one by one
 
@@ -36,6 +36,25 @@ def least(values: Array) -> Array:
 def most(values: Array) -> Array:
     """`jnp.max` of a vector, as `least`."""
     return _fold(jnp.maximum, jnp.max, values)
+
+
+def running_sum(counts: Array) -> Int[Array, "n"]:
+    """`jnp.cumsum` of whole numbers whose sum is below 2^24, by products with triangles of ones: quicker on a CPU."""
+    size = len(counts)
+    rows = -(-size // _LANES)
+    table = jnp.pad(counts.astype(jnp.float32), (0, rows * _LANES - size)).reshape(rows, _LANES)
+    sums = jnp.matmul(table, jnp.triu(jnp.ones((_LANES, _LANES))), precision=jax.lax.Precision.HIGHEST)
+    sums = sums.astype(jnp.int32)
+    if rows > 1:
+        sums = sums.at[1:].add(running_sum(sums[:-1, -1])[:, None])
+    return sums.reshape(-1)[:size]
+
+
+def positions(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
+    """Which flags are set, in order; what is left is filled with their number, n."""
+    size = len(flags)
+    place = jnp.where(flags, running_sum(flags) - 1, size)
+    return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
 
 
 def _fold(pair: Callable[[Array, Array], Array], whole: Callable[[Array], Array], values: Array) -> Array:

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from sts_jax import _math
+
 TILE = 4  # pixels, side of a tile
 BATCH = 64  # tiles done at a time
 CROWDED = 0.4  # of the tiles; with more of them active the whole image is done at once, on all cores
@@ -83,7 +85,7 @@ def _sparse(
     flags = jnp.pad(active, [(0, rows * TILE - height), (0, columns * TILE - width)])
     used = jnp.any(flags.reshape(rows, TILE, columns, TILE), axis=(1, 3)).reshape(number)
     end = jnp.sum(used)
-    (order,) = jnp.nonzero(used, size=-(-number // BATCH) * BATCH, fill_value=number)
+    order = jnp.pad(_math.positions(used), (0, -number % BATCH), constant_values=number)
     # The last row and column of tiles overlap those before them, so that a tile lies in the image; what fills up the
     # last batch is one of them, done once more.
     first_row = jnp.minimum(order // columns * TILE, height - TILE)
@@ -94,12 +96,12 @@ def _sparse(
         # Tiles along the last axis: there a processor's vector units work best.
         row, column = (jax.lax.dynamic_slice(first, (base,), (BATCH,)) for first in (first_row, first_column))
         inside = jnp.arange(TILE, dtype=jnp.int32)[:, None]
-        own = (row + inside)[:, None] * width + (column + inside)[None, :]
+        own = (row[None, :] + inside)[:, None] * width + (column[None, :] + inside)[None, :]
 
         def take(image: Array) -> Array:
             side = jnp.arange(TILE + 2 * ring, dtype=jnp.int32)[:, None]
-            down = (row + side)[:, None] * (image.shape[1] if image.shape[0] > 1 else 0)
-            across = (column + side)[None, :] * (1 if image.shape[1] > 1 else 0)
+            down = (row[None, :] + side)[:, None] * (image.shape[1] if image.shape[0] > 1 else 0)
+            across = (column[None, :] + side)[None, :] * (1 if image.shape[1] > 1 else 0)
             # What no neighbour takes part in is done in one line.
             place = down + across if ring else (down + across).reshape(1, -1)
             return image.reshape(-1).at[place].get(mode="promise_in_bounds")

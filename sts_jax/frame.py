@@ -105,11 +105,10 @@ def _sense(
     if wrench is not None:
         finite &= jnp.all(jnp.isfinite(wrench))
         wrench = jnp.where(finite, wrench, 0)
-    away = jnp.array([0.0, 0, -1, 1, 0, 0, 0])
-    safe_pose = jnp.where(finite, pose, away)
+    safe_pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
     safe_pose = jnp.concatenate([safe_pose[:3], _math.normalize(safe_pose[3:])])
 
-    points = _math.transform(safe_pose, body.vertices)
+    points = _placed(finite, safe_pose, body.vertices, jnp.full_like(body.vertices, -1))
     present = _math.most(points[:, 2]) > 0
     heights = underside(sensor.gel, body, points, present)
     if wrench is None:
@@ -122,7 +121,7 @@ def _sense(
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
     position = _math.transform(jnp.concatenate([drop, turn]), safe_pose[:3])
     drawn = jnp.concatenate([position, _math.quat_multiply(turn, safe_pose[3:])])
-    points = _math.transform(drawn, body.vertices)
+    points = _placed(pressing, drawn, body.vertices, points)
 
     if crop:
         window = optics.object_window(
@@ -143,6 +142,15 @@ def _sense(
         pressure=contact.pressure,
         window=window,
     )
+
+
+def _placed(
+    so: Bool[Array, ""], pose: Float[Array, "7"], vertices: Float[Array, "v 3"], otherwise: Float[Array, "v 3"]
+) -> Float[Array, "v 3"]:
+    """Vertices in the sensor frame, x, y and z each by itself in memory."""
+    # What comes out of a condition is kept; else XLA works it out anew wherever it is needed.
+    planes = jax.lax.cond(so, lambda: tuple(_math.transform(pose, vertices).T), lambda: tuple(otherwise.T))
+    return jnp.stack(planes, axis=-1)
 
 
 def _check_shapes(body: Body, pose: Any, wrench: Any, resolution: Any) -> None:
@@ -326,7 +334,8 @@ def _pad(
     # Of two walls the one is seen that the ray is farther out over: the darker.
     sides = (jnp.stack([x, 0 * x], axis=-1), jnp.stack([0 * y, y], axis=-1))
     walls = (
-        optics.housing(sensor.room, jnp.bool_(False), side, sensor.gel.size, sensor.camera.distance) for side in sides
+        optics.housing(sensor.room, jnp.zeros(side.shape[:-1], bool), side, sensor.gel.size, sensor.camera.distance)
+        for side in sides
     )
     return on_pad, jnp.where(on_pad, 1, jnp.minimum(*walls))
 
@@ -417,12 +426,11 @@ def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tup
 
     # Plane by plane, and stacked for what takes vectors: an axis of three, if worked on, is slow on a CPU.
     across = inside(normals)
-    normal = [row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn]
-    square = normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2
-    towards = normal[0] * slope_x + normal[1] * slope_y + normal[2]
-    scale = jnp.where(square > 0, jax.lax.rsqrt(jnp.where(square > 0, square, 1)), 0)
-    scale = jnp.where(two_sided & (towards > 0), -scale, scale)
-    normal = jnp.stack([scale * part for part in normal], axis=-1)
+    nx, ny, nz = (row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn)
+    square = nx * nx + ny * ny + nz * nz
+    scale = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    scale = jnp.where(two_sided & (nx * slope_x + ny * slope_y + nz > 0), -scale, scale)
+    normal = jnp.stack([scale * nx, scale * ny, scale * nz], axis=-1)
     sampled = optics.sample_texture(texture, jnp.stack(inside(uv), axis=-1))
     albedo = jnp.stack([color * sampled[..., k] for k, color in enumerate(inside(colors))], axis=-1)
     height = jnp.where(winner >= 0, depth, 1) - sensor.camera.distance

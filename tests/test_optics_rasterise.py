@@ -25,7 +25,8 @@ def draw(vertices, faces, two_sided, pose, shape):
     inverse = 1 / jnp.maximum(depth, CAMERA.near)
     winner = optics.rasterise(pixels, -inverse, faces, depth > CAMERA.near, two_sided, shape)
     corners = pixels[faces][jnp.maximum(winner, 0)]
-    weights = optics.barycentrics([(corners[..., k, 0], corners[..., k, 1]) for k in range(3)], *optics.pixel_centres(shape))
+    places = [(corners[..., k, 0], corners[..., k, 1]) for k in range(3)]
+    weights = optics.barycentrics(places, *optics.pixel_centres(shape))
     corners = inverse[faces][jnp.maximum(winner, 0)]
     return jnp.where(winner >= 0, 1 / sum(w * corners[..., k] for k, w in enumerate(weights)), jnp.inf), winner
 

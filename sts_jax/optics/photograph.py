@@ -54,8 +54,8 @@ def photograph(
     inverse = 1 / jnp.maximum(depth, 0.01)
     winner = rasterise(pixels, -inverse, faces, depth > 0.01, jnp.asarray(two_sided), shape)
     nearest = jnp.maximum(winner, 0)
-    corners = [pixels[faces[:, k]][nearest] for k in range(3)]
-    weights = barycentrics([(corner[..., 0], corner[..., 1]) for corner in corners], *pixel_centres(shape))
+    places = [pixels[faces[:, k]][nearest] for k in range(3)]
+    weights = barycentrics([(place[..., 0], place[..., 1]) for place in places], *pixel_centres(shape))
     shares = [w * inverse[faces[:, k]][nearest] for k, w in enumerate(weights)]
     total = shares[0] + shares[1] + shares[2]
     corners = jnp.concatenate([normals, albedo], -1)[nearest]

@@ -34,7 +34,7 @@ def rasterise(
     shape: tuple[int, int],
     *,
     farthest: ScalarLike = jnp.inf,
-    chunk: int = 512,
+    chunk: int = 1024,
 ) -> Int[Array, "h w"]:
     """Index of the nearest face at every pixel centre.
 
@@ -105,7 +105,7 @@ def rasterise(
         run = base + jnp.arange(chunk, dtype=jnp.int32)
         # Every face has a run, so no more than `chunk` faces begin among these: the next ones of the list.
         begins = jax.lax.dynamic_slice(entries, (current + 1, zero), (chunk, 1))[:, 0] - base
-        of = current + jnp.cumsum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"), dtype=jnp.int32)
+        of = current + _math.running_sum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"))
         following = of[-1] + (entries[of[-1] + 1, 0] == base + chunk)
         begin, face, across = (entries[of, k] for k in range(3))
         a, b, c = corners_of(face)
@@ -117,7 +117,7 @@ def rasterise(
         safe_area = jnp.where(area == 0, 1, area)
         slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
         slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
-        line = (run - begin) // across
+        line = jnp.floor((run - begin + 0.5) / across)  # whole numbers below 2^22: exact
         row = _first_row(y0, height) + line
         long = x0 + (x2 - x0) * _fraction(row, y0, y2)
         short = jnp.where(row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2))

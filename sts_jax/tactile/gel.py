@@ -162,7 +162,7 @@ def _newton(
         full = jnp.stack([s[0, 0], s[1, 0], s[0, 1], s[1, 0], s[2, 0], s[1, 1], s[0, 1], s[1, 1], s[0, 2]])
         return gradient, full.reshape(3, 3) + (1e-6 + 1e-5 * s[0, 0]) * jnp.eye(3)
 
-    def newton(state: tuple[Array, ...]) -> tuple[Array, ...]:
+    def newton(state: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
         count, u, _, gradient, matrix = state
         held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
         step = -_solve(matrix, gradient, held)
@@ -185,7 +185,7 @@ def _newton(
         u, (gradient, matrix) = jax.lax.cond(enough, lambda: whole, shorter)
         return count + 1, u, jnp.max(jnp.abs(step)), gradient, matrix
 
-    def unsettled(state: tuple[Array, ...]) -> Bool[Array, ""]:
+    def unsettled(state: tuple[Array, Array, Array, Array, Array]) -> Bool[Array, ""]:
         return (state[0] < _NEWTON_STEPS) & (state[2] > _SETTLED)
 
     fixed = jax.lax.stop_gradient((height, x, y, target))
