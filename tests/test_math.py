@@ -1,4 +1,4 @@
-"""Closed-form eigenvectors against LAPACK, and their gradients against finite differences."""
+"""Closed-form eigenvectors against LAPACK, their gradients against differences; reductions against NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -86,3 +86,14 @@ def test_transform_is_the_quaternions_rotation_then_the_shift():
     turned = points + 2 * np.cross(v, np.cross(v, points) + w * points)
     got = _math.transform(jnp.asarray([0.1, -0.2, 0.3, *quat]), jnp.asarray(points))
     np.testing.assert_allclose(got, turned + np.array([0.1, -0.2, 0.3]), atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 7, 33, 64, 150, 1000, 5003])
+def test_reductions_by_parts_are_numpys(size):
+    rng = np.random.default_rng(size)
+    values, counts = rng.normal(size=size).astype(np.float32), rng.integers(0, 5, size).astype(np.int32)
+    flags = rng.uniform(size=size) < 0.3
+    assert jax.jit(_math.least)(values) == values.min() and jax.jit(_math.most)(values) == values.max()
+    np.testing.assert_array_equal(jax.jit(_math.running_sum)(counts), np.cumsum(counts))
+    expected = np.concatenate([np.flatnonzero(flags), np.full(size - flags.sum(), size)])
+    np.testing.assert_array_equal(jax.jit(_math.positions)(flags), expected)

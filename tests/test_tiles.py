@@ -7,7 +7,7 @@ import pytest
 
 from sts_jax._tiles import TILE, where_active
 
-SHAPES = [(8, 8), (17, 33), (64, 64), (131, 53), (5, 40)]
+SHAPES = [(8, 8), (17, 33), (64, 64), (131, 53), (5, 40), (TILE - 1, 40)]
 
 
 def blur(params, images):
@@ -50,6 +50,22 @@ def test_it_is_where_of_the_whole_image(shape):
     for name, active in patterns(shape):
         for got, expected in zip(tiled(active, *given), dense(active, *given), strict=True):
             np.testing.assert_allclose(got, expected, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_row_and_a_column_stand_for_images_of_such(shape):
+    rng = np.random.default_rng(3)
+    image, otherwise = (jnp.asarray(rng.normal(size=shape), jnp.float32) for _ in range(2))
+    across, down = jnp.arange(shape[1], dtype=jnp.float32)[None, :], jnp.arange(shape[0], dtype=jnp.float32)[:, None]
+
+    def function(params, images):
+        one, x, y = images
+        return params * one + x - 100 * y
+
+    tiled = jax.jit(lambda active: where_active(function, active, 2.0, (image, across, down), otherwise))
+    for name, active in patterns(shape):
+        expected = np.where(active, 2 * np.asarray(image) + np.asarray(across) - 100 * np.asarray(down), otherwise)
+        np.testing.assert_allclose(tiled(active), expected, rtol=1e-6, err_msg=name)
 
 
 def test_vmap_is_the_loop():

@@ -119,7 +119,7 @@ def hidden_sky(
         return functools.reduce(operator.add, (value[:, k :: blocks[1]] for k in range(blocks[1])))
 
     there = jnp.isfinite(heights)
-    count = pool(there.astype(jnp.float32))
+    count = pool(there.astype(heights.dtype))
     height = pool(jnp.where(there, heights, 0)) / jnp.maximum(count, 1)
     covered = count / (blocks[0] * blocks[1])
     rows, columns = covered.shape
