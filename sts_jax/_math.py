@@ -29,7 +29,7 @@ def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
 
 
 def least(values: Array) -> Array:
-    """`jnp.min` of a vector by halves, as a CPU's vector units can; XLA's own goes through it number by number."""
+    """`jnp.min` of a vector, part against part: so a CPU's vector units can; XLA's own goes number by number."""
     return _fold(jnp.minimum, jnp.min, values)
 
 

@@ -102,7 +102,7 @@ def _sparse(
             side = jnp.arange(TILE + 2 * ring, dtype=jnp.int32)[:, None]
             down = (row[None, :] + side)[:, None] * (image.shape[1] if image.shape[0] > 1 else 0)
             across = (column[None, :] + side)[None, :] * (1 if image.shape[1] > 1 else 0)
-            # What no neighbour takes part in is done in one line.
+            # Where no neighbours take part a batch is one line of pixels.
             place = down + across if ring else (down + across).reshape(1, -1)
             return image.reshape(-1).at[place].get(mode="promise_in_bounds")
 
