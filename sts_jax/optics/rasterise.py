@@ -132,13 +132,13 @@ def rasterise(
         least, most = _lowest(o0, o1, o2), _highest(o0, o1, o2)
         pixel = row.astype(jnp.int32) * width + column.astype(jnp.int32)
 
-        def step(along: Array, image: Array) -> Array:
+        def step(along: Int[Array, ""], image: Array) -> Array:
             level = jnp.clip((jnp.clip(value + slope_x * along, least, most) - nearest) * scale, 0, levels)
             key = (level.astype(jnp.uint32) << face_bits) | face.astype(jnp.uint32)
             return image.at[jnp.where(along < length, pixel + along, height * width)].min(key, mode="drop")
 
-        image = jax.lax.fori_loop(zero, jnp.max(length), step, image)
-        return base + chunk, following, image
+        # As many steps for every chunk: under `vmap` a loop that may end sooner copies the image in each.
+        return base + chunk, following, jax.lax.fori_loop(0, _RUN, step, image)
 
     blank = jnp.full(height * width, _NOTHING)
     _, _, image = jax.lax.while_loop(lambda state: state[0] < total, body, (zero, zero, blank))
