@@ -32,8 +32,8 @@ def where_active(
 
     Args:
         function: `(params, images) -> images'`, from images of any size (a + 2 ring, b + 2 ring) to images (a, b), of
-            which each pixel depends on those within `ring` of it alone. It must close over no tracer: what it needs
-            comes by its arguments.
+            which each pixel depends on those within `ring` of it alone. A third axis of its images, tiles, it leaves as
+            it is. It must close over no tracer: what it needs comes by its arguments.
         active: where the result is wanted.
         params: passed on, whole.
         images: tree of (h + 2 ring, w + 2 ring); one of a single row or column stands for an image of such.
@@ -107,8 +107,7 @@ def _sparse(
             return image.reshape(-1).at[place].get(mode="promise_in_bounds")
 
         parts = jax.tree.map(take, images)
-        many = jax.vmap(function, in_axes=(None, -1), out_axes=-1) if ring else function
-        values = many(params, parts)
+        values = function(params, parts)
         wanted = active.reshape(-1).at[own].get(mode="promise_in_bounds")
         own = jnp.where(wanted, own, height * width).reshape(-1)
 

@@ -13,7 +13,7 @@ SHAPES = [(8, 8), (17, 33), (64, 64), (131, 53), (5, 40), (TILE - 1, 40)]
 def blur(params, images):
     """Every pixel from its 3x3 neighbourhood, twice over."""
     first, second = images
-    height, width = (n - 2 for n in first.shape)
+    height, width = (n - 2 for n in first.shape[:2])
     total = sum(first[i : i + height, j : j + width] for i in range(3) for j in range(3))
     return params["gain"] * total, total * second[1:-1, 1:-1]
 

@@ -78,17 +78,18 @@ class Phong:
 
 
 def surface_normals(
-    points: tuple[Float[Array, "a b"], Float[Array, "a b"], Float[Array, "a b"]],
-) -> Float[Array, "h w 3"]:
+    points: tuple[Float[Array, "a b *n"], Float[Array, "a b *n"], Float[Array, "a b *n"]],
+) -> Float[Array, "h w *n 3"]:
     """Unit normals of a grid of points: the axis of least covariance of each point's 3x3 neighbourhood.
 
     Args:
-        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`.
+        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`. Further
+            axes hold more of such grids.
 
     Returns:
         Unit normals towards the camera (z <= 0) (paper, supplement "Simulator Details").
     """
-    height, width = (n - 2 for n in points[0].shape)
+    height, width = (n - 2 for n in points[0].shape[:2])
     # Differences from the middle point in millimetres: float32 keeps its digits.
     padded = [1e3 * part for part in points]
     planes = [part[1:-1, 1:-1] for part in padded]
@@ -100,7 +101,7 @@ def surface_normals(
     ]
     total = [functools.reduce(operator.add, (n[k] for n in near)) for k in range(3)]
 
-    def covariance(i: int, j: int) -> Float[Array, "h w"]:
+    def covariance(i: int, j: int) -> Float[Array, "h w *n"]:
         return functools.reduce(operator.add, (n[i] * n[j] for n in near)) / 9 - total[i] * total[j] / 81
 
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -271,6 +272,6 @@ def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
     return (*(p / length for p in parts), length)
 
 
-def darken(phong: Phong, depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+def darken(phong: Phong, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Brightness of the skin by how deep it is pressed, `exp(-depth / darkening)` (m)."""
     return jnp.exp(-depth / phong.darkening)
