@@ -82,6 +82,15 @@ def test_normals_are_the_axis_of_least_covariance(shape):
         np.testing.assert_allclose(got[i, j], normal, atol=2e-3)
 
 
+def test_normals_of_several_grids_side_by_side_are_those_of_each():
+    grids = [np.moveaxis(bumpy((9, 7)), -1, 0), np.moveaxis(bumpy((9, 7))[::-1], -1, 0)]
+    several = tactile.surface_normals(tuple(jnp.asarray(np.stack(planes, -1)) for planes in zip(*grids, strict=True)))
+    assert several.shape == (7, 5, 2, 3)
+    for k, grid in enumerate(grids):
+        alone = tactile.surface_normals(tuple(jnp.asarray(grid)))
+        np.testing.assert_allclose(several[:, :, k], alone, atol=1e-6)
+
+
 def reflected_light(constants, lights, normal, point, shares):
     """Phong's equation in float64, one point, one light after the other."""
     view = np.array([0.0, 0.0, -1.0])

@@ -66,9 +66,9 @@ def rasterise(
         a, b, c = ((points_x[k], points_y[k], order[k]) for k in faces[chosen].T)
         return a, b, c
 
-    def collect(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def collect(state: tuple[Array, Array, Array, list[Array]]) -> tuple[Array, Array, Array, list[Array]]:
         """Of a group of faces, those that have runs: from which number on, which they are, runs in a row."""
-        base, count, total, entries = state
+        base, count, total, lists = state
         face = jnp.minimum(base, num_faces - group) + jnp.arange(group, dtype=jnp.int32)
         a, b, c = corners_of(face)
         area = _cross(a, b, c)
@@ -87,14 +87,16 @@ def rasterise(
         drawn &= (face >= base) & (_lowest(a[2], b[2], c[2]) < farthest) & ~outside & ~empty & (rows > 0)
         across = jnp.ceil(columns / _RUN)
         number = jnp.where(drawn, rows * across, 0).astype(jnp.int32)
-        upto = jnp.cumsum(jnp.stack([number, number > 0], axis=1), axis=0, dtype=jnp.int32)
-        place = jnp.where(number > 0, count + upto[:, 1] - 1, len(entries))
-        entry = jnp.stack([total + upto[:, 0] - number, face, across.astype(jnp.int32)], axis=1)
-        return base + group, count + upto[-1, 1], total + upto[-1, 0], entries.at[place].set(entry, mode="drop")
+        nth, upto = _math.running_sum(number > 0), jnp.cumsum(number, dtype=jnp.int32)
+        place = jnp.where(number > 0, count + nth - 1, num_faces + chunk)
+        found = total + upto - number, face, across.astype(jnp.int32)
+        lists = [all_.at[place].set(new, mode="drop") for all_, new in zip(lists, found, strict=True)]
+        return base + group, count + nth[-1], total + upto[-1], lists
 
     zero = jnp.int32(0)
-    none = jnp.full((num_faces + chunk, 3), jnp.iinfo(jnp.int32).max, jnp.int32)
-    _, _, total, entries = jax.lax.while_loop(lambda state: state[0] < real, collect, (zero, zero, zero, none))
+    none = jnp.full(num_faces + chunk, jnp.iinfo(jnp.int32).max, jnp.int32)
+    start = zero, zero, zero, [none] * 3
+    _, _, total, (first_run, listed, in_a_row) = jax.lax.while_loop(lambda state: state[0] < real, collect, start)
 
     face_bits = max((num_faces - 1).bit_length(), 1)
     levels = 2.0 ** min(32 - face_bits, 23) - 2
@@ -104,10 +106,10 @@ def rasterise(
         base, current, image = state
         run = base + jnp.arange(chunk, dtype=jnp.int32)
         # Every face has a run, so no more than `chunk` faces begin among these: the next ones of the list.
-        begins = jax.lax.dynamic_slice(entries, (current + 1, zero), (chunk, 1))[:, 0] - base
+        begins = jax.lax.dynamic_slice(first_run, (current + 1,), (chunk,)) - base
         of = current + _math.running_sum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"))
-        following = of[-1] + (entries[of[-1] + 1, 0] == base + chunk)
-        begin, face, across = (entries[of, k] for k in range(3))
+        following = of[-1] + (first_run[of[-1] + 1] == base + chunk)
+        begin, face, across = first_run[of], listed[of], in_a_row[of]
         a, b, c = corners_of(face)
         a, b = _by_row(a, b)
         b, c = _by_row(b, c)
