@@ -111,22 +111,26 @@ def rasterise(
         following = of[-1] + (first_run[of[-1] + 1] == base + chunk)
         begin, face, across = first_run[of], listed[of], in_a_row[of]
         a, b, c = corners_of(face)
-        a, b = _by_row(a, b)
-        b, c = _by_row(b, c)
-        a, b = _by_row(a, b)
         (x0, y0, o0), (x1, y1, o1), (x2, y2, o2) = a, b, c
         area = _cross(a, b, c)
         safe_area = jnp.where(area == 0, 1, area)
         slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
         slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
+        top, bottom = _lowest(y0, y1, y2), _highest(y0, y1, y2)
         line = jnp.floor((run - begin + 0.5) / across)  # whole numbers below 2^22: exact
-        row = _first_row(y0, height) + line
-        long = x0 + (x2 - x0) * _fraction(row, y0, y2)
-        short = jnp.where(row < y1, x0 + (x1 - x0) * _fraction(row, y0, y1), x1 + (x2 - x1) * _fraction(row, y1, y2))
+        row = _first_row(top, height) + line
+        # From the edges that it lies to the right of to those that it lies to the left of, and not beyond its corners.
         # A face that lies within one row's slack covers that row from end to end.
-        flat = y2 - y0 <= 1e-3
-        start = jnp.where(flat, _lowest(x0, x1, x2), jnp.minimum(long, short))
-        stop = jnp.where(flat, _highest(x0, x1, x2), jnp.maximum(long, short))
+        flat = bottom - top <= 1e-3
+        at = jnp.clip(row, top, bottom)
+        starts, stops = [], []
+        for (px, py, _), (qx, qy, _) in ((a, b), (b, c), (c, a)):
+            rise = qy - py
+            crossing = px + (at - py) * ((qx - px) / jnp.where(rise == 0, 1, rise))
+            starts.append(jnp.where(rise * area < 0, crossing, -jnp.inf))
+            stops.append(jnp.where(rise * area > 0, crossing, jnp.inf))
+        start = jnp.maximum(_lowest(x0, x1, x2), jnp.where(flat, -jnp.inf, _highest(*starts)))
+        stop = jnp.minimum(_highest(x0, x1, x2), jnp.where(flat, jnp.inf, _lowest(*stops)))
         column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + _RUN * (run - begin - line * across)
         length = jnp.clip(jnp.minimum(jnp.floor(stop + _SLACK), width - 1) - column + 1, 0, _RUN)
         length = jnp.where(run < total, length, 0).astype(jnp.int32)
@@ -188,20 +192,9 @@ def _first_row(top: Array, height: int) -> Array:
     return jnp.clip(jnp.ceil(top - _SLACK), 0, height)
 
 
-def _by_row(a: _Corner, b: _Corner) -> tuple[_Corner, _Corner]:
-    swap = a[1] > b[1]
-    low, high = ([jnp.where(swap, q, p) for p, q in zip(*pair, strict=True)] for pair in ((a, b), (b, a)))
-    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
-
-
 def _lowest(a: Array, b: Array, c: Array) -> Array:
     return jnp.minimum(jnp.minimum(a, b), c)
 
 
 def _highest(a: Array, b: Array, c: Array) -> Array:
     return jnp.maximum(jnp.maximum(a, b), c)
-
-
-def _fraction(value: Array, low: Array, high: Array) -> Array:
-    span = high - low
-    return jnp.clip((value - low) / jnp.where(span > 0, span, 1), 0, 1)
