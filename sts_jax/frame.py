@@ -478,7 +478,7 @@ def _lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Flo
     return images[0][:1], images[1][:, :1]
 
 
-def _planes(image: Float[Array, "h w 3"]) -> list[Float[Array, "h w"]]:
+def _planes(image: Float[Array, "h w *n 3"]) -> list[Float[Array, "h w *n"]]:
     return [image[..., k] for k in range(3)]
 
 
