@@ -72,6 +72,27 @@ def test_closed_box(box):
     np.testing.assert_allclose(np.asarray(body.colors)[:12], linear(np.array(0.7)), rtol=1e-5)
 
 
+def test_parts_that_share_an_edge_are_closed(tmp_path):
+    first, second = (trimesh.creation.box((0.03, 0.02, 0.04)) for _ in range(2))
+    second.apply_translation((0.03, 0.02, 0.0))
+    both = trimesh.util.concatenate([first, second])
+    both.merge_vertices()
+    assert len(both.vertices) == 14
+    assert not both.is_watertight  # four faces at the common edge, whole: no diagonal
+    both.export(tmp_path / "boxes.ply")
+    body = objects.load(tmp_path / "boxes.ply", strict=True)
+    assert not body.two_sided
+    assert volume(body) == pytest.approx(2 * 0.03 * 0.02 * 0.04, rel=1e-5)
+
+    whole = both.faces.copy()
+    for name, faces in (("open", whole[1:]), ("turned", np.vstack([whole[:1, ::-1], whole[1:]]))):
+        path = tmp_path / f"{name}.ply"
+        trimesh.Trimesh(both.vertices, faces, process=False).export(path)
+        with pytest.raises(ValueError, match="is not closed"):
+            objects.load(path, strict=True)
+        assert objects.load(path, mass=0.1).two_sided
+
+
 def test_given_mass_has_no_contents(box):
     body = objects.load(box, mass=0.3)
     for fill in (0.0, 1.0):

@@ -297,7 +297,7 @@ def _body(
             "give faces= to decimate it"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    closed = bool(mesh.is_watertight and mesh.is_winding_consistent)
+    closed = _is_closed(faces)
     if closed and mesh.volume < 0:
         faces, colors, uv = faces[:, ::-1], colors[:, ::-1], uv[:, ::-1]
     try:
@@ -338,6 +338,18 @@ def _body(
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def _is_closed(faces: np.ndarray) -> bool:
+    """Whether faces have no boundary: each edge is run through as often one way as the other.
+
+    Of a single part this is what watertight and consistently wound means. Where parts touch, and welding has made one
+    edge of theirs, more than two faces meet there, and there is no hole.
+    """
+    start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
+    edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
+    _, place = np.unique(edge, return_inverse=True)
+    return not np.bincount(place.reshape(-1), np.where(start < end, 1, -1)).any()
 
 
 def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
