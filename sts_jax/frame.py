@@ -194,8 +194,10 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         Image, sRGB in [0, 1]; the streams themselves at 0 and 1.
 
     Raises:
-        ValueError: `light` is outside [0, 1] or not a number.
+        ValueError: `light` is outside [0, 1] or not a number; or the sensor cannot be, of what is known of it. Of a
+            traced one that cannot be, the default's exposure counts.
     """
+    sensor, _ = sensor.guard()
     if not isinstance(light, jax.core.Tracer) and not 0 <= np.asarray(light) <= 1:
         raise ValueError(f"light is {light}; it is a share of the LEDs' full power, from 0 (visual) to 1 (tactile)")
     light = jnp.asarray(light, jnp.float32)
@@ -221,11 +223,31 @@ def touch(
 
     Returns:
         Image, in [0, 1]: `Frame.tactile` of this imprint, where images are not so small that `sense` samples finer.
+        Where constants or window are traced and cannot be, that of a flat skin in the whole view, with the default's
+        constants.
+
+    Raises:
+        ValueError: the imprint is no image, the window has no area or is not finite, or the sensor cannot be, of what
+            is known of them.
     """
+    if jnp.ndim(imprint) != 2 or 0 in jnp.shape(imprint):
+        raise ValueError(
+            f"imprint has the shape {jnp.shape(imprint)}; it takes (height, width). For several use jax.vmap"
+        )
+    sensor, sound = sensor.guard()
+    rows, columns = jnp.shape(imprint)
+    full = optics.full_window(sensor.camera, (rows, columns))
     if window is None:
-        rows, columns = imprint.shape
-        window = optics.full_window(sensor.camera, (rows, columns))
-    return _touch(sensor, imprint, window)
+        window = full
+    elif jnp.shape(window) != (4,):
+        raise ValueError(f"window has the shape {jnp.shape(window)}; it takes (4,), left, top, width, height (m)")
+    else:
+        somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)
+        if not isinstance(somewhere, jax.core.Tracer) and not somewhere:
+            raise ValueError(f"window is {window}; it takes finite left, top, width, height (m), the last two above 0")
+        sound &= somewhere
+        window = jnp.where(sound, window, full)
+    return _touch(sensor, jnp.where(sound, imprint, 0), window)
 
 
 @jax.jit

@@ -15,7 +15,7 @@ import sts_jax as sts
 from sts_jax import objects, tactile
 
 # As its users call it: without the tests' own checks of types and shapes.
-sense = inspect.unwrap(sts.sense)
+sense, touch, expose = (inspect.unwrap(call) for call in (sts.sense, sts.touch, sts.expose))
 SENSOR = sts.Sensor()
 BODY = from_trimesh(trimesh.creation.box((0.05, 0.03, 0.02)))
 POSE = jnp.array([0.003, 0.002, 0.01, 1, 0, 0, 0], jnp.float32)
@@ -81,6 +81,10 @@ def test_a_known_sensor_that_cannot_be_is_an_error(sensor, field, value):
         with pytest.raises(ValueError, match=f"field {field}") as error:
             call(BODY, POSE, WRENCH)
         assert str(error.value) == str(checked.value)
+    frame = jax.jit(functools.partial(sense, resolution=(16, 16)))(SENSOR, BODY, POSE)
+    for call in (functools.partial(touch, bad, frame.depth), functools.partial(expose, bad, frame, 0.5)):
+        with pytest.raises(ValueError, match=f"field {field}"):
+            call()
 
 
 @jax.jit
@@ -105,7 +109,7 @@ def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(ligh
     refused = 0
     for index, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(start)):
         for value in (np.nan, np.inf, -np.inf, 0.0, -1.0, 10.0):
-            bad = value if isinstance(leaf, float) else jnp.full(leaf.shape, value)
+            bad = value if isinstance(leaf, float) else jnp.full_like(leaf, value)
             sensor = structure.unflatten([bad if k == index else v for k, v in enumerate(leaves)])
             frame = traced(sensor, POSE)
             words = f"{jax.tree_util.keystr(path)} is {value}"
@@ -119,6 +123,45 @@ def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(ligh
                 np.testing.assert_allclose(frame.visual, empty.visual, atol=1e-6)
                 np.testing.assert_allclose(frame.tactile, empty.tactile, atol=1e-6)
     assert refused > 3 * len(leaves)  # of six: three are not finite
+
+
+@pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
+def test_touch_and_light_between_have_no_nan_of_a_traced_sensor_that_cannot_be(lights):
+    start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
+    frame = traced(start, POSE)
+    imprint = jnp.zeros((24, 32)).at[8:14, 10:20].set(5e-4)
+    pressed, between = jax.jit(touch), jax.jit(lambda sensor: expose(sensor, frame, 0.5))
+    flat, half = pressed(start, 0 * imprint), between(start)
+    assert np.any(pressed(start, imprint) != flat)
+    leaves, structure = jax.tree.flatten(start)
+    for index, (path, leaf) in enumerate(jax.tree_util.tree_leaves_with_path(start)):
+        for value in (np.nan, np.inf, 0.0, -1.0):
+            bad = value if isinstance(leaf, float) else jnp.full_like(leaf, value)
+            sensor = structure.unflatten([bad if k == index else v for k, v in enumerate(leaves)])
+            lit, mixed = pressed(sensor, imprint), between(sensor)
+            words = f"{jax.tree_util.keystr(path)} is {value}"
+            assert all(np.all(np.isfinite(image)) for image in (lit, mixed)), words
+            if not possible(sensor):
+                np.testing.assert_allclose(lit, flat, atol=1e-6, err_msg=words)
+                np.testing.assert_allclose(mixed, half, atol=1e-6, err_msg=words)
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (5, 6, 3), (0, 4)])
+def test_an_imprint_that_is_no_image_is_named(shape):
+    for call in (touch, jax.jit(touch)):
+        with pytest.raises(ValueError, match=r"imprint has the shape .*\(height, width\).*vmap"):
+            call(SENSOR, jnp.zeros(shape))
+
+
+@pytest.mark.parametrize("bad", [(0, 0, 0, 0.1), (0, 0, 0.1, -0.1), (np.nan, 0, 0.1, 0.1), (0, 0, np.inf, 0.1)])
+def test_a_window_that_cannot_be_is_named_and_traced_is_the_whole_view_of_a_flat_skin(bad):
+    imprint = jnp.zeros((24, 32)).at[8:14, 10:20].set(5e-4)
+    bad = jnp.array(bad, jnp.float32)
+    with pytest.raises(ValueError, match=r"window is .*finite left, top, width, height"):
+        touch(SENSOR, imprint, bad)
+    np.testing.assert_allclose(jax.jit(touch)(SENSOR, imprint, bad), touch(SENSOR, 0 * imprint), atol=1e-6)
+    with pytest.raises(ValueError, match=r"window has the shape \(3,\)"):
+        touch(SENSOR, imprint, bad[:3])
 
 
 def stl_of_a_million(path):
