@@ -35,6 +35,7 @@ STEPS = 10  # at most, with each blur
 SETTLED = (1e-5, 1e-5, 1e-3)  # m, m, rad: a step that is shorter is the last with a blur
 OFF = (0.003, 10.0)  # m, degrees: how far off a start is
 GOAL = (0.0002, 1.0)  # m, degrees: what counts as found
+SEEN = 0.02  # change of a pixel's value by touch that counts as an imprint
 FAINT = 0.25  # of what 3 mm change in the image: if 10 degrees change less, there is no telling the yaw
 
 
@@ -157,7 +158,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
     """The target, the first start and where it ended, what they lack of it, and all ways in x and y."""
     (_, first), (_, last) = paths[0][0], paths[0][-1]
     flat = np.median(target, axis=(0, 1))
-    touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > 0.02
+    touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN
     rows, columns = (np.flatnonzero(touched.any(axis)) for axis in (1, 0))
     part = slice(max(rows[0] - 5, 0), rows[-1] + 6), slice(max(columns[0] - 5, 0), columns[-1] + 6)
 
@@ -203,6 +204,9 @@ def main(config: Config) -> None:
     pose, wrench, words = sense.lay(config, body)
     given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     target = touch(sensor, body, *given, resolution=config.resolution)
+    empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)
+    if np.abs(target - empty).max() < SEEN:
+        raise ValueError(f"{config.mesh} leaves no imprint in view: press with more force, or lay it elsewhere")
     print(f"{config.mesh} on {words}", flush=True)
 
     def look(at: np.ndarray, blur: float) -> Slope:

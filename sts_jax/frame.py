@@ -28,8 +28,9 @@ class Frame:
 
     visual: Float[Array, "*n h w 3"]  # lights off: the view through the skin, sRGB
     tactile: Float[Array, "*n h w 3"]  # lights on: the skin itself
-    depth: Float[Array, "*n h w"]  # m along the optical axis from the pinhole to the object, inf where there is none
-    segmentation: Bool[Array, "*n h w"]  # the object
+    # m along the optical axis from the pinhole to the object, inf where there is none; through the housing's walls too
+    depth: Float[Array, "*n h w"]
+    segmentation: Bool[Array, "*n h w"]  # the object: where depth is finite
     pose: Float[Array, "*n 7"]  # the pose drawn: the object's mesh frame in the sensor frame, gel in balance
     # whether the gel carries the wrench within its limits; False for a non-finite input or a sensor that cannot be
     balanced: Bool[Array, "*n"]
@@ -79,6 +80,7 @@ def sense(
         ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
             more faces than can be drawn, all of this under `jit` too; or the sensor cannot be, of what is known of it.
     """
+    pose, wrench = jnp.asarray(pose, jnp.float32), None if wrench is None else jnp.asarray(wrench, jnp.float32)
     _check_shapes(body, pose, wrench, resolution)
     sensor, sound = sensor.guard()
     # What is not drawn is left out: things of one size then share a program, whatever collides or is inside.
@@ -120,7 +122,7 @@ def _sense(
     turn = _math.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
     position = _math.transform(jnp.concatenate([drop, turn]), safe_pose[:3])
-    drawn = jnp.concatenate([position, _math.quat_multiply(turn, safe_pose[3:])])
+    drawn = jnp.concatenate([position, _math.quat_canonical(_math.quat_multiply(turn, safe_pose[3:]))])
     points = _placed(pressing, drawn, body.vertices, points)
 
     if crop:
@@ -153,20 +155,19 @@ def _placed(
     return jnp.stack(planes, axis=-1)
 
 
-def _check_shapes(body: Body, pose: Any, wrench: Any, resolution: Any) -> None:
+def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:
     whole = isinstance(resolution, Sequence) and all(isinstance(n, int | np.integer) for n in resolution)
     if not whole or len(resolution) != 2 or min(resolution) < 1:
         raise ValueError(
             f"resolution is {resolution!r}; it takes two whole numbers of pixels, (height, width), above 0"
         )
-    if jnp.shape(pose) != (7,):
+    if pose.shape != (7,):
         raise ValueError(
-            f"pose has the shape {jnp.shape(pose)}; it takes (7,), position (m), quaternion. For several use jax.vmap"
+            f"pose has the shape {pose.shape}; it takes (7,), position (m), quaternion. For several use jax.vmap"
         )
-    if wrench is not None and jnp.shape(wrench) != (6,):
+    if wrench is not None and wrench.shape != (6,):
         raise ValueError(
-            f"wrench has the shape {jnp.shape(wrench)}; it takes (6,), force (N) and moment (N m). For several use "
-            "jax.vmap"
+            f"wrench has the shape {wrench.shape}; it takes (6,), force (N) and moment (N m). For several use jax.vmap"
         )
     if len(body.faces) > FACE_CLASSES[-1]:
         raise ValueError(
@@ -194,10 +195,12 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         Image, sRGB in [0, 1]; the streams themselves at 0 and 1.
 
     Raises:
-        ValueError: `light` is outside [0, 1] or not a number; or the sensor cannot be, of what is known of it. Of a
+        ValueError: `light` is outside [0, 1] or not one number; or the sensor cannot be, of what is known of it. Of a
             traced one that cannot be, the default's exposure counts.
     """
     sensor, _ = sensor.guard()
+    if jnp.ndim(light):
+        raise ValueError(f"light has the shape {jnp.shape(light)}; it takes one number. For several use jax.vmap")
     if not isinstance(light, jax.core.Tracer) and not 0 <= np.asarray(light) <= 1:
         raise ValueError(f"light is {light}; it is a share of the LEDs' full power, from 0 (visual) to 1 (tactile)")
     light = jnp.asarray(light, jnp.float32)
@@ -230,23 +233,20 @@ def touch(
         ValueError: the imprint is no image, the window has no area or is not finite, or the sensor cannot be, of what
             is known of them.
     """
-    if jnp.ndim(imprint) != 2 or 0 in jnp.shape(imprint):
-        raise ValueError(
-            f"imprint has the shape {jnp.shape(imprint)}; it takes (height, width). For several use jax.vmap"
-        )
+    imprint = jnp.asarray(imprint, jnp.float32)
+    if imprint.ndim != 2 or 0 in imprint.shape:
+        raise ValueError(f"imprint has the shape {imprint.shape}; it takes (height, width). For several use jax.vmap")
     sensor, sound = sensor.guard()
-    rows, columns = jnp.shape(imprint)
+    rows, columns = imprint.shape
     full = optics.full_window(sensor.camera, (rows, columns))
-    if window is None:
-        window = full
-    elif jnp.shape(window) != (4,):
-        raise ValueError(f"window has the shape {jnp.shape(window)}; it takes (4,), left, top, width, height (m)")
-    else:
-        somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)
-        if not isinstance(somewhere, jax.core.Tracer) and not somewhere:
-            raise ValueError(f"window is {window}; it takes finite left, top, width, height (m), the last two above 0")
-        sound &= somewhere
-        window = jnp.where(sound, window, full)
+    window = full if window is None else jnp.asarray(window, jnp.float32)
+    if window.shape != (4,):
+        raise ValueError(f"window has the shape {window.shape}; it takes (4,), left, top, width, height (m)")
+    somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)
+    if not isinstance(somewhere, jax.core.Tracer) and not somewhere:
+        raise ValueError(f"window is {window}; it takes finite left, top, width, height (m), the last two above 0")
+    sound &= somewhere
+    window = jnp.where(sound, window, full)
     return _touch(sensor, jnp.where(sound, imprint, 0), window)
 
 
@@ -275,18 +275,15 @@ def underside(
         present: whether there is anything at all.
 
     Returns:
-        Heights (m), `inf` where nothing within the gel's reach lies over a cell.
+        Heights (m), `inf` where nothing lies over a cell.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))
-    # No part can reach the gel that is higher over first touch than depth and tilts bring it down.
-    extent = sum(_math.most(part) - _math.least(part) for part in (across, down))
-    farthest = _math.least(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
     across = (across / gel.size[0] + 0.5) * columns - 0.5
     down = (down / gel.size[1] + 0.5) * rows - 0.5
     keep = jnp.broadcast_to(present, height.shape)
     places = jnp.stack([across, down], axis=-1)
-    winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells, farthest=farthest)
+    winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells)
     corners = (across, down, height), body.faces
     images = (winner, *_lines(optics.pixel_centres(gel.cells)))
     return where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))

@@ -31,7 +31,7 @@ _NOT_BELOW_ZERO = {
     "room.rim", "room.milk", "room.tint", "room.crease", "fine_below",
 }
 # fmt: on
-_BELOW = {"camera.fov": math.pi, "gel.max_tilt": math.pi / 2}
+_BELOW = {"camera.fov": math.pi, "gel.max_tilt": 0.3}  # a tilt's slope is taken for its angle
 _UP_TO_ONE = {"room.background", "room.vignette", "room.milk", "room.tint", "room.crease"}
 _LARGEST, _LEAST = (float(x) for x in (np.finfo(np.float32).max, np.finfo(np.float32).tiny))  # beyond: inf and 0
 _ROUNDED = 1 + 1e-6  # float32's last digit
@@ -244,6 +244,14 @@ def _conditions(sensor: Sensor) -> Iterator[_Condition]:
 
 def _of_fields(default: Any, value: Any, name: str) -> Iterator[_Condition]:
     if not dataclasses.is_dataclass(default):
+        static = isinstance(default, int) or (isinstance(default, tuple) and isinstance(default[0], int))
+        numbers = value if isinstance(value, tuple) else (value,)
+        if isinstance(default, tuple) and not isinstance(value, tuple):
+            raise ValueError(f"field {name} is {value!r}; it takes a tuple of {len(default)} numbers.")
+        if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
+            raise ValueError(f"field {name} is {value!r}; it takes an array.")
+        if static and not all(isinstance(number, int | np.integer) for number in numbers):
+            raise ValueError(f"field {name} is {value!r}; it takes whole numbers, of Python's or NumPy's kind.")
         yield from _of_value(default, value, name)
         return
     if type(value) is not type(default):

@@ -3,11 +3,13 @@
 import jax.numpy as jnp
 import numpy as np
 import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks.depth import body_mesh, embree, interior, public_meshes
 from sts_jax.objects.body import FACE_CLASSES, Body
 
-__all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes"]
+__all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "rays_hidden"]
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
@@ -37,3 +39,17 @@ def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -
         contents_density=jnp.float32(0),
         category=jnp.int32(-1),
     )
+
+
+def rays_hidden(mesh, places, num=3000):
+    """Share of rays, spread by the cosine, from places of the skin that meet a mesh."""
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, np.float32))
+    index = np.arange(num)
+    radius, angle = np.sqrt((index + 0.5) / num), index * np.pi * (3 - np.sqrt(5))
+    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], -1)
+    shares = []
+    for x, y in places:
+        origins = np.tile([x, y, 1e-5], (num, 1)).astype(np.float32)
+        shares.append(np.mean(scene.run(origins, directions.astype(np.float32), query="DISTANCE") < 1e3))
+    return np.array(shares)

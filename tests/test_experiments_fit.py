@@ -81,6 +81,7 @@ def test_pose_and_wrench_go_together():
     [
         ({"starts": 0}, "starts is 0: give at least 1"),
         ({"force": 0.0}, "force is 0: what does not press"),
+        ({"position": (0.3, 0.0), "resolution": SMALL}, "scissors leaves no imprint in view"),
         ({"mesh": "teapot"}, "teapot: no such file, nor one of the classes"),
         ({"resolution": (0, 64)}, "at least 1 pixel"),
     ],

@@ -1,6 +1,7 @@
 """The image at any light between the two streams, against a loop in NumPy float64."""
 
 import dataclasses
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -136,6 +137,13 @@ def test_vmap_over_frames_and_over_lights():
 def test_a_light_that_is_no_share_is_named(light):
     with pytest.raises(ValueError, match=r"light is .*from 0 \(visual\) to 1 \(tactile\)"):
         sts.expose(SENSOR, noise((8, 8)), light)
+
+
+def test_several_lights_at_once_are_named():
+    several = inspect.unwrap(sts.expose)  # without the tests' own checks of shapes
+    for call in (several, jax.jit(several)):
+        with pytest.raises(ValueError, match=r"light has the shape \(3,\).*vmap"):
+            call(SENSOR, noise((3, 8, 8)), jnp.array([0.0, 0.5, 1.0]))
 
 
 def test_under_jit_it_is_clipped_and_never_nan():

@@ -47,6 +47,21 @@ def test_a_wrench_of_another_shape_is_named(shape):
             call(SENSOR, BODY, POSE, jnp.zeros(shape))
 
 
+def test_lists_and_tuples_of_numbers_are_taken():
+    small = {"resolution": (16, 16)}
+    frame = sense(SENSOR, BODY, POSE, WRENCH, **small)
+    listed = sense(SENSOR, BODY, POSE.tolist(), tuple(WRENCH.tolist()), **small)
+    np.testing.assert_array_equal(listed.tactile, frame.tactile)
+    imprint, window = np.full((20, 30), 1e-4), (-0.01, -0.01, 0.03, 0.02)
+    np.testing.assert_array_equal(touch(SENSOR, imprint.tolist(), window), touch(SENSOR, imprint, jnp.array(window)))
+
+
+def test_the_pose_drawn_has_no_negative_w():
+    for pose in (POSE.at[3].set(-1), POSE.at[3:].set(jnp.array([-0.01, 1, 0, 0]))):
+        frame = sense(SENSOR, BODY, pose, WRENCH, resolution=(16, 16))
+        assert float(frame.pose[3]) >= 0
+
+
 def test_a_body_with_too_many_faces_is_refused():
     number = objects.FACE_CLASSES[-1] + 1
     many = {name: jnp.zeros((number, *getattr(BODY, name).shape[1:])) for name in ("normals", "colors", "uv")}
@@ -144,6 +159,13 @@ def test_touch_and_light_between_have_no_nan_of_a_traced_sensor_that_cannot_be(l
             if not possible(sensor):
                 np.testing.assert_allclose(lit, flat, atol=1e-6, err_msg=words)
                 np.testing.assert_allclose(mixed, half, atol=1e-6, err_msg=words)
+
+
+def test_leds_that_fall_off_steeply_have_no_nan():
+    steep = dataclasses.replace(SENSOR, lights=tactile.Leds(falloff=50.0))
+    imprint = jnp.zeros((60, 80)).at[3:14, 1:20].set(5e-4)
+    assert np.all(np.isfinite(touch(steep, imprint)))
+    assert np.all(np.isfinite(jax.jit(touch)(steep, imprint)))
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (5, 6, 3), (0, 4)])

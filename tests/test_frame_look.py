@@ -9,11 +9,12 @@ import pytest
 import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
-from optics_bodies import body_mesh, from_trimesh, public_meshes
+from optics_bodies import body_mesh, from_trimesh, public_meshes, rays_hidden
 from PIL import Image
 
 import sts_jax as sts
-from sts_jax import objects
+from sts_jax import _math, objects, optics
+from sts_jax.frame import underside
 
 SENSOR = sts.Sensor()
 sense = jax.jit(sts.sense, static_argnames=("resolution", "crop"))
@@ -45,6 +46,32 @@ def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
     assert np.all(share[(away > 0.06) & ~np.asarray(there.segmentation)] > 0.985)
     in_air = np.asarray(sense(SENSOR, body, at(0, 0, 0.13), resolution=resolution).visual).mean(-1) / empty.mean(-1)
     assert in_air[(away > 0.03) & (away < 0.035)].min() > 0.96
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.045])
+@pytest.mark.parametrize("category", ["webcam", "camera", "mouse", "scissors"])
+def test_what_leans_over_the_skin_hides_as_much_of_the_sky_as_rays_find(category, lift):
+    body = objects.make(jax.random.key(0), category)
+    turn = _math.quat_from_rotvec(jnp.array([0.6, 0.5, 0.3]))
+    points = _math.transform(jnp.concatenate([jnp.zeros(3), turn]), body.vertices)
+    points += jnp.array([[0, 0, lift]]) - jnp.min(points[:, 2])[None, None] * jnp.array([[0, 0, 1.0]])
+    x = y = np.linspace(-0.07, 0.07, 15)
+    heights = jax.jit(underside)(SENSOR.gel, body, points, jnp.bool_(True))
+    got = jax.jit(optics.hidden_sky)(heights, SENSOR.gel.size, jnp.max(points[:, 2]), jnp.asarray(x), jnp.asarray(y))
+    faces = np.asarray(body.faces)
+    mesh = trimesh.Trimesh(np.asarray(points), faces[np.any(faces != faces[:, :1], axis=1)], process=False)
+    truth = rays_hidden(mesh, [(a, b) for b in y for a in x], 1000).reshape(15, 15)
+    assert np.abs(np.asarray(got) - truth).mean() < 0.07 * (1 if lift == 0 else 0.4)
+
+
+def test_the_view_depends_on_no_limit_of_the_gels_equilibrium():
+    body = objects.make(jax.random.key(0), "camera")
+    pose = jnp.array([0.0, 0, 0.06, 0.9, 0.3, 0.2, 0.2], jnp.float32)
+    stiff = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, max_tilt=0.01, max_depth=0.0001))
+    for sensor in (SENSOR, stiff):
+        frame = sense(sensor, body, pose)
+        assert bool(frame.segmentation.any())
+        np.testing.assert_array_equal(frame.visual, sense(SENSOR, body, pose).visual)
 
 
 def test_beyond_the_pad_there_is_a_dark_housing_whatever_lies_there():

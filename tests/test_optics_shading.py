@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
+from optics_bodies import rays_hidden
 
 from sts_jax import optics
 
@@ -123,20 +122,6 @@ def box_heights(low, half_x, half_y, cells=CELLS):
 
 def hidden_by(heights, top, x, y):
     return np.asarray(jax.jit(optics.hidden_sky)(*map(jnp.float32, (heights,)), PAD, *map(jnp.float32, (top, x, y))))
-
-
-def rays_hidden(mesh, places, num=3000):
-    """Share of rays, spread by the cosine, from places of the skin that meet a mesh."""
-    scene = EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, np.float32))
-    index = np.arange(num)
-    radius, angle = np.sqrt((index + 0.5) / num), index * np.pi * (3 - np.sqrt(5))
-    directions = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], -1)
-    shares = []
-    for x, y in places:
-        origins = np.tile([x, y, 1e-5], (num, 1)).astype(np.float32)
-        shares.append(np.mean(scene.run(origins, directions.astype(np.float32), query="DISTANCE") < 1e3))
-    return np.array(shares)
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,28 @@ def test_a_bad_led_is_named(tmp_path, field, value):
     assert str(path) in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("lights.directions", [[-1.0, 0, 0]] * 4),
+        ("room.background", [0.7, 0.7, 0.8]),
+        ("gel.cells", (150.0, 150.0)),
+        ("gel.cells", [150, 150]),
+        ("gel.size", jnp.array([0.15, 0.15])),
+        ("skin.shadow_steps", jnp.int32(4)),
+        ("phong.ambient_color", jnp.array([0.8, 0.8, 1.0])),
+    ],
+)
+def test_the_right_numbers_in_the_wrong_kind_are_named(field, value):
+    sensor = Sensor()
+    part, name = field.split(".")
+    object.__setattr__(getattr(sensor, part), name, value)  # past the tests' own checks of types
+    with pytest.raises(ValueError, match=f"field {field} is .*it takes"):
+        sensor.check()
+    with pytest.raises(ValueError, match=f"field {field} is .*it takes"):
+        jax.jit(lambda: sensor.guard()[1])()
+
+
 @pytest.mark.parametrize("position", [[0.0, 0, -0.0051], [0.0751, 0, -0.001], [0, -0.2, 0], [0, 0, -0.15]])
 def test_leds_before_the_gel_beside_it_and_behind_the_pinhole_can_be(position):
     leds = tactile.Leds(positions=jnp.array([position]), colors=jnp.ones((1, 3)))

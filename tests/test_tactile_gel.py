@@ -131,6 +131,13 @@ def test_more_load_never_makes_the_imprint_smaller(name):
     assert np.all(np.diff(depth) >= -1e-3 * depth[1:])
 
 
+def deepest(got, height, gel=GEL):
+    """How far the object lies in the gel at most (m)."""
+    x, y = grid(gel)
+    moved = np.asarray(height, float) - float(got.sink) + float(got.turn[0]) * y - float(got.turn[1]) * x
+    return -np.min(moved)
+
+
 @pytest.mark.parametrize(
     ("height", "wrench"),
     [
@@ -145,9 +152,20 @@ def test_more_load_never_makes_the_imprint_smaller(name):
 def test_without_equilibrium_the_limits_hold_and_the_flag_falls(height, wrench):
     got = settle(GEL, jnp.asarray(height(*grid()), jnp.float32), wrench)
     assert not bool(got.balanced)
+    assert deepest(got, height(*grid())) <= GEL.max_depth * 1.001
     assert np.all(np.isfinite(got.pressure))
     assert np.asarray(got.pressure).max() <= GEL.stiffness * GEL.max_depth * 1.001
     assert np.abs(got.turn).max() <= np.tan(GEL.max_tilt) * 1.001
+
+
+@pytest.mark.parametrize("force", [1.0, 10.0, 200.0])
+def test_a_tip_that_carries_too_little_goes_no_deeper_than_the_limit(force):
+    x, y = grid()
+    tip = np.where((abs(x) < 1e-3) & (abs(y) < 1e-3), 0.0, 0.02)
+    got = settle(GEL, jnp.asarray(tip, jnp.float32), push(force, 0.0, 0.0))
+    assert not bool(got.balanced)
+    assert float(got.sink) == pytest.approx(GEL.max_depth, rel=1e-3)
+    assert np.asarray(got.pressure).max() == pytest.approx(GEL.stiffness * GEL.max_depth, rel=1e-3)
 
 
 @pytest.mark.parametrize("force", [0.0, -1.0])
@@ -241,6 +259,7 @@ def test_odd_things_under_any_load_are_balanced_or_flagged():
         assert pressure.min() >= 0
         assert pressure.max() <= GEL.stiffness * GEL.max_depth * 1.001
         assert np.abs(got.turn).max() <= np.tan(GEL.max_tilt) * 1.001
+        assert deepest(got, height) <= max(GEL.max_depth, -height.min()) * 1.001
         if got.balanced:
             balanced += 1
             assert pressure.sum() * area == pytest.approx(force, rel=0.0051)

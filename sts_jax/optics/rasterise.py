@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, ScalarLike
+from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import _math
 
@@ -33,7 +33,6 @@ def rasterise(
     two_sided: Bool[Array, ""],
     shape: tuple[int, int],
     *,
-    farthest: ScalarLike = jnp.inf,
     chunk: int = 1024,
 ) -> Int[Array, "h w"]:
     """Index of the nearest face at every pixel centre.
@@ -46,7 +45,6 @@ def rasterise(
         keep: vertices that can be drawn; a face needs all three.
         two_sided: whether faces are seen from behind too.
         shape: (height, width) of the image, pixels.
-        farthest: faces no corner of which is of an order below it are left out.
         chunk: runs walked at a time.
 
     Returns:
@@ -54,7 +52,7 @@ def rasterise(
     """
     height, width = shape
     num_faces = faces.shape[0]
-    points, order, farthest = jax.lax.stop_gradient((points, order, farthest))
+    points, order = jax.lax.stop_gradient((points, order))
     points_x, points_y = points[:, 0], points[:, 1]
     nearest, last = _math.least(jnp.where(keep, order, jnp.inf)), _math.most(jnp.where(keep, order, -jnp.inf))
 
@@ -84,7 +82,7 @@ def rasterise(
         empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
         columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
         rows = jnp.clip(jnp.floor(bottom + _SLACK), -1, height - 1) - _first_row(top, height) + 1
-        drawn &= (face >= base) & (_lowest(a[2], b[2], c[2]) < farthest) & ~outside & ~empty & (rows > 0)
+        drawn &= (face >= base) & ~outside & ~empty & (rows > 0)
         across = jnp.ceil(columns / _RUN)
         number = jnp.where(drawn, rows * across, 0).astype(jnp.int32)
         nth, upto = _math.running_sum(number > 0), jnp.cumsum(number, dtype=jnp.int32)

@@ -123,13 +123,16 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     u = _newton(height, x, y, target, start, bound, gel.max_depth)
 
     u = jnp.where(pressed & reach, u, 0)
-    length = jnp.where(pressed & reach, jnp.clip(_plane(u, x, y) - height, 0, gel.max_depth), 0)
+    length = _plane(u, x, y) - height
+    # The hard bottom gives way, far where it is all that carries: the deepest spring ends at the limit.
+    beyond = jnp.where(pressed & reach, jnp.maximum(_math.most(jnp.max(length, axis=0)) - gel.max_depth, 0), 0)
+    length = jnp.where(pressed & reach, jnp.clip(length - beyond, 0, gel.max_depth), 0)
 
     # the moments' errors over a lever of 1 cm
     residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
     balanced = ~pressed | (reach & on_pad & jnp.all(residual <= gel.tolerance * load))
     return Equilibrium(
-        sink=u[0] - (u[1] * centre_y + u[2] * centre_x) / _LEVER,
+        sink=u[0] - beyond - (u[1] * centre_y + u[2] * centre_x) / _LEVER,
         turn=jnp.stack([-u[1], u[2]]) / _LEVER,
         pressure=gel.stiffness * length,
         balanced=balanced,

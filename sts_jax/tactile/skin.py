@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from sts_jax import _math
 
 _NEAREST = 1e-4  # m, a light is never nearer than this to what it lights
+_BRIGHTEST = 60.0  # log of how much brighter than at its reference distance a light can get: no overflow
 _FAINTEST = 1e-20  # cosines below it make no highlight: their power would not be a number in the gradient
 
 
@@ -258,7 +259,7 @@ def phong(
         highlight = jnp.where(shines, jnp.exp(phong.shininess * jnp.log(jnp.where(shines, towards, 1))), 0)
         strength = phong.diffuse * jnp.maximum(incidence, 0) + phong.specular * highlight
         if isinstance(lights, Leds):
-            strength *= jnp.exp(lights.falloff * jnp.log(lights.reference / distance))
+            strength *= jnp.exp(jnp.minimum(lights.falloff * jnp.log(lights.reference / distance), _BRIGHTEST))
         if shares is not None:
             strength *= shares[m]
         image = [channel + strength * lights.colors[m, k] for k, channel in enumerate(image)]
