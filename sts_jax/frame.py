@@ -80,7 +80,7 @@ def sense(
         ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
             more faces than can be drawn, all of this under `jit` too; or the sensor cannot be, of what is known of it.
     """
-    pose, wrench = jnp.asarray(pose, jnp.float32), None if wrench is None else jnp.asarray(wrench, jnp.float32)
+    pose, wrench = jnp.asarray(pose, float), None if wrench is None else jnp.asarray(wrench, float)
     _check_shapes(body, pose, wrench, resolution)
     sensor, sound = sensor.guard()
     # What is not drawn is left out: things of one size then share a program, whatever collides or is inside.
@@ -233,13 +233,13 @@ def touch(
         ValueError: the imprint is no image, the window has no area or is not finite, or the sensor cannot be, of what
             is known of them.
     """
-    imprint = jnp.asarray(imprint, jnp.float32)
+    imprint = jnp.asarray(imprint, float)
     if imprint.ndim != 2 or 0 in imprint.shape:
         raise ValueError(f"imprint has the shape {imprint.shape}; it takes (height, width). For several use jax.vmap")
     sensor, sound = sensor.guard()
     rows, columns = imprint.shape
     full = optics.full_window(sensor.camera, (rows, columns))
-    window = full if window is None else jnp.asarray(window, jnp.float32)
+    window = full if window is None else jnp.asarray(window, float)
     if window.shape != (4,):
         raise ValueError(f"window has the shape {window.shape}; it takes (4,), left, top, width, height (m)")
     somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)
