@@ -112,7 +112,7 @@ def _sense(
 
     points = _placed(finite, safe_pose, body.vertices, jnp.full_like(body.vertices, -1))
     present = _math.most(points[:, 2]) > 0
-    heights = underside(sensor.gel, body, points, present)
+    heights, whole = underside(sensor.gel, body, points, present)
     if wrench is None:
         contact = tactile.indent(sensor.gel, heights)
         pressing = present
@@ -132,7 +132,7 @@ def _sense(
     else:
         window = optics.full_window(sensor.camera, resolution)
 
-    given = sensor, body, points, drawn, heights, present, pressing, window
+    given = sensor, body, points, drawn, whole, present, pressing, window
     visual, lit, depth = _draw(*given, resolution, moving_edges)
     return Frame(
         visual=visual,
@@ -265,7 +265,7 @@ def _touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4
 
 def underside(
     gel: tactile.Gel, body: Body, points: Float[Array, "v 3"], present: Bool[Array, ""]
-) -> Float[Array, "r c"]:
+) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
     """Heights of an object's underside over the gel's face, on the gel's grid.
 
     Args:
@@ -275,18 +275,23 @@ def underside(
         present: whether there is anything at all.
 
     Returns:
-        Heights (m), `inf` where nothing lies over a cell.
+        Heights (m) of what lies within the gel's reach, which alone can press, and of everything, which light meets;
+        `inf` where nothing lies over a cell.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))
+    # No part can reach the gel that is higher over first touch than depth and tilts bring it down.
+    extent = sum(_math.most(part) - _math.least(part) for part in (across, down))
+    reach = _math.least(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
     across = (across / gel.size[0] + 0.5) * columns - 0.5
     down = (down / gel.size[1] + 0.5) * rows - 0.5
     keep = jnp.broadcast_to(present, height.shape)
     places = jnp.stack([across, down], axis=-1)
-    winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells)
+    near, winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells, within=reach)
     corners = (across, down, height), body.faces
     images = (winner, *_lines(optics.pixel_centres(gel.cells)))
-    return where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
+    whole = where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
+    return jnp.where(winner == near, whole, jnp.inf), whole
 
 
 def _draw(

@@ -9,12 +9,13 @@ Pixel coordinates are (column, row), whole numbers at pixel centres, x to the ri
 what is nearer and affine across a face on the screen: -1/depth in a pinhole's view, depth itself in a parallel one.
 """
 
+import math
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _math
 
@@ -33,8 +34,9 @@ def rasterise(
     two_sided: Bool[Array, ""],
     shape: tuple[int, int],
     *,
+    within: ScalarLike | None = None,
     chunk: int = 1024,
-) -> Int[Array, "h w"]:
+) -> Int[Array, "*layers h w"]:
     """Index of the nearest face at every pixel centre.
 
     Args:
@@ -45,14 +47,18 @@ def rasterise(
         keep: vertices that can be drawn; a face needs all three.
         two_sided: whether faces are seen from behind too.
         shape: (height, width) of the image, pixels.
+        within: an order, to have an image by themselves of the faces that have a corner nearer than it.
         chunk: runs walked at a time.
 
     Returns:
-        Face indices, -1 where no face is seen. No gradient.
+        Face indices, -1 where no face is seen. With `within` two such images, (2, h, w): of those faces, and of all. No
+        gradient.
     """
     height, width = shape
+    layers = () if within is None else (2,)
+    pixels = math.prod((*layers, *shape))
     num_faces = faces.shape[0]
-    points, order = jax.lax.stop_gradient((points, order))
+    points, order, within = jax.lax.stop_gradient((points, order, within))
     points_x, points_y = points[:, 0], points[:, 1]
     nearest, last = _math.least(jnp.where(keep, order, jnp.inf)), _math.most(jnp.where(keep, order, -jnp.inf))
 
@@ -135,19 +141,24 @@ def rasterise(
         value = o0 + slope_x * (column - x0) + slope_y * (row - y0)
         least, most = _lowest(o0, o1, o2), _highest(o0, o1, o2)
         pixel = row.astype(jnp.int32) * width + column.astype(jnp.int32)
+        if within is not None:
+            pixel += jnp.where(least < within, 0, height * width)
 
         def step(along: Int[Array, ""], image: Array) -> Array:
             level = jnp.clip((jnp.clip(value + slope_x * along, least, most) - nearest) * scale, 0, levels)
             key = (level.astype(jnp.uint32) << face_bits) | face.astype(jnp.uint32)
-            return image.at[jnp.where(along < length, pixel + along, height * width)].min(key, mode="drop")
+            return image.at[jnp.where(along < length, pixel + along, pixels)].min(key, mode="drop")
 
         # As many steps for every chunk: under `vmap` a loop that may end sooner copies the image in each.
         return base + chunk, following, jax.lax.fori_loop(0, _RUN, step, image)
 
-    blank = jnp.full(height * width, _NOTHING)
+    blank = jnp.full(pixels, _NOTHING)
     _, _, image = jax.lax.while_loop(lambda state: state[0] < total, body, (zero, zero, blank))
+    if within is not None:
+        near, far = image.reshape(2, height * width)
+        image = jnp.stack([near, jnp.minimum(near, far)])
     winner = (image & jnp.uint32(2**face_bits - 1)).astype(jnp.int32)
-    return jnp.where(image == _NOTHING, -1, winner).reshape(shape)
+    return jnp.where(image == _NOTHING, -1, winner).reshape(*layers, *shape)
 
 
 def barycentrics(
