@@ -317,9 +317,6 @@ def _draw(
     pixels, far = optics.to_pixels(camera, seen, shape, points)
     inverse = 1 / jnp.maximum(far, camera.near)
     winner = optics.rasterise(pixels, -inverse, body.faces, present & (far > camera.near), body.two_sided, shape)
-    corners = (pixels[:, 0], pixels[:, 1], inverse), body.faces
-    centres = _lines(optics.pixel_centres(shape))
-    depth = where_active(_depth, winner >= 0, corners, (winner, *centres), jnp.full(shape, jnp.inf))
 
     # seen through the skin
     slopes = _lines(optics.rays(camera, seen, shape))
@@ -329,10 +326,12 @@ def _draw(
     square_radius = (x * 2 / gel.size[0]) ** 2 + (y * 2 / gel.size[1]) ** 2
     empty = _planes(optics.empty_view(sensor.room, square_radius, walls, hidden))
     surface = (body.normals, body.colors, body.uv, body.texture, body.two_sided)
+    corners = (pixels[:, 0], pixels[:, 1], inverse), body.faces
     params = (sensor, surface, corners, _math.quat_matrix(pose[3:]))
-    images = (winner, depth, *centres, *slopes, hidden, *empty)
-    visual = [v[1:-1, 1:-1] for v in where_active(_look, (winner >= 0) & on_pad, params, images, empty)]
-    visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in _pixels(visual, stride)]
+    images = (winner, on_pad, *_lines(optics.pixel_centres(shape)), *slopes, hidden, *empty)
+    depth, *visual = where_active(_look, winner >= 0, params, images, [jnp.full(shape, jnp.inf), *empty])
+    visual = _pixels([channel[1:-1, 1:-1] for channel in visual], stride)
+    visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in visual]
 
     # the skin itself
     face = jnp.asarray(camera.distance)
@@ -384,11 +383,6 @@ def _lit(
     return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), _planes(untouched), ring=1)
 
 
-def _depth(corners: _Corners, images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
-    """Depth of the winning faces."""
-    return 1 / functools.reduce(operator.add, _shares(corners, *images))
-
-
 @jax.custom_jvp
 def _carried(
     imprint: Float[Array, "h w"],
@@ -436,11 +430,13 @@ def _carried_jvp(primals: tuple, tangents: tuple) -> tuple[Float[Array, "h w"], 
 
 
 def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tuple[Array, ...]) -> list[Array]:
-    """The object's colour through the skin, linear light."""
+    """The object's depth, and its colour through the skin, linear light."""
     sensor, (normals, colors, uv, texture, two_sided), corners, turn = params
-    winner, depth, column, row, slope_x, slope_y, hidden, *empty = images
+    winner, on_pad, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
-    shares = [share * jnp.where(winner >= 0, depth, 1) for share in _shares(corners, winner, column, row)]
+    shares = _shares(corners, winner, column, row)
+    depth = 1 / functools.reduce(operator.add, shares)
+    shares = [share * depth for share in shares]
 
     def inside(values: Float[Array, "f 3 k"]) -> list[Float[Array, "h w"]]:
         size = values.shape[-1]
@@ -457,8 +453,9 @@ def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tup
     normal = jnp.stack([scale * nx, scale * ny, scale * nz], axis=-1)
     sampled = optics.sample_texture(texture, jnp.stack(inside(uv), axis=-1))
     albedo = jnp.stack([color * sampled[..., k] for k, color in enumerate(inside(colors))], axis=-1)
-    height = jnp.where(winner >= 0, depth, 1) - sensor.camera.distance
-    return _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
+    height = depth - sensor.camera.distance
+    color = _planes(optics.shade(sensor.room, albedo, normal, height, jnp.stack(empty, axis=-1), hidden))
+    return [depth, *(jnp.where(on_pad, own, behind) for own, behind in zip(color, empty, strict=True))]
 
 
 def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Array]:
