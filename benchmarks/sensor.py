@@ -1,6 +1,6 @@
 """Whole frames per second of `sense` beside embree's depth, and what they cost from small to large.
 
-    python -m benchmarks.sensor             # about 10 minutes on two CPU cores, most of it compilation
+    python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
     python -m benchmarks.sensor --taxim     # a minute: touch from a height map, beside taxim's renderer in JAX
     python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory; writes a plot
     python -m benchmarks.sensor --compile   # 2 minutes: how often a hundred objects compile
@@ -42,11 +42,10 @@ from embreex.rtcore_scene import EmbreeScene
 import sts_jax as sts
 from sts_jax import _math, frame, objects, optics, tactile
 
-SIZES = ((64, 64), (200, 200), (480, 640))
+SIZES = {(64, 64): 41, (200, 200): 15, (480, 640): 7}  # and how often each is timed
 FACES = (None, 2000, 5000)  # None: as the class has them
 CATEGORIES = ("bottle", "scissors", "watch")
 POSES = 16  # of each object: resting on the pad, turned about the vertical
-REPEATS = 7
 PAPER = 0.40  # s, a frame of 640x480 of the paper's code
 COST_SIZES = ((64, 64), (120, 160), (240, 320), (480, 640), (960, 1280), (1232, 1640))
 COST_FACES = (500, 1000, 2000, 5000, 10000, 20000, 50000)
@@ -126,7 +125,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
     }
 
 
-def median_seconds(*works: Callable[[], object], repeats: int = REPEATS) -> list[float]:
+def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
     """Median seconds of each, run in turn so that a busy machine slows all alike."""
     seconds = []
     for _ in range(repeats + 1):
@@ -180,14 +179,14 @@ def speed() -> None:
         for faces in FACES:
             body = finer(objects.make(jax.random.key(0), category), faces)
             inputs = resting(body)
-            for shape in SIZES:
+            for shape, repeats in SIZES.items():
                 asked = [(), ("pressure",), ("depth",), ("visual",), ("tactile",)]
                 ours = [functools.partial(frames, body, inputs, shape=shape, fields=fields) for fields in asked]
                 batched = functools.partial(frames, body, inputs, shape=shape, batched=True)
                 at_once = in_threads([ours[0]] * cores) if on_cpu else batched
                 others = list(embree(body, inputs[0], shape).values())
                 threaded = [in_threads(works * cores) for works in others]
-                times = median_seconds(*ours, at_once, *map(in_turn, others), *threaded)
+                times = median_seconds(*ours, at_once, *map(in_turn, others), *threaded, repeats=repeats)
                 whole, gel, depth, visual, touch = (seconds / POSES for seconds in times[:5])
                 best = times[5] / POSES / (cores if on_cpu else 1)
                 alone, together = (np.array(some) / POSES for some in (times[6:9], times[9:]))
