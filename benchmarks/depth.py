@@ -24,7 +24,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from sts_jax import _math, objects
+from sts_jax import geometry, objects
 
 SIZES = ((64, 64), (97, 53), (200, 200), (480, 640))
 PROCEDURAL = ("fork", "scissors", "watch", "camera")
@@ -83,7 +83,7 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
     """A pose of a kind and a wrench that goes with it: 1 N under the object's middle where it touches, or none."""
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
-    points = np.asarray(_math.transform(jnp.asarray([0, 0, 0, *quat], jnp.float32), body.vertices))
+    points = np.asarray(geometry.transform(jnp.asarray([0, 0, 0, *quat], jnp.float32), body.vertices))
     low = -points[:, 2].min()
     if kind == "touching":
         x, y, z = *rng.uniform(-0.03, 0.03, 2), low + rng.uniform(-3e-4, 0)

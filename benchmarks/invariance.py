@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from sts_jax import _math, objects, physics
+from sts_jax import geometry, objects, physics
 from sts_jax.dataset.collect import turn, turn_condition
 from sts_jax.physics import scene
 from sts_jax.physics.scenarios import Shape, Start
@@ -102,7 +102,7 @@ def box() -> objects.Body:
 def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
     """0, 1, 2: the axis that is vertical at the end; 3: none; 4: it fell off."""
     del first
-    vertical = jnp.abs(_math.quat_matrix(_math.normalize(last[3:]))[2])
+    vertical = jnp.abs(geometry.quat_to_matrix(geometry.normalize(last[3:]))[2])
     face = jnp.where(jnp.max(vertical) > UP, jnp.argmax(vertical), 3)
     return jnp.where(physics.fell_off(last), 4, face)
 
@@ -110,7 +110,7 @@ def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
 def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
     """0: stands, 1: on its head, 2: lies, 3: it fell off."""
     del first
-    up = _math.quat_matrix(_math.normalize(last[3:]))[2, 2]
+    up = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2]
     side = jnp.where(up > UP, 0, jnp.where(up < -UP, 1, 2))
     return jnp.where(physics.fell_off(last), 3, side)
 

@@ -40,7 +40,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from sts_jax import _math, frame, objects, optics, tactile
+from sts_jax import frame, geometry, objects, optics, tactile
 
 SIZES = {(64, 64): 41, (200, 200): 15, (480, 640): 7}  # and how often each is timed
 FACES = (None, 2000, 5000)  # None: as the class has them
@@ -82,11 +82,11 @@ def resting(body: objects.Body, number: int = POSES) -> Inputs:
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
     angles = jnp.linspace(0, 2 * jnp.pi, number, endpoint=False)
     low = jnp.min(body.vertices[body.faces.ravel(), 2])
-    quats = jax.vmap(lambda a: _math.quat_from_rotvec(jnp.stack([0 * a, 0 * a, a])))(angles)
+    quats = jax.vmap(lambda a: geometry.quat_from_rotvec(jnp.stack([0 * a, 0 * a, a])))(angles)
     poses = jnp.concatenate(
         [jnp.full((number, 1), 0.01), jnp.zeros((number, 1)), jnp.full((number, 1), -low), quats], 1
     )
-    places = jax.vmap(_math.transform)(poses, jnp.broadcast_to(com, (number, 3)))
+    places = jax.vmap(geometry.transform)(poses, jnp.broadcast_to(com, (number, 3)))
     force = mass * 9.81
     zero = jnp.zeros(number)
     return poses, jnp.stack([zero, zero, zero + force, places[:, 1] * force, -places[:, 0] * force, zero], 1)
@@ -97,7 +97,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
-    posed = [np.asarray(_math.transform(pose, body.vertices)) for pose in poses]
+    posed = [np.asarray(geometry.transform(pose, body.vertices)) for pose in poses]
     slopes = np.asarray(jnp.stack(optics.rays(camera, optics.full_window(camera, shape), shape), -1)).reshape(-1, 2)
     directions = np.concatenate([slopes, np.ones((len(slopes), 1), np.float32)], -1)
     origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from benchmarks.starts import Starts, filled, rigid
-from sts_jax import _math, objects, physics
+from sts_jax import geometry, objects, physics
 from sts_jax.sensor import Sensor
 
 NOISE = 0.001  # m, standard deviation of the centre of pressure that is asked about
@@ -105,7 +105,7 @@ def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, 
     friction = np.repeat(np.linspace(*scenario.friction, 2 * FRICTIONS + 1)[1::2], DRAWS)
     rng = np.random.default_rng(1)
     seen = starts.pose + np.array([*[SEEN[0]] * 3, *[SEEN[1] / 2] * 4]) * rng.normal(size=starts.pose.shape)
-    turns = np.asarray(jax.vmap(_math.quat_matrix)(_math.normalize(jnp.asarray(seen[:, 3:], jnp.float32))))
+    turns = np.asarray(jax.vmap(geometry.quat_to_matrix)(geometry.normalize(jnp.asarray(seen[:, 3:], jnp.float32))))
     full = [filled(body, np.ones(1))[1][0] for body in items]
     hulls = [np.asarray(b.hulls, float).reshape(-1, 3) for b in items]
     ups = [objects.rest_poses(hull, np.asarray(b.shell_com, float))[0] for hull, b in zip(hulls, items, strict=True)]

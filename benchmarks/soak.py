@@ -23,7 +23,7 @@ import numpy as np
 from tqdm import tqdm
 
 from benchmarks.starts import Starts, bodies, rigid_of
-from sts_jax import _math, dataset, objects, physics
+from sts_jax import dataset, geometry, objects, physics
 from sts_jax.physics.scenarios import G
 from sts_jax.physics.simulate import SUNK_LIMIT
 from sts_jax.sensor import Sensor
@@ -49,7 +49,7 @@ def excess_energy(
         gravity: (3,) m/s^2, constant.
     """
     mass, com, inertia = (np.asarray(x, np.float64) for x in rigid)
-    rotation = np.asarray(_math.quat_matrix(jnp.asarray(pose[..., 3:])), np.float64)
+    rotation = np.asarray(geometry.quat_to_matrix(jnp.asarray(pose[..., 3:])), np.float64)
     arm = np.einsum("nfij,nj->nfi", rotation, com)
     turn = np.einsum("nfji,nfj->nfi", rotation, velocity[..., 3:])
     speed = velocity[..., :3] + np.cross(velocity[..., 3:], arm)

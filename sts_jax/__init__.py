@@ -1,6 +1,6 @@
 """The See-Through-your-Skin sensor in JAX: simulate it, see with it, learn to predict from it."""
 
-from sts_jax import dataset, evaluation, mvae, objects, optics, physics, tactile, training
+from sts_jax import dataset, evaluation, geometry, mvae, objects, optics, physics, tactile, training
 from sts_jax.frame import Frame, expose, sense, touch
 from sts_jax.predict import Prediction, Predictor
 from sts_jax.sensor import Sensor
@@ -13,6 +13,7 @@ __all__ = [
     "dataset",
     "evaluation",
     "expose",
+    "geometry",
     "mvae",
     "objects",
     "optics",

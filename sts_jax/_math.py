@@ -1,31 +1,13 @@
-"""Small mathematics that every room may use: gradient-safe vector operations and quaternions.
-
-Quaternions are `[w, x, y, z]`, unit; a pose is `(7,)`: position (m), then quaternion. Everything broadcasts
-over leading axes.
-"""
+"""Reductions in the form that XLA's CPU backend vectorises, and an eigenvector in closed form."""
 
 import functools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
 _LANES = 32  # numbers that a reduction takes one by one
-
-
-def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-    """Euclidean norm over the last axis, with zero gradient at zero."""
-    square = jnp.sum(x * x, axis=-1)
-    ok = square > 0
-    return jnp.where(ok, jnp.sqrt(jnp.where(ok, square, 1)), 0)
-
-
-def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-    """`x` over its norm; zero, with zero gradient, where `x` is zero."""
-    length = norm(x)[..., None]
-    ok = length > 0
-    return jnp.where(ok, x / jnp.where(ok, length, 1), 0)
 
 
 def least(values: Array) -> Array:
@@ -64,72 +46,6 @@ def _fold(pair: Callable[[Array, Array], Array], whole: Callable[[Array], Array]
         rest = values[8 * part :]
         values = jnp.concatenate([functools.reduce(pair, parts), rest]) if len(rest) else functools.reduce(pair, parts)
     return whole(values)
-
-
-def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Hamilton product: the rotation `b`, then the rotation `a`."""
-    aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
-    bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
-    return jnp.stack(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
-    )
-
-
-def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """The same rotation, unit, with `w >= 0`."""
-    q = normalize(q)
-    return jnp.where(q[..., :1] < 0, -q, q)
-
-
-def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Rotation matrix of a unit quaternion."""
-    w, x, y, z = jnp.moveaxis(q, -1, 0)
-    rows = [
-        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ]
-    return jnp.stack(rows, -2)
-
-
-def nearest_quat(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
-    """Quaternion, `w >= 0`, of the rotation R with the largest `sum(R * matrix)`: the nearest to any 3x3 matrix.
-
-    The eigenvector of the largest eigenvalue of Davenport's K (Markley and Mortari 2000, "Quaternion attitude
-    estimation using vector observations").
-    """
-    m = matrix
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
-    z = jnp.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1)
-    corner = m + m.swapaxes(-1, -2) - jnp.tensordot(trace, jnp.eye(3), 0)
-    top = jnp.concatenate([trace[..., None], z], axis=-1)[..., None, :]
-    k = jnp.concatenate([top, jnp.concatenate([z[..., :, None], corner], axis=-1)], axis=-2)
-    return quat_canonical(jnp.linalg.eigh(k)[1][..., :, -1])
-
-
-def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """Quaternion of the rotation by `|v|` radians about `v`; differentiable at zero."""
-    half = 0.5 * norm(v)[..., None]
-    return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
-
-
-def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """A rotation drawn uniformly; `w >= 0`."""
-    return quat_canonical(jax.random.normal(key, (4,)))
-
-
-def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Points of the mesh frame in the sensor frame."""
-    # Component by component: as a product of matrices it is several times slower on a CPU, and rounded on some GPUs.
-    x, y, z = (points[..., k] for k in range(3))
-    rows = zip(quat_matrix(pose[3:]), pose[:3], strict=True)
-    return jnp.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
 
 
 @jax.custom_jvp

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-from sts_jax import _math, optics, tactile
+from sts_jax import _math, geometry, optics, tactile
 from sts_jax._tiles import where_active
 from sts_jax.objects.body import FACE_CLASSES, Body
 from sts_jax.sensor import Sensor
@@ -103,12 +103,12 @@ def _sense(
     crop: bool,
     moving_edges: bool,
 ) -> Frame:
-    finite = sound & jnp.all(jnp.isfinite(pose)) & (_math.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
+    finite = sound & jnp.all(jnp.isfinite(pose)) & (geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
     if wrench is not None:
         finite &= jnp.all(jnp.isfinite(wrench))
         wrench = jnp.where(finite, wrench, 0)
     safe_pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
-    safe_pose = jnp.concatenate([safe_pose[:3], _math.normalize(safe_pose[3:])])
+    safe_pose = jnp.concatenate([safe_pose[:3], geometry.normalize(safe_pose[3:])])
 
     points = _placed(finite, safe_pose, body.vertices, jnp.full_like(body.vertices, -1))
     present = _math.most(points[:, 2]) > 0
@@ -119,10 +119,10 @@ def _sense(
     else:
         contact = tactile.settle(sensor.gel, heights, jnp.where(present, wrench, 0))
         pressing = present & (wrench[2] > 0)
-    turn = _math.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
+    turn = geometry.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
-    position = _math.transform(jnp.concatenate([drop, turn]), safe_pose[:3])
-    drawn = jnp.concatenate([position, _math.quat_canonical(_math.quat_multiply(turn, safe_pose[3:]))])
+    position = geometry.transform(jnp.concatenate([drop, turn]), safe_pose[:3])
+    drawn = jnp.concatenate([position, geometry.quat_canonical(geometry.quat_multiply(turn, safe_pose[3:]))])
     points = _placed(pressing, drawn, body.vertices, points)
 
     if crop:
@@ -151,7 +151,7 @@ def _placed(
 ) -> Float[Array, "v 3"]:
     """Vertices in the sensor frame, x, y and z each by itself in memory."""
     # What comes out of a condition is kept; else XLA works it out anew wherever it is needed.
-    planes = jax.lax.cond(so, lambda: tuple(_math.transform(pose, vertices).T), lambda: tuple(otherwise.T))
+    planes = jax.lax.cond(so, lambda: tuple(geometry.transform(pose, vertices).T), lambda: tuple(otherwise.T))
     return jnp.stack(planes, axis=-1)
 
 
@@ -327,7 +327,7 @@ def _draw(
     empty = _planes(optics.empty_view(sensor.room, square_radius, walls, hidden))
     surface = (body.normals, body.colors, body.uv, body.texture, body.two_sided)
     corners = (pixels[:, 0], pixels[:, 1], inverse), body.faces
-    params = (sensor, surface, corners, _math.quat_matrix(pose[3:]))
+    params = (sensor, surface, corners, geometry.quat_to_matrix(pose[3:]))
     images = (winner, on_pad, *_lines(optics.pixel_centres(shape)), *slopes, hidden, *empty)
     depth, *visual = where_active(_look, winner >= 0, params, images, [jnp.full(shape, jnp.inf), *empty])
     visual = _pixels([channel[1:-1, 1:-1] for channel in visual], stride)

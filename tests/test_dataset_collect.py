@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from sts_jax import _math, dataset
+from sts_jax import dataset, geometry
 from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
 SMALL = dataset.Collection(
@@ -83,11 +83,11 @@ def test_all_frames_of_the_full_ones_and_two_of_the_others(folder):
 
 def test_a_turn_turns_position_orientation_and_wrench():
     key = jax.random.key(3)
-    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), _math.random_quat(key)])
+    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), geometry.random_quat(key)])
     point = jnp.array([0.005, -0.01, 0.02])
-    x, y, z = np.asarray(_math.transform(pose, point))
+    x, y, z = np.asarray(geometry.transform(pose, point))
     turned = turn(pose, 1)
-    np.testing.assert_allclose(_math.transform(turned, point), [-y, x, z], atol=1e-7)
+    np.testing.assert_allclose(geometry.transform(turned, point), [-y, x, z], atol=1e-7)
     wrench = jnp.array([1.0, 2, 3, 4, 5, 6])
     np.testing.assert_allclose(turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
 
@@ -107,11 +107,11 @@ def test_a_scenarios_symmetries_are_those_that_turn_its_gravity_with_its_conditi
 
 
 def test_a_mirrored_pose_and_body_are_the_mirror_image_in_the_sensor_frame():
-    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), _math.random_quat(jax.random.key(4))])
+    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), geometry.random_quat(jax.random.key(4))])
     point, arm, force = jnp.array([0.005, -0.01, 0.02]), jnp.array([0.3, -0.2, 0.1]), jnp.array([1.0, 2, 3])
     flip = jnp.array([1.0, -1, 1])
     np.testing.assert_allclose(
-        _math.transform(turn(pose, 4), point * flip), _math.transform(pose, point) * flip, atol=1e-7
+        geometry.transform(turn(pose, 4), point * flip), geometry.transform(pose, point) * flip, atol=1e-7
     )
     wrench = jnp.concatenate([force, jnp.cross(arm, force)])
     image = jnp.concatenate([force * flip, jnp.cross(arm * flip, force * flip)])

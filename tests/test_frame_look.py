@@ -13,7 +13,7 @@ from optics_bodies import body_mesh, from_trimesh, public_meshes, rays_hidden
 from PIL import Image
 
 import sts_jax as sts
-from sts_jax import _math, objects, optics, tactile
+from sts_jax import geometry, objects, optics, tactile
 from sts_jax.frame import underside
 
 SENSOR = sts.Sensor()
@@ -49,8 +49,8 @@ def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
 
 
 def leaning(body, lift):
-    turn = _math.quat_from_rotvec(jnp.array([0.6, 0.5, 0.3]))
-    points = _math.transform(jnp.concatenate([jnp.zeros(3), turn]), body.vertices)
+    turn = geometry.quat_from_rotvec(jnp.array([0.6, 0.5, 0.3]))
+    points = geometry.transform(jnp.concatenate([jnp.zeros(3), turn]), body.vertices)
     return points + jnp.array([[0, 0, lift]]) - jnp.min(points[:, 2])[None, None] * jnp.array([[0, 0, 1.0]])
 
 

@@ -13,7 +13,7 @@ from optics_bodies import from_trimesh
 
 import sts_jax as sts
 from experiments.sense import Config, lay
-from sts_jax import _math, objects, tactile
+from sts_jax import geometry, objects, tactile
 
 SENSOR = sts.Sensor()
 FINE = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, cells=(300, 300)))
@@ -55,7 +55,7 @@ def seen(name, sensor, size, crop=False):
 
 def heights(name, frame):
     """Of the object's vertices in the balanced pose (m)."""
-    return np.asarray(_math.transform(jnp.asarray(frame.pose), rest(name)[0].vertices))[:, 2]
+    return np.asarray(geometry.transform(jnp.asarray(frame.pose), rest(name)[0].vertices))[:, 2]
 
 
 def figures(name, sensor):

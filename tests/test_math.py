@@ -65,29 +65,6 @@ def test_gradient_is_the_finite_difference(spread):
     np.testing.assert_allclose(np.array(got) * np.sign(np.array(value) @ here), expected, atol=2e-4)
 
 
-def test_nearest_quat_is_the_nearest_rotation_by_singular_values():
-    rng = np.random.default_rng(2)
-    matrix = rng.normal(size=(500, 3, 3))
-    left, _, right = np.linalg.svd(matrix)
-    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
-    quat = _math.nearest_quat(jnp.asarray(matrix, jnp.float32))
-    assert np.all(quat[:, 0] >= 0)
-    values = np.linalg.svd(matrix, compute_uv=False)
-    clear = values[:, 1] - values[:, 2] > 0.05  # elsewhere two rotations may be equally near
-    np.testing.assert_allclose(_math.quat_matrix(quat)[clear], (left @ right)[clear], atol=2e-4)
-
-
-def test_transform_is_the_quaternions_rotation_then_the_shift():
-    rng = np.random.default_rng(2)
-    quat = rng.normal(size=4)
-    quat /= np.linalg.norm(quat)
-    points = rng.normal(size=(5, 3))
-    w, v = quat[0], quat[1:]
-    turned = points + 2 * np.cross(v, np.cross(v, points) + w * points)
-    got = _math.transform(jnp.asarray([0.1, -0.2, 0.3, *quat]), jnp.asarray(points))
-    np.testing.assert_allclose(got, turned + np.array([0.1, -0.2, 0.3]), atol=1e-6)
-
-
 @pytest.mark.parametrize("size", [1, 7, 33, 64, 150, 1000, 5003])
 def test_reductions_by_parts_are_numpys(size):
     rng = np.random.default_rng(size)

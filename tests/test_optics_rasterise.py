@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from optics_bodies import body_mesh, embree, from_trimesh, interior, public_meshes
 
-from sts_jax import _math, objects, optics
+from sts_jax import geometry, objects, optics
 
 CAMERA = optics.Camera()
 SHAPES = [(64, 64), (97, 53), (200, 200)]
@@ -20,7 +20,7 @@ def strict_ranks():
 
 
 def draw(vertices, faces, two_sided, pose, shape):
-    points = _math.transform(pose, vertices)
+    points = geometry.transform(pose, vertices)
     pixels, depth = optics.to_pixels(CAMERA, optics.full_window(CAMERA, shape), shape, points)
     inverse = 1 / jnp.maximum(depth, CAMERA.near)
     winner = optics.rasterise(pixels, -inverse, faces, depth > CAMERA.near, two_sided, shape)
@@ -160,7 +160,7 @@ def test_two_sided_faces_are_seen_from_behind():
 @pytest.mark.parametrize("name", ["bumpy", "ring", "bottle"])
 def test_faces_within_an_order_have_an_image_of_their_own(name):
     body = BODIES[name]
-    points = _math.transform(some_pose(np.random.default_rng(7)), body.vertices)
+    points = geometry.transform(some_pose(np.random.default_rng(7)), body.vertices)
     faces, height = np.asarray(body.faces), np.asarray(points[:, 2])
     real = np.any(faces != faces[:, :1], axis=1)
     within = float(np.median(height[faces].min(1)[real]))

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sts_jax import _math, physics
+from sts_jax import geometry, physics
 from sts_jax.physics import contact, roll, scene
 
 PAD = (0.15, 0.15)
@@ -115,7 +115,7 @@ def test_frames_are_right_handed_and_start_with_the_normal() -> None:
 def test_padding_changes_nothing() -> None:
     shape = points("box")
     more = np.concatenate([shape, np.repeat(shape[-1:], 32, axis=0)])
-    pose = jnp.array([0.05, 0.01, 0.0398, *_math.random_quat(jax.random.key(0)) * 0 + jnp.array([1.0, 0, 0, 0])])
+    pose = jnp.array([0.05, 0.01, 0.0398, *geometry.random_quat(jax.random.key(0)) * 0 + jnp.array([1.0, 0, 0, 0])])
     a, b = (contact.collide(contact.hull(s), pose, HALF) for s in (shape, more))
     np.testing.assert_array_equal(np.sort(a.dist), np.sort(b.dist))
 
@@ -185,8 +185,8 @@ def test_an_edge_across_a_corner_is_held_by_both_rims_where_its_ends_are_lower(l
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.06, 0.005, 0.005]
     rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)]).astype(np.float32)[None]
     turn = jnp.array([jnp.array([0, 0, -np.pi / 4]), jnp.array([0, lean, 0]), jnp.array([np.pi / 4, 0, 0])])
-    yaw, pitch, edge_on = _math.quat_from_rotvec(turn.astype(jnp.float32))
-    quat = np.asarray(_math.quat_multiply(yaw, _math.quat_multiply(pitch, edge_on)))
+    yaw, pitch, edge_on = geometry.quat_from_rotvec(turn.astype(jnp.float32))
+    quat = np.asarray(geometry.quat_multiply(yaw, geometry.quat_multiply(pitch, edge_on)))
     away = 0.007  # m, the middle of the lowest edge from either side; it crosses the rims 14 mm from the corner
     deep = 0.0002  # m, the lower of the two crossings; both ends are lower still, or one is
     reach, thick = away * np.sqrt(2), 0.005 * np.sqrt(2)

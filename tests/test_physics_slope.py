@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy
 
-from sts_jax import _math, objects, physics
+from sts_jax import geometry, objects, physics
 from sts_jax.physics import contact, roll, scene
 from sts_jax.physics.scenarios import STANDING, G
 from sts_jax.sensor import Sensor
@@ -112,7 +112,7 @@ def slid(bodies: list[objects.Body]) -> physics.Trajectory:
 def points(bodies: list[objects.Body], slid: physics.Trajectory, row: int, frame: int) -> np.ndarray:
     """Hull vertices in the sensor frame."""
     pose = jnp.asarray(slid.pose[row, frame])
-    return np.asarray(_math.transform(pose, bodies[slid.body[row]].hulls[0]))
+    return np.asarray(geometry.transform(pose, bodies[slid.body[row]].hulls[0]))
 
 
 def weight(bodies: list[objects.Body], slid: physics.Trajectory, row: int) -> tuple[float, np.ndarray]:
@@ -176,7 +176,7 @@ def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], 
     for row in alone:  # the pad carries all of the weight, and its moment
         size, com = weight(bodies, slid, row)
         pull = size * np.array([0, np.sin(SLOPE), -np.cos(SLOPE)])
-        centre = np.asarray(_math.transform(jnp.asarray(slid.pose[row, -1]), jnp.asarray(com)))
+        centre = np.asarray(geometry.transform(jnp.asarray(slid.pose[row, -1]), jnp.asarray(com)))
         np.testing.assert_allclose(slid.wrench[row, -1, :3], -pull, atol=0.02 * size)
         np.testing.assert_allclose(slid.wrench[row, -1, 3:], -np.cross(centre, pull), atol=0.02 * size * 0.075)
     for row in leaning:  # of Coulomb's friction on the pad no more than there can be

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax import _math, training
+from sts_jax import geometry, training
 from sts_jax.evaluation.metrics import geodesic_angle
 
 
 def poses(count):
     key, turn = jax.random.split(jax.random.key(0))
-    quats = jax.vmap(_math.random_quat)(jax.random.split(turn, count))
+    quats = jax.vmap(geometry.random_quat)(jax.random.split(turn, count))
     return jnp.concatenate([0.05 * jax.random.normal(key, (count, 3)), quats], axis=-1)
 
 
@@ -29,7 +29,7 @@ def test_a_code_comes_back_as_its_pose(rotation, size):
 
 def test_a_matrix_code_has_no_jump_where_the_quaternions_sign_has_one():
     around = jnp.array([0.0, 0.0, 1.0])
-    turns = [_math.quat_from_rotvec(angle * around) for angle in (jnp.pi - 1e-3, jnp.pi + 1e-3)]
+    turns = [geometry.quat_from_rotvec(angle * around) for angle in (jnp.pi - 1e-3, jnp.pi + 1e-3)]
     codes = {
         rotation: [training.Preprocessing(rotation=rotation).encode_pose(jnp.r_[jnp.zeros(3), q]) for q in turns]
         for rotation in ("matrix", "quaternion")

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from sts_jax import _math, objects, physics
+from sts_jax import geometry, objects, physics
 from sts_jax.dataset import records
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
@@ -218,19 +218,19 @@ def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
     """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
-    spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
-    position = _math.transform(jnp.concatenate([jnp.zeros(3), spin]), pose[..., :3])
+    spin = geometry.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
+    position = geometry.transform(jnp.concatenate([jnp.zeros(3), spin]), pose[..., :3])
     spin = jnp.broadcast_to(spin, (*pose.shape[:-1], 4))
-    return jnp.concatenate([position, _math.quat_canonical(_math.quat_multiply(spin, pose[..., 3:]))], -1)
+    return jnp.concatenate([position, geometry.quat_canonical(geometry.quat_multiply(spin, pose[..., 3:]))], -1)
 
 
 def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n 6"]:
     """A wrench about the sensor's origin under a symmetry of the pad."""
     if symmetry >= 4:
         wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
-    spin = _math.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
+    spin = geometry.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
     pair = wrench.reshape(*wrench.shape[:-1], 2, 3)
-    return _math.transform(jnp.concatenate([jnp.zeros(3), spin]), pair).reshape(wrench.shape)
+    return geometry.transform(jnp.concatenate([jnp.zeros(3), spin]), pair).reshape(wrench.shape)
 
 
 def turn_condition(condition: Float[Array, "*n c"], symmetry: int) -> Float[Array, "*n c"]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 
-from sts_jax import _math, optics, physics
+from sts_jax import geometry, optics, physics
 from sts_jax.dataset import render_uint8
 from sts_jax.objects import Body
 from sts_jax.sensor import Sensor
@@ -51,16 +51,18 @@ def outside(
     stop = jnp.stack(
         [jnp.stack([x * half[0], y, z * wall]) for x in (-1, 1) for y in (half[1], thick[1]) for z in (0, 1)]
     )
-    vertices = jnp.concatenate([_math.transform(pose, body.vertices), corners * half, stop])
+    vertices = jnp.concatenate([geometry.transform(pose, body.vertices), corners * half, stop])
     faces = jnp.concatenate([body.faces, box + len(body.vertices), box + len(body.vertices) + 8])
     flat = jnp.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], jnp.float32)
     flat = jnp.broadcast_to(jnp.tile(flat, (4, 1))[:, None], (24, 3, 3))
-    normals = jnp.concatenate([body.normals @ _math.quat_matrix(pose[3:]).T, flat])
+    normals = jnp.concatenate([body.normals @ geometry.quat_to_matrix(pose[3:]).T, flat])
     top = (flat[..., 2:] > 0) & (jnp.arange(24) < 12)[:, None, None]
     if up is not None:
-        axis, along = jnp.cross(up, jnp.array([0.0, 0.0, 1.0])), _math.norm(up)
-        level = _math.quat_from_rotvec(_math.normalize(axis) * jnp.arctan2(_math.norm(axis) / along, up[2] / along))
-        vertices, normals = (x @ _math.quat_matrix(level).T for x in (vertices, normals))
+        axis, along = jnp.cross(up, jnp.array([0.0, 0.0, 1.0])), geometry.norm(up)
+        level = geometry.quat_from_rotvec(
+            geometry.normalize(axis) * jnp.arctan2(geometry.norm(axis) / along, up[2] / along)
+        )
+        vertices, normals = (x @ geometry.quat_to_matrix(level).T for x in (vertices, normals))
     albedo = body.colors * optics.sample_texture(body.texture, body.uv)
     albedo = jnp.concatenate([albedo, jnp.where(top, _PAD, _HOUSING)])
     return optics.photograph(
@@ -98,7 +100,7 @@ def stand_ins(
     for body, where in zip(bodies, jnp.asarray(poses, jnp.float32), strict=True):
         grey, plain = jnp.full_like(body.colors, _STAND_IN), jnp.ones_like(body.texture)
         body = dataclasses.replace(body, colors=grey, texture=plain)
-        lowest = jnp.min(_math.transform(where, body.vertices)[:, 2])
+        lowest = jnp.min(geometry.transform(where, body.vertices)[:, 2])
         height = jnp.where(physics.fell_off(where), -1.0, where[2] - lowest)
         pose = where.at[2].set(height)[None]
         visual, _, _ = render_uint8(sensor, body, pose, jnp.zeros((1, 6)), resolution=resolution, crop=False)

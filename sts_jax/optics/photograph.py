@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sts_jax import _math
+from sts_jax import geometry
 from sts_jax.optics.camera import Camera, full_window, rays, to_pixels
 from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
 from sts_jax.optics.shading import to_srgb
@@ -42,8 +42,8 @@ def photograph(
         Image, sRGB in [0, 1].
     """
     eye = jnp.asarray(eye, jnp.float32)
-    forward = _math.normalize(jnp.asarray(target, jnp.float32) - eye)
-    right = _math.normalize(jnp.cross(forward, jnp.array([0.0, 0.0, 1.0])))
+    forward = geometry.normalize(jnp.asarray(target, jnp.float32) - eye)
+    right = geometry.normalize(jnp.cross(forward, jnp.array([0.0, 0.0, 1.0])))
     turn = jnp.stack([right, jnp.cross(forward, right), forward])
     shape = (resolution[0] * _SAMPLES, resolution[1] * _SAMPLES)
     # The pinhole of `camera` sits at z = -distance; the point it looks at, one metre ahead, is the origin.
@@ -63,9 +63,9 @@ def photograph(
 
     x, y = rays(camera, window, shape)
     ray = jnp.stack([x, y, jnp.ones_like(x)], -1) @ turn
-    normal = _math.normalize(values[..., :3])
+    normal = geometry.normalize(values[..., :3])
     normal = jnp.where(jnp.sum(normal * ray, -1, keepdims=True) > 0, -normal, normal)
-    lamp = _math.normalize(-forward - 0.6 * right + jnp.array([0.0, 0.0, 0.8]))
+    lamp = geometry.normalize(-forward - 0.6 * right + jnp.array([0.0, 0.0, 0.8]))
     up = 0.5 + 0.5 * normal[..., 2:]
     light = up * jnp.array(_SKY) + (1 - up) * jnp.array(_GROUND)
     light += jnp.maximum(normal @ lamp, 0)[..., None] * jnp.array(_LAMP)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sts_jax import _math
+from sts_jax import _math, geometry
 
 Scalar = float | Array
 
@@ -227,7 +227,7 @@ def shade(
         Linear light.
     """
     # Channel by channel: an XLA program on a CPU is slow along an axis of three.
-    directions, colors = _math.normalize(room.directions), room.colors
+    directions, colors = geometry.normalize(room.directions), room.colors
     ambient, tint = jnp.asarray(room.ambient), jnp.asarray(room.tint)
     incidence = [jnp.maximum(_dot(direction, normals), 0) for direction in directions]
     heights = jnp.maximum(heights, 0)

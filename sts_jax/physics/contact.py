@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
-from sts_jax import _math
+from sts_jax import geometry
 
 PAD_CONTACTS, WALL_CONTACTS = 8, 4  # MJX reserves four for each pair of boxes
 STEEP = 5.0  # depth against extent in the choice of points
@@ -167,7 +167,7 @@ def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> 
 
 def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
     other = jnp.where(jnp.abs(normal[1]) < 0.5, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
-    tangent = _math.normalize(other - normal * (normal @ other))
+    tangent = geometry.normalize(other - normal * (normal @ other))
     return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
 
 
@@ -193,7 +193,7 @@ def collide(
     Returns:
         `num` contacts in the frame of the box's top; those that are not needed have a distance of 1 m.
     """
-    rotation, place = _math.quat_matrix(pose[3:]), pose[:3, None]
+    rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place
     ends = turned(rotation, jnp.reshape(body.edges, (2, 3, -1))) + place
     normals = turned(rotation, jnp.reshape(body.planes[:3], (3, -1)))

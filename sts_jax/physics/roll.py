@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sts_jax import _math
+from sts_jax import geometry
 from sts_jax.physics import scene
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide, turned
 from sts_jax.physics.scene import mjx
@@ -49,7 +49,7 @@ class Record(NamedTuple):
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:
     """The state of an object with a pose and a velocity (m/s, rad/s, sensor frame), let go after some steps."""
-    turn = velocity[3:] @ _math.quat_matrix(pose[3:])
+    turn = velocity[3:] @ geometry.quat_to_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
     return State(
         qpos=pose,
@@ -104,15 +104,15 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
     new = scene.step(model, data, contacts)
 
     push = scene.push(new, slice(0, PAD_CONTACTS))
-    rotation = _math.quat_matrix(old.qpos[3:])
+    rotation = geometry.quat_to_matrix(old.qpos[3:])
     moment = rotation @ push[3:] + jnp.cross(old.qpos[:3], push[:3])
     wrench = jnp.concatenate([push[:3], moment])
     contact = jnp.any(push != 0)
     wall = jnp.any(scene.push(new, slice(PAD_CONTACTS, len(contacts.dist))) != 0)
 
-    points = turned(_math.quat_matrix(new.qpos[3:]), jnp.reshape(hull.vertices, (3, -1))) + new.qpos[:3, None]
+    points = turned(geometry.quat_to_matrix(new.qpos[3:]), jnp.reshape(hull.vertices, (3, -1))) + new.qpos[:3, None]
     timestep = model.opt.timestep
-    slow = (_math.norm(new.qvel[:3]) < SLOW_SPEED) & (_math.norm(new.qvel[3:]) < SLOW_TURN)
+    slow = (geometry.norm(new.qvel[:3]) < SLOW_SPEED) & (geometry.norm(new.qvel[3:]) < SLOW_TURN)
     touched = contact | wall
     begun = touched & (old.apart * timestep >= PARTED_TIME)
     now = State(
@@ -137,10 +137,10 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
 
 
 def _record(state: State) -> Record:
-    turn = _math.quat_matrix(state.qpos[3:]) @ state.qvel[3:]
+    turn = geometry.quat_to_matrix(state.qpos[3:]) @ state.qvel[3:]
     contact = state.loaded > 0
     return Record(
-        pose=jnp.concatenate([state.qpos[:3], _math.quat_canonical(state.qpos[3:])]),
+        pose=jnp.concatenate([state.qpos[:3], geometry.quat_canonical(state.qpos[3:])]),
         velocity=jnp.concatenate([state.qvel[:3], turn]),
         wrench=jnp.where(contact, state.impulse / jnp.maximum(state.loaded, 1), 0),
         contact=contact,

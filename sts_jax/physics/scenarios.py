@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sts_jax import _math
+from sts_jax import geometry
 from sts_jax.physics.scene import Contact
 
 G = 9.81  # m/s^2
@@ -166,7 +166,7 @@ class Freefall(_Common):
         """
         del pad
         turn, radius, angle = jax.random.split(key, 3)
-        quat = _math.random_quat(turn)
+        quat = geometry.random_quat(turn)
         pose = _above(_in_disc(radius, angle, self.spread), quat, shape, self.height)
         return Start(pose, jnp.asarray(self.steps), jnp.zeros(0))
 
@@ -233,8 +233,8 @@ class Perturbed(_Common):
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
         """`FELL_OFF`, `TOPPLES` (leans by more than 45 degrees), `SLIDES` (moved by 10 mm) or `STANDS`."""
-        leans = _math.quat_matrix(_math.normalize(last[3:]))[2, 2] < math.cos(TURNED)
-        moved = _math.norm(last[:2] - first[:2]) >= MOVED
+        leans = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2] < math.cos(TURNED)
+        moved = geometry.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STANDS)
         ends = jnp.where(fell_off(last), Outcome.FELL_OFF, jnp.where(leans, Outcome.TOPPLES, stays))
         return ends.astype(jnp.int32)
@@ -297,11 +297,11 @@ class Inclined(_Common):
         rests = jax.random.uniform(kind) < self.resting
         faces = shape.rests[jax.random.categorical(face, jnp.log(shape.shares), shape=(self.tries,))]
         turns = jax.vmap(_yaw)(jax.random.split(turn, self.tries))
-        laid = jax.vmap(_math.quat_multiply)(turns, jax.vmap(_upright)(faces))
+        laid = jax.vmap(geometry.quat_multiply)(turns, jax.vmap(_upright)(faces))
         margin = jax.lax.map(lambda quat: _margins(quat, shape, self.slope), laid)  # one by one: memory
         undecided = jnp.minimum(jnp.maximum(margin, 0).mean(axis=1), jnp.maximum(-margin, 0).mean(axis=1))
-        quat = jnp.where(rests, laid[jnp.argmax(undecided)], _math.random_quat(free))
-        lower_end = jnp.max(shape.points @ _math.quat_matrix(quat)[1])
+        quat = jnp.where(rests, laid[jnp.argmax(undecided)], geometry.random_quat(free))
+        lower_end = jnp.max(shape.points @ geometry.quat_to_matrix(quat)[1])
         place = jnp.stack(
             [
                 jax.random.uniform(x, minval=-self.across, maxval=self.across),
@@ -313,7 +313,7 @@ class Inclined(_Common):
         )
         height = jnp.where(rests, -STANDING, jax.random.uniform(gap, minval=self.gap[0], maxval=self.gap[1]))
         held = jnp.where(rests, self.steps - round(LET_GO / self.contact.timestep), self.steps)
-        return Start(_above(place, _math.quat_canonical(quat), shape, height), held, jnp.zeros(0))
+        return Start(_above(place, geometry.quat_canonical(quat), shape, height), held, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
         """As `Freefall.gravity`."""
@@ -322,8 +322,8 @@ class Inclined(_Common):
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
         """`FELL_OFF`, `ROLLS` (turned by 45 degrees or more, about any axis), `SLIDES` (moved by 10 mm) or `STICKS`."""
-        same = jnp.abs(_math.normalize(first[3:]) @ _math.normalize(last[3:]))
-        moved = _math.norm(last[:2] - first[:2]) >= MOVED
+        same = jnp.abs(geometry.normalize(first[3:]) @ geometry.normalize(last[3:]))
+        moved = geometry.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STICKS)
         ends = jnp.where(fell_off(last), Outcome.FELL_OFF, jnp.where(same < math.cos(TURNED / 2), Outcome.ROLLS, stays))
         return ends.astype(jnp.int32)
@@ -365,7 +365,7 @@ def _above(
     place: Float[Array, "2"], quat: Float[Array, "4"], shape: Shape, height: Float[Array, ""] | float
 ) -> Float[Array, "7"]:
     """The pose with its origin over a place and its lowest point at a height (m)."""
-    lowest = jnp.min(shape.points @ _math.quat_matrix(quat)[2])
+    lowest = jnp.min(shape.points @ geometry.quat_to_matrix(quat)[2])
     return jnp.concatenate([place, jnp.stack([height - lowest]), quat])
 
 
@@ -374,7 +374,7 @@ def _margins(quat: Float[Array, "4"], shape: Shape, slope: float) -> Float[Array
 
     Where it is negative the object tips.
     """
-    rotation = _math.quat_matrix(quat)
+    rotation = geometry.quat_to_matrix(quat)
     points, coms = shape.points @ rotation.T, shape.coms @ rotation.T
     low = jnp.min(points[:, 2])
     meets = coms[:, :2] + (coms[:, 2:] - low) * math.tan(slope) * jnp.array([0.0, 1.0])
@@ -386,14 +386,14 @@ def _margins(quat: Float[Array, "4"], shape: Shape, slope: float) -> Float[Array
 
 def _yaw(key: PRNGKeyArray) -> Float[Array, "4"]:
     angle = jax.random.uniform(key, maxval=2 * jnp.pi)
-    return _math.quat_canonical(_math.quat_from_rotvec(jnp.stack([0.0, 0.0, angle])))
+    return geometry.quat_canonical(geometry.quat_from_rotvec(jnp.stack([0.0, 0.0, angle])))
 
 
 def _upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
     """The shortest turn that brings a unit vector to +z."""
     upside_down = up[2] < -0.9999
     turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
-    return _math.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
+    return geometry.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
 
 
 def _in_disc(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Float[Array, "2"]:

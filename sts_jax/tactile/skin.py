@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sts_jax import _math
+from sts_jax import _math, geometry
 
 _NEAREST = 1e-4  # m, a light is never nearer than this to what it lights
 _BRIGHTEST = 60.0  # log of how much brighter than at its reference distance a light can get: no overflow
@@ -168,7 +168,7 @@ def shadows(
     lengths = skin.shadow_reach * (jnp.arange(1, skin.shadow_steps + 1) / max(skin.shadow_steps, 1)) ** 2
     if isinstance(lights, Lights):
         # The way to a light is the same everywhere: the whole image moves, with room for another on every side.
-        places = _math.normalize(lights.directions)
+        places = geometry.normalize(lights.directions)
         around = jnp.pad(depth, ((rows + 1, rows + 1), (columns + 1, columns + 1)))
         look = functools.partial(_moved, around)
     else:
@@ -179,8 +179,8 @@ def shadows(
 
     def share(place: Float[Array, "3"]) -> Float[Array, "h w"]:
         if isinstance(lights, Lights):
-            ux, uy = _math.normalize(place[:2])
-            elevation, way = jnp.arctan2(-place[2], _math.norm(place[:2])), jnp.float32(jnp.inf)
+            ux, uy = geometry.normalize(place[:2])
+            elevation, way = jnp.arctan2(-place[2], geometry.norm(place[:2])), jnp.float32(jnp.inf)
         else:
             ux, uy, way = _unit(place[0] - x, place[1] - y)
             elevation = jnp.arctan2(-place[2] - depth, way)
@@ -247,7 +247,7 @@ def phong(
         Image, not clipped (paper, equation "phong").
     """
     nx, ny, nz = (normals[..., k] for k in range(3))
-    places = _math.normalize(lights.directions) if isinstance(lights, Lights) else lights.positions
+    places = geometry.normalize(lights.directions) if isinstance(lights, Lights) else lights.positions
     image = [jnp.broadcast_to(jnp.asarray(phong.ambient * i, nx.dtype), nx.shape) for i in phong.ambient_color]
     for m in range(places.shape[0]):
         lx, ly, lz = (places[m, k] for k in range(3))

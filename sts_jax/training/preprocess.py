@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sts_jax import _math
+from sts_jax import geometry
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Preprocessing:
 
     def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n code"]:
         """A pose (m, quaternion) as the networks see it: `pose_size` numbers."""
-        position, quat = pose[..., :3] / self.position_scale, _math.quat_canonical(pose[..., 3:])
+        position, quat = pose[..., :3] / self.position_scale, geometry.quat_canonical(pose[..., 3:])
         if self.rotation == "matrix":
-            quat = _math.quat_matrix(quat).reshape(*quat.shape[:-1], 9)
+            quat = geometry.quat_to_matrix(quat).reshape(*quat.shape[:-1], 9)
         return jnp.concatenate([position, quat], axis=-1)
 
     def decode_pose(self, code: Float[Array, "*n code"]) -> Float[Array, "*n 7"]:
@@ -52,9 +52,9 @@ class Preprocessing:
         """
         quat = code[..., 3:]
         if self.rotation == "matrix":
-            quat = _math.nearest_quat(quat.reshape(*quat.shape[:-1], 3, 3))
+            quat = geometry.quat_from_matrix(quat.reshape(*quat.shape[:-1], 3, 3))
         else:
-            quat = _math.quat_canonical(quat)
+            quat = geometry.quat_canonical(quat)
         said = jnp.any(code[..., 3:] != 0, -1, keepdims=True)
         quat = jnp.where(said, quat, jnp.array([1.0, 0, 0, 0]))
         return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
