@@ -1,10 +1,12 @@
 """Collections on disk: made shard by shard, read as arrays."""
 
+from sts_jax._files import TornFileError as TornFileError
+from sts_jax._files import claim as claim
+from sts_jax._files import write_bytes as write_bytes
 from sts_jax.dataset.collect import Collected as Collected
 from sts_jax.dataset.collect import Collection as Collection
 from sts_jax.dataset.collect import Meshes as Meshes
 from sts_jax.dataset.collect import Progress as Progress
-from sts_jax.dataset.collect import claim as claim
 from sts_jax.dataset.collect import class_names as class_names
 from sts_jax.dataset.collect import collect as collect
 from sts_jax.dataset.collect import head as head
@@ -19,9 +21,7 @@ from sts_jax.dataset.load import Dataset as Dataset
 from sts_jax.dataset.load import Pairs as Pairs
 from sts_jax.dataset.load import load as load
 from sts_jax.dataset.records import Images as Images
-from sts_jax.dataset.records import TornFileError as TornFileError
 from sts_jax.dataset.records import write_arrays as write_arrays
-from sts_jax.dataset.records import write_bytes as write_bytes
 
 __all__ = [
     "Collected",

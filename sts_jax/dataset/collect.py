@@ -4,7 +4,6 @@ import concurrent.futures
 import dataclasses
 import functools
 import hashlib
-import json
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from sts_jax import geometry, objects, physics
+from sts_jax._files import claim
 from sts_jax.dataset import records
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
@@ -299,39 +299,6 @@ def symmetries_of(collection: Collection) -> tuple[int, ...]:
 def shard_path(folder: Path, collection: Collection, index: int) -> Path:
     """The record file of a shard."""
     return folder / f"shard-{index:05d}-of-{collection.num_shards:05d}.array_record"
-
-
-def claim(path: Path, content: dict) -> None:
-    """Write a JSON file once; afterwards insist that it says the same.
-
-    Raises:
-        ValueError: The file says something else; names the first field that differs, both values, and the remedy.
-    """
-    content = json.loads(json.dumps(content))
-    if not path.exists():
-        records.write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
-        return
-    try:
-        there = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise records.TornFileError(f"{path} is torn ({error}); give another folder or delete this one.") from error
-    difference = _first_difference(there, content)
-    if difference is not None:
-        field, old, new = difference
-        raise ValueError(
-            f"{path} was made with {field} = {old!r}, asked for now is {new!r}: "
-            f"give another folder than {path.parent}, or delete it to start anew."
-        )
-
-
-def _first_difference(old: object, new: object, field: str = "") -> tuple[str, object, object] | None:
-    if isinstance(old, dict) and isinstance(new, dict):
-        for key in [*old, *(key for key in new if key not in old)]:
-            inner = _first_difference(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
-            if inner is not None:
-                return inner
-        return None
-    return None if old == new else (field, old, new)
 
 
 def _make_shard(

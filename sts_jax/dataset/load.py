@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from sts_jax._files import TornFileError
 from sts_jax.dataset import records
 from sts_jax.dataset.collect import turn, turn_condition
 
@@ -148,4 +149,4 @@ def _read_json(path: Path) -> dict:
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: {path.parent} is not a collected dataset.") from None
     except json.JSONDecodeError as error:
-        raise records.TornFileError(f"{path} is torn ({error}); delete {path.parent} and collect again.") from error
+        raise TornFileError(f"{path} is torn ({error}); delete {path.parent} and collect again.") from error

@@ -6,20 +6,17 @@ named arrays and is written last: a shard without it does not exist.
 """
 
 import io
-import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
+from sts_jax._files import TornFileError, write_bytes, write_whole
+
 # One frame per group, so that a random read inflates one frame only.
 WRITER_OPTIONS = "group_size:1,zstd:3"
-
-
-class TornFileError(OSError):
-    """A file that is there but not whole; the message names it and what to do."""
 
 
 class Images(NamedTuple):
@@ -28,37 +25,6 @@ class Images(NamedTuple):
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
     segmentation: np.ndarray  # bool (n, height, width)
-
-
-def write_whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Make `path` by `write(temporary)`, flush it to disk, then rename: a kill leaves the whole file or none.
-
-    Raises:
-        OSError: The disk is full or not writable; says so, names the file, and nothing else is touched.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        write(temporary)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise OSError(
-            f"cannot write {path}: {error}. Free some disk space (or check permissions) and start again; "
-            "what was finished before is kept."
-        ) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a small file, whole or not at all."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(data)
-
-    write_whole(path, write)
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:

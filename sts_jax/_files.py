@@ -1,0 +1,138 @@
+"""Files that are whole or absent, JSON that cannot change unnoticed, checksums, and a lock on a folder."""
+
+import contextlib
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import filelock
+
+
+class TornFileError(OSError):
+    """A file that exists but is incomplete or damaged. The message names the file and the remedy."""
+
+
+class LockedError(RuntimeError):
+    """Another process is working in a folder. The message names the folder and the process."""
+
+
+def write_whole(path: Path, write: Callable[[Path], None]) -> None:
+    """Create `path` through `write(temporary)`, flush it to disk, then rename it.
+
+    An interruption leaves either the complete new file or the previous state.
+
+    Raises:
+        OSError: the disk is full or the folder is not writable. The message names the file.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(temporary)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OSError(
+            f"cannot write {path}: {error}. Free some disk space or check the permissions, then start again; "
+            "everything that was finished before is kept."
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a small file through `write_whole`."""
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(data)
+
+    write_whole(path, write)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON through `write_whole`."""
+    write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def read_json(path: Path, remedy: str) -> Any:
+    """Read a JSON file.
+
+    Args:
+        path: the file.
+        remedy: what to do about a damaged file; ends the error message.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        TornFileError: the file cannot be read or is no JSON.
+    """
+    try:
+        return json.loads(path.read_bytes().decode())
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise TornFileError(f"{path} cannot be read as JSON ({error}); {remedy}.") from error
+
+
+def claim(path: Path, content: dict) -> None:
+    """Write a JSON file, or check that an existing one has the same content.
+
+    Raises:
+        ValueError: the content differs. The message names the first field that differs, both values, and the remedy.
+        TornFileError: the existing file is no JSON.
+    """
+    content = json.loads(json.dumps(content))
+    if not path.exists():
+        write_json(path, content)
+        return
+    there = read_json(path, f"choose another folder than {path.parent}, or delete it")
+    difference = _first_difference(there, content)
+    if difference is not None:
+        field, old, new = difference
+        raise ValueError(
+            f"{path} was made with {field} = {old!r}, and the current settings have {new!r}: "
+            f"choose another folder than {path.parent}, or delete it to start anew."
+        )
+
+
+def _first_difference(old: object, new: object, field: str = "") -> tuple[str, object, object] | None:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in [*old, *(key for key in new if key not in old)]:
+            inner = _first_difference(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
+            if inner is not None:
+                return inner
+        return None
+    return None if old == new else (field, old, new)
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextlib.contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Hold a folder for this process; the lock ends with the block or with the process.
+
+    Raises:
+        LockedError: another process, or another part of this one, holds the folder.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    owner = folder / ".lock-owner"
+    try:
+        with filelock.FileLock(folder / ".lock", timeout=0):
+            owner.write_text(f"process {os.getpid()} on {platform.node()}")
+            try:
+                yield
+            finally:
+                owner.unlink(missing_ok=True)
+    except filelock.Timeout:
+        holder = owner.read_text() if owner.exists() else "another process"
+        raise LockedError(
+            f"{folder} is in use by {holder}: wait until it has finished, or choose another folder."
+        ) from None
