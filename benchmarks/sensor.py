@@ -309,8 +309,9 @@ def compilations(number: int = 100) -> None:
     for body in bodies:
         poses, wrenches = resting(body, 1)
         sts.sense(sts.Sensor(), body, poses[0], wrenches[0])
-    program: Any = frame._sense
-    print(f"{len(bodies)} objects, {len(files)} of them loaded: sense compiled {program._cache_size()} times")
+    programs: tuple[Any, Any] = (frame._balance, frame._draw)
+    balance, draw = (program._cache_size() for program in programs)
+    print(f"{len(bodies)} objects, {len(files)} of them loaded: the balance compiled {balance} times, drawing {draw}")
 
 
 if __name__ == "__main__":

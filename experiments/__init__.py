@@ -2,5 +2,5 @@
 
 import os
 
-# jaxlib reads this as it is imported, see `compilation.keep`.
+# jaxlib reads this as it is imported, see `sts_jax.compilation`.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

@@ -8,10 +8,11 @@ from typing import Literal
 import tyro
 
 import sts_jax as sts
-from experiments import compilation, stages
+from experiments import stages
 from experiments.plan import plan
 from experiments.progress import say
 from sts_jax import dataset
+from sts_jax.compilation import cache_folder
 
 LEAST_OBJECTS = 10  # of a folder, so that whole ones can be held out to validate and to test
 
@@ -36,7 +37,7 @@ class Args:
 def run(presets: Mapping[str, stages.Config], workdir: str, description: str | None) -> None:
     """An experiment from the command line."""
     args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
-    compilation.keep()
+    sts.enable_compilation_cache()
     config = configure(presets[args.preset], args)
     if args.plan:
         print(plan(config))
@@ -93,7 +94,7 @@ def with_meshes(
         scale=scale,
         up=up,
         parts=collection.parts,
-        cache=compilation.cache_folder() / "objects",
+        cache=cache_folder() / "objects",
         progress=say,
     )
     others = [name for name in there if name not in taken]

@@ -26,7 +26,7 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments import compilation, sense
+from experiments import sense
 from sts_jax import tactile
 
 # m, of the Gaussian that images are compared under: first as far as the tips of what is 12 cm long move in 10 degrees
@@ -241,7 +241,7 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    compilation.keep()
+    sts.enable_compilation_cache()
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
     try:
         main(tyro.cli(Config, description=__doc__))

@@ -27,7 +27,6 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
-from experiments import compilation
 from sts_jax import tactile
 
 G = 9.81  # m/s^2
@@ -259,7 +258,7 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    compilation.keep()
+    sts.enable_compilation_cache()
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
     try:
         main(tyro.cli(Config, description=__doc__))

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import compilation, freefall, inclined, perturbed, pictures
+from experiments import freefall, inclined, perturbed, pictures
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -76,5 +76,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    compilation.keep()
+    sts.enable_compilation_cache()
     main(tyro.cli(Config, description=__doc__))

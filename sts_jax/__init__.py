@@ -1,6 +1,8 @@
 """The See-Through-your-Skin sensor in JAX: simulate it, see with it, learn to predict from it."""
 
 from sts_jax import dataset, evaluation, geometry, mvae, objects, optics, physics, tactile, training
+from sts_jax.compilation import enable_compilation_cache
+from sts_jax.display import load, save, show
 from sts_jax.frame import Frame, expose, sense, touch
 from sts_jax.predict import Prediction, Predictor
 from sts_jax.sensor import Sensor
@@ -11,14 +13,18 @@ __all__ = [
     "Predictor",
     "Sensor",
     "dataset",
+    "enable_compilation_cache",
     "evaluation",
     "expose",
     "geometry",
+    "load",
     "mvae",
     "objects",
     "optics",
     "physics",
+    "save",
     "sense",
+    "show",
     "tactile",
     "touch",
     "training",

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _math, geometry, optics, tactile
+from sts_jax._loop import looped
 from sts_jax._tiles import where_active
 from sts_jax.objects.body import FACE_CLASSES, Body
 from sts_jax.sensor import Sensor
@@ -36,6 +37,18 @@ class Frame:
     balanced: Bool[Array, "*n"]
     pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid (tactile.cell_centres)
     window: Float[Array, "*n 4"]  # m, (left, top, width, height) on the gel's face that the images show
+
+    def __repr__(self) -> str:
+        *lead, height, width = jnp.shape(self.depth)
+        size = f"{width} x {height} pixels"
+        if lead or isinstance(self.depth, jax.core.Tracer) or not isinstance(self.depth, jax.Array | np.ndarray):
+            return f"Frame({' x '.join(map(str, lead))}{' frames, ' if lead else ''}{size})"
+        seen = np.asarray(self.segmentation).mean()
+        pressed = "nothing presses on the gel"
+        if np.any(self.pressure > 0):
+            pressed = f"pressure up to {np.max(self.pressure) / 1e3:.3g} kPa"
+        balance = "balanced" if self.balanced else "not balanced"
+        return f"Frame({size}, object in {seen:.1%} of the view, {pressed}, {balance})"
 
 
 def sense(
@@ -91,7 +104,19 @@ def sense(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("resolution", "crop", "moving_edges"))
+class _Resting(NamedTuple):
+    """An object in balance on the gel, before it is drawn: independent of the images' size."""
+
+    points: Float[Array, "v 3"]  # m, vertices, sensor frame
+    pose: Float[Array, "7"]  # in balance; some pose beneath the pad where the given one is not finite
+    shown: Float[Array, "7"]  # in balance, or the given one where it is not finite
+    heights: Float[Array, "r c"]  # m, its underside over the gel's grid
+    present: Bool[Array, ""]  # some part is above the gel's face
+    pressing: Bool[Array, ""]  # it presses on the gel
+    balanced: Bool[Array, ""]
+    pressure: Float[Array, "r c"]  # Pa
+
+
 def _sense(
     sensor: Sensor,
     sound: Bool[Array, ""] | bool,
@@ -103,6 +128,33 @@ def _sense(
     crop: bool,
     moving_edges: bool,
 ) -> Frame:
+    # Two programs: the first one serves every resolution.
+    resting = _balance(sensor.gel, jnp.asarray(sound), body.vertices, body.faces, body.two_sided, pose, wrench)
+    return _draw(sensor, body, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
+
+
+@jax.jit
+def _balance(
+    gel: tactile.Gel,
+    sound: Bool[Array, ""],
+    vertices: Float[Array, "v 3"],
+    faces: Int[Array, "f 3"],
+    two_sided: Bool[Array, ""],
+    pose: Float[Array, "7"],
+    wrench: Float[Array, "6"] | None,
+) -> _Resting:
+    return looped(_balanced)(gel, sound, vertices, faces, two_sided, pose, wrench)
+
+
+def _balanced(
+    gel: tactile.Gel,
+    sound: Bool[Array, ""],
+    vertices: Float[Array, "v 3"],
+    faces: Int[Array, "f 3"],
+    two_sided: Bool[Array, ""],
+    pose: Float[Array, "7"],
+    wrench: Float[Array, "6"] | None,
+) -> _Resting:
     finite = sound & jnp.all(jnp.isfinite(pose)) & (geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
     if wrench is not None:
         finite &= jnp.all(jnp.isfinite(wrench))
@@ -110,39 +162,29 @@ def _sense(
     safe_pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
     safe_pose = jnp.concatenate([safe_pose[:3], geometry.normalize(safe_pose[3:])])
 
-    points = _placed(finite, safe_pose, body.vertices, jnp.full_like(body.vertices, -1))
+    points = _placed(finite, safe_pose, vertices, jnp.full_like(vertices, -1))
     present = _math.most(points[:, 2]) > 0
-    heights, whole = underside(sensor.gel, body, points, present)
+    heights, whole = underside(gel, faces, two_sided, points, present)
     if wrench is None:
-        contact = tactile.indent(sensor.gel, heights)
+        contact = tactile.indent(gel, heights)
         pressing = present
     else:
-        contact = tactile.settle(sensor.gel, heights, jnp.where(present, wrench, 0))
+        contact = tactile.settle(gel, heights, jnp.where(present, wrench, 0))
         pressing = present & (wrench[2] > 0)
     turn = geometry.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
     position = geometry.transform(jnp.concatenate([drop, turn]), safe_pose[:3])
     drawn = jnp.concatenate([position, geometry.quat_canonical(geometry.quat_multiply(turn, safe_pose[3:]))])
-    points = _placed(pressing, drawn, body.vertices, points)
-
-    if crop:
-        window = optics.object_window(
-            sensor.camera, jnp.where(present, points, jnp.array([[0.0, 0.0, -1.0]])), resolution
-        )
-    else:
-        window = optics.full_window(sensor.camera, resolution)
-
-    given = sensor, body, points, drawn, whole, present, pressing, window
-    visual, lit, depth = _draw(*given, resolution, moving_edges)
-    return Frame(
-        visual=visual,
-        tactile=lit,
-        depth=depth,
-        segmentation=jnp.isfinite(depth),
-        pose=jnp.where(finite, drawn, pose),
-        balanced=contact.balanced & finite,
-        pressure=contact.pressure,
-        window=window,
+    points = _placed(pressing, drawn, vertices, points)
+    return _Resting(
+        points,
+        drawn,
+        jnp.where(finite, drawn, pose),
+        whole,
+        present,
+        pressing,
+        contact.balanced & finite,
+        contact.pressure,
     )
 
 
@@ -264,13 +306,18 @@ def _touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4
 
 
 def underside(
-    gel: tactile.Gel, body: Body, points: Float[Array, "v 3"], present: Bool[Array, ""]
+    gel: tactile.Gel,
+    faces: Int[Array, "f 3"],
+    two_sided: Bool[Array, ""],
+    points: Float[Array, "v 3"],
+    present: Bool[Array, ""],
 ) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
     """Heights of an object's underside over the gel's face, on the gel's grid.
 
     Args:
         gel: whose grid.
-        body: the object.
+        faces: of the object, three vertices each.
+        two_sided: whether its faces are seen from behind too.
         points: its vertices, sensor frame (m).
         present: whether there is anything at all.
 
@@ -287,25 +334,30 @@ def underside(
     down = (down / gel.size[1] + 0.5) * rows - 0.5
     keep = jnp.broadcast_to(present, height.shape)
     places = jnp.stack([across, down], axis=-1)
-    near, winner = optics.rasterise(places, height, body.faces, keep, body.two_sided, gel.cells, within=reach)
-    corners = (across, down, height), body.faces
+    near, winner = optics.rasterise(places, height, faces, keep, two_sided, gel.cells, within=reach)
+    corners = (across, down, height), faces
     images = (winner, *_lines(optics.pixel_centres(gel.cells)))
     whole = where_active(_height, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
     return jnp.where(winner == near, whole, jnp.inf), whole
 
 
+@functools.partial(jax.jit, static_argnames=("resolution", "crop", "moving_edges"))
 def _draw(
-    sensor: Sensor,
-    body: Body,
-    points: Float[Array, "v 3"],
-    pose: Float[Array, "7"],
-    heights: Float[Array, "r c"],
-    present: Bool[Array, ""],
-    pressing: Bool[Array, ""],
-    window: Float[Array, "4"],
-    resolution: tuple[int, int],
-    moving_edges: bool,
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w 3"], Float[Array, "h w"]]:
+    sensor: Sensor, body: Body, resting: _Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
+) -> Frame:
+    drawn = functools.partial(_drawn, resolution=resolution, crop=crop, moving_edges=moving_edges)
+    return looped(drawn)(sensor, body, resting)
+
+
+def _drawn(
+    sensor: Sensor, body: Body, resting: _Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
+) -> Frame:
+    points, present, pressing = resting.points, resting.present, resting.pressing
+    if crop:
+        corners_seen = jnp.where(present, points, jnp.array([[0.0, 0.0, -1.0]]))
+        window = optics.object_window(sensor.camera, corners_seen, resolution)
+    else:
+        window = optics.full_window(sensor.camera, resolution)
     camera, gel = sensor.camera, sensor.gel
     # Samples: a pixel each, or, in small images, every other one is a pixel's centre and the others lie half way
     # between. A ring of one more around all of them is there for the normals of the outermost.
@@ -322,12 +374,12 @@ def _draw(
     slopes = _lines(optics.rays(camera, seen, shape))
     x, y = (slope * camera.distance for slope in slopes)  # where the rays cross the gel's face
     on_pad, walls = _pad(sensor, x, y)
-    hidden = optics.hidden_sky(heights, gel.size, _math.most(points[:, 2]), x[0], y[:, 0])
+    hidden = optics.hidden_sky(resting.heights, gel.size, _math.most(points[:, 2]), x[0], y[:, 0])
     square_radius = (x * 2 / gel.size[0]) ** 2 + (y * 2 / gel.size[1]) ** 2
     empty = _planes(optics.empty_view(sensor.room, square_radius, walls, hidden))
     surface = (body.normals, body.colors, body.uv, body.texture, body.two_sided)
     corners = (pixels[:, 0], pixels[:, 1], inverse), body.faces
-    params = (sensor, surface, corners, geometry.quat_to_matrix(pose[3:]))
+    params = (sensor, surface, corners, geometry.quat_to_matrix(resting.pose[3:]))
     images = (winner, on_pad, *_lines(optics.pixel_centres(shape)), *slopes, hidden, *empty)
     depth, *visual = where_active(_look, winner >= 0, params, images, [jnp.full(shape, jnp.inf), *empty])
     visual = _pixels([channel[1:-1, 1:-1] for channel in visual], stride)
@@ -344,7 +396,16 @@ def _draw(
     lit = [channel * walls[1:-1, 1:-1] for channel in _lit(sensor, imprint, seen, pitch, slopes)]
     lit = [jnp.clip(channel, 0, 1) for channel in _pixels(lit, stride)]
     depth = depth[1:-1, 1:-1] if stride == 1 else depth[2:-1:2, 2:-1:2]
-    return jnp.stack(visual, axis=-1), jnp.stack(lit, axis=-1), depth
+    return Frame(
+        visual=jnp.stack(visual, axis=-1),
+        tactile=jnp.stack(lit, axis=-1),
+        depth=depth,
+        segmentation=jnp.isfinite(depth),
+        pose=resting.shown,
+        balanced=resting.balanced,
+        pressure=resting.pressure,
+        window=window,
+    )
 
 
 def _pad(

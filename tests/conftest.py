@@ -7,7 +7,7 @@ import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "agg")
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see experiments.compilation.keep
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see sts_jax.compilation
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # one for all workers: what one has compiled, the other reads
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="sts_jax_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)

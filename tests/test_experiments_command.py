@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 import sts_jax as sts
-from experiments import command, compilation, freefall, inclined, perturbed, stages
-from sts_jax import dataset, physics
+from experiments import command, freefall, inclined, perturbed, stages
+from sts_jax import compilation, dataset, physics
 
 BOTTLES = ("bottle",)
 

@@ -313,6 +313,14 @@ def test_one_program_serves_bodies_that_collide_and_hold_otherwise():
     assert body.hulls.shape != other.hulls.shape
     pose = jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))
-    before = frame_module._sense._cache_size()
+    before = frame_module._balance._cache_size(), frame_module._draw._cache_size()
     sts.sense(dataclasses.replace(SENSOR, phong=tactile.Phong(ambient=0.7)), other, pose, resolution=(24, 24))
-    assert frame_module._sense._cache_size() == before
+    assert (frame_module._balance._cache_size(), frame_module._draw._cache_size()) == before
+
+
+def test_another_resolution_compiles_the_drawing_alone():
+    body, pose = sts.objects.make(jax.random.key(0), "bottle"), jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
+    sts.sense(SENSOR, body, pose, resolution=(24, 24))
+    before = frame_module._balance._cache_size()
+    sts.sense(SENSOR, body, pose, resolution=(2, 3))
+    assert frame_module._balance._cache_size() == before

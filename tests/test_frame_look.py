@@ -60,7 +60,7 @@ def test_what_leans_over_the_skin_hides_as_much_of_the_sky_as_rays_find(category
     body = objects.make(jax.random.key(0), category)
     points = leaning(body, lift)
     x = y = np.linspace(-0.07, 0.07, 15)
-    _, heights = jax.jit(underside)(SENSOR.gel, body, points, jnp.bool_(True))
+    _, heights = jax.jit(underside)(SENSOR.gel, body.faces, body.two_sided, points, jnp.bool_(True))
     got = jax.jit(optics.hidden_sky)(heights, SENSOR.gel.size, jnp.max(points[:, 2]), jnp.asarray(x), jnp.asarray(y))
     faces = np.asarray(body.faces)
     mesh = trimesh.Trimesh(np.asarray(points), faces[np.any(faces != faces[:, :1], axis=1)], process=False)
@@ -72,7 +72,9 @@ def test_only_what_is_within_reach_enters_the_gels_map_and_everything_the_skys()
     # a foot of 2 cm under a roof of 10 cm, 4 cm up
     foot, roof = trimesh.creation.box((0.02, 0.02, 0.04)), trimesh.creation.box((0.1, 0.1, 0.01))
     body = from_trimesh(trimesh.util.concatenate([foot, roof.apply_translation((0, 0, 0.025))]))
-    near, whole = jax.jit(underside)(SENSOR.gel, body, body.vertices + jnp.array([[0, 0, 0.02]]), jnp.bool_(True))
+    near, whole = jax.jit(underside)(
+        SENSOR.gel, body.faces, body.two_sided, body.vertices + jnp.array([[0, 0, 0.02]]), jnp.bool_(True)
+    )
     middle = np.abs(np.arange(150) - 74.5)
     apart = np.maximum(middle[:, None], middle[None, :])
     np.testing.assert_allclose(near, np.where(apart < 10, 0, np.inf), atol=1e-6)
@@ -84,7 +86,7 @@ def test_what_is_beyond_reach_presses_nothing_at_the_limits_either():
     for category in ("camera", "webcam", "bottle"):
         body = objects.make(jax.random.key(0), category)
         points = leaning(body, 0.0)
-        near, whole = jax.jit(underside)(SENSOR.gel, body, points, jnp.bool_(True))
+        near, whole = jax.jit(underside)(SENSOR.gel, body.faces, body.two_sided, points, jnp.bool_(True))
         assert np.any(np.asarray(near) != np.asarray(whole))
         for wrench in ([0, 0, 5, 0, 0, 0], [0, 0, 60, 1.0, -2.0, 0], [0, 0, 400, 9.0, 9.0, 0]):
             wrench = jnp.asarray(wrench, jnp.float32)

@@ -1,0 +1,168 @@
+"""`looped`: a function of which `jax.vmap` makes a loop on a CPU, its derivatives included.
+
+A function with a data-dependent loop inside, such as the rasteriser, runs a whole batch for as many turns as its
+slowest item needs when `jax.vmap` batches it. On a CPU one item after the other is several times as fast. JAX has
+`jax.custom_batching.sequential_vmap` for this, which has no reverse derivative. Here the derivative is a linear
+primitive with its own rule for batches. It keeps the arguments of the function, not the intermediate values, and
+evaluates the function once more in the backward pass.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+Flat = Callable[..., list[Array]]
+
+
+def looped(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Make `jax.vmap` of a function a loop where JAX runs on a CPU.
+
+    Args:
+        function: from trees of arrays to a tree of arrays. It must not close over traced values.
+
+    Returns:
+        A function with the same values and derivatives.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def primal(*arguments: Any) -> Any:
+        return function(*arguments)
+
+    @primal.def_vmap
+    def batched(size: int, is_batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
+        leaves, structure = jax.tree.flatten(arguments)
+        flags = jax.tree.leaves(is_batched)
+
+        def flat(*leaves: Array) -> Any:
+            return primal(*jax.tree.unflatten(structure, leaves))
+
+        def dense(*leaves: Array) -> Any:
+            return function(*jax.tree.unflatten(structure, leaves))
+
+        result = _over_batch(flat, dense, size, flags, leaves)
+        return result, jax.tree.map(lambda _: True, result)
+
+    @jax.custom_jvp
+    def differentiable(*arguments: Any) -> Any:
+        return primal(*arguments)
+
+    @functools.partial(differentiable.defjvp, symbolic_zeros=True)
+    def derivative(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
+        result = differentiable(*primals)
+        leaves, structure = jax.tree.flatten(primals)
+        changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
+        active = tuple(
+            not _is_zero(change) and jnp.issubdtype(leaf.dtype, jnp.inexact)
+            for leaf, change in zip(leaves, changes, strict=True)
+        )
+        results, result_structure = jax.tree.flatten(result)
+        real = tuple(jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in results)
+
+        def flat(*leaves: Array) -> list[Array]:
+            found = jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
+            return [leaf for leaf, kept in zip(found, real, strict=True) if kept]
+
+        moving = [change for change, used in zip(changes, active, strict=True) if used]
+        found = iter(_linear.bind(*leaves, *moving, function=flat, active=active, transposed=False) if moving else ())
+        out = [
+            (next(found) if moving else jnp.zeros_like(leaf)) if kept else np.zeros(leaf.shape, jax.dtypes.float0)
+            for leaf, kept in zip(results, real, strict=True)
+        ]
+        return result, jax.tree.unflatten(result_structure, out)
+
+    return differentiable
+
+
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, jax.custom_derivatives.SymbolicZero)
+
+
+def _over_batch(
+    flat: Callable[..., Any], dense: Callable[..., Any], size: int, flags: Sequence[bool], leaves: Sequence[Array]
+) -> Any:
+    """A function over the first axis of the flagged arguments: a loop on a CPU, `jax.vmap` elsewhere."""
+    if jax.default_backend() != "cpu" or not any(flags):
+        result = jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
+        return result
+
+    def one(mapped: list[Array]) -> Any:
+        own = iter(mapped)
+        return flat(*(next(own) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)))
+
+    return jax.lax.map(one, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
+
+
+# The derivative of a function at its arguments, applied to the tangents of the active ones; or, transposed, applied to
+# cotangents of its results. Operands: the arguments, then tangents or cotangents.
+_linear = Primitive("looped_derivative")
+_linear.multiple_results = True
+
+
+def _apply(*operands: Array, function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
+    arguments, vectors = operands[: len(active)], operands[len(active) :]
+
+    def of_active(*moving: Array) -> list[Array]:
+        own = iter(moving)
+        return function(*(next(own) if used else x for x, used in zip(arguments, active, strict=True)))
+
+    here = [x for x, used in zip(arguments, active, strict=True) if used]
+    if transposed:
+        return list(jax.vjp(of_active, *here)[1](list(vectors)))
+    return jax.jvp(of_active, here, list(vectors))[1]
+
+
+def _abstract(*operands: Any, **params: Any) -> list[Any]:
+    shapes = jax.eval_shape(functools.partial(_apply, **params), *operands)
+    return [jax.core.ShapedArray(leaf.shape, leaf.dtype) for leaf in shapes]
+
+
+def _derivative(primals: Sequence[Array], tangents: Sequence[Any], **params: Any) -> tuple[list[Array], list[Array]]:
+    """Of second order, by the function itself: the operation is linear in its vectors only."""
+    moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
+
+    def of_moving(*values: Array) -> list[Array]:
+        operands = list(primals)
+        for k, value in zip(moving, values, strict=True):
+            operands[k] = value
+        return _apply(*operands, **params)
+
+    result = _linear.bind(*primals, **params)
+    first = len(params["active"])
+    if all(k >= first for k in moving):
+        vectors = [ad.instantiate_zeros(tangent) for tangent in tangents[first:]]
+        return result, _linear.bind(*primals[:first], *vectors, **params)
+    return result, jax.jvp(of_moving, [primals[k] for k in moving], [tangents[k] for k in moving])[1]
+
+
+def _transpose(cotangents: Sequence[Any], *operands: Any, transposed: bool, **params: Any) -> list[Any]:
+    first = len(params["active"])
+    vectors = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
+    back = _linear.bind(*operands[:first], *vectors, transposed=not transposed, **params)
+    return [None] * first + list(back)
+
+
+def _batch(operands: Sequence[Array], axes: Sequence[Any], **params: Any) -> tuple[list[Array], list[int]]:
+    flags = [axis is not batching.not_mapped for axis in axes]
+    moved = [jnp.moveaxis(x, axis, 0) if flag else x for x, axis, flag in zip(operands, axes, flags, strict=True)]
+    size = next(len(x) for x, flag in zip(moved, flags, strict=True) if flag)
+    dense = functools.partial(_apply, **params)
+    if any(flags[: len(params["active"])]):
+        result = _over_batch(functools.partial(_linear.bind, **params), dense, size, flags, moved)
+    else:  # several tangents at one place, as in `jax.jacfwd`: the function itself is evaluated once
+        result = jax.vmap(dense, in_axes=[0 if flag else None for flag in flags])(*moved)
+    return result, [0] * len(result)
+
+
+_linear.def_impl(_apply)
+_linear.def_abstract_eval(_abstract)
+ad.primitive_jvps[_linear] = _derivative
+ad.primitive_transposes[_linear] = _transpose
+batching.primitive_batchers[_linear] = _batch
+mlir.register_lowering(_linear, mlir.lower_fun(_apply, multiple_results=True))

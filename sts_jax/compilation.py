@@ -1,0 +1,54 @@
+"""Keep compiled programs between sessions."""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+
+
+def cache_folder() -> Path:
+    """Folder for files that can be made again: `sts_jax` in XDG_CACHE_HOME, which is ~/.cache unless it is set."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sts_jax"
+
+
+def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
+    """Let JAX keep compiled programs on disk, so that the next session loads them instead of compiling them again.
+
+    Call it once, before the first computation. It changes JAX's settings for the whole process, and the library itself
+    never calls it. The command lines of the experiments do.
+
+    On a CPU, XLA logs an error for each program that it loads from the cache, because two of its own preferences are
+    not features of a processor (jax#38445). The message is harmless. The environment variable TF_CPP_MIN_LOG_LEVEL=3,
+    set before `import jax`, silences it.
+
+    Args:
+        folder: of the cache. By default JAX_COMPILATION_CACHE_DIR decides, and keeps nothing if it is empty. Where it
+            is not set, the cache is in `~/.cache/sts_jax`, in a folder for this kind of processor, since a program that
+            was compiled for one kind may not run on another.
+
+    Returns:
+        The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.
+
+    Raises:
+        OSError: the folder cannot be created.
+    """
+    if folder is None and "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        folder = os.environ["JAX_COMPILATION_CACHE_DIR"]
+        if not folder:
+            return None
+    path = cache_folder() / processor() if folder is None else Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    return path
+
+
+def processor() -> str:
+    """Name for this kind of processor, the same wherever the same compiled programs run."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    features = sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))})
+    return hashlib.sha256("\n".join([platform.machine(), platform.processor(), *features]).encode()).hexdigest()[:12]

@@ -1,0 +1,176 @@
+"""Look at results and keep them: `show` draws a figure, `save` and `load` write and read one file."""
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+from matplotlib.figure import Figure
+from PIL import Image
+
+from sts_jax._files import TornFileError, write_bytes
+from sts_jax.evaluation.views import outside
+from sts_jax.frame import Frame
+from sts_jax.objects import Body
+from sts_jax.physics import Trajectory
+from sts_jax.predict import Prediction
+from sts_jax.sensor import Sensor
+
+_KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}
+_INCH = 2.6  # height of a panel
+_FORMAT = 1
+
+
+def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Figure:
+    """Draw a frame, a body, a prediction or an image.
+
+    A notebook displays the figure. Elsewhere call `figure.savefig(path)`.
+
+    Args:
+        thing: a `Frame`: both streams, depth (mm) and pressure (kPa); a `Body`: a view from outside as it stands on a
+            pad; a `Prediction`: the images and poses that the model has; or one image `(height, width, 3)` in [0, 1].
+            One item each: index a batch with `jax.tree.map(lambda x: x[i], frames)`.
+        title: of the figure.
+
+    Returns:
+        A Matplotlib figure.
+
+    Raises:
+        TypeError: `thing` is none of these.
+        ValueError: `thing` has leading axes.
+    """
+    panels: list[tuple[str, np.ndarray, str | None]]
+    if isinstance(thing, Frame):
+        _one("Frame", thing.depth, 2)
+        seen = np.where(np.asarray(thing.segmentation), 1e3 * np.asarray(thing.depth), np.nan)
+        panels = [
+            ("visual", np.asarray(thing.visual), None),
+            ("tactile", np.asarray(thing.tactile), None),
+            ("depth (mm)", seen, "viridis_r"),
+            ("pressure (kPa)", np.asarray(thing.pressure) / 1e3, "magma"),
+        ]
+    elif isinstance(thing, Body):
+        _one("Body", thing.vertices, 2)
+        low, high = thing.vertices.min(0), thing.vertices.max(0)
+        middle = (low + high) / 2
+        pose = jnp.array([-middle[0], -middle[1], -low[2], 1, 0, 0, 0])
+        size = Sensor().gel.size
+        panels = [("", np.asarray(outside(thing, pose, jnp.asarray(size), resolution=(400, 400))), None)]
+        title = title or repr(thing)
+    elif isinstance(thing, Prediction):
+        streams = {"visual": thing.visual, "tactile": thing.tactile}
+        panels = [(f"predicted {name}", np.asarray(x), None) for name, x in streams.items() if x is not None]
+        for _, image, _ in panels:
+            _one("Prediction", image, 3)
+        if not panels:
+            raise ValueError("the prediction has no image: the model predicts the pose alone; print it instead")
+    else:
+        panels = [("", _image(thing), None)]
+    figure = Figure(figsize=(1.15 * _INCH * len(panels), _INCH + 0.5), layout="constrained")
+    for axes, (name, values, colours) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+        drawn = axes.imshow(values, cmap=colours)
+        if colours is not None:
+            figure.colorbar(drawn, ax=axes, shrink=0.8)
+        axes.set_title(name, fontsize=9)
+        axes.set_axis_off()
+    if title:
+        figure.suptitle(title, fontsize=9)
+    return figure
+
+
+def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayLike) -> None:
+    """Write one thing to a file, complete or not at all.
+
+    Args:
+        path: `.npz` keeps all arrays of a `Frame`, a `Body` or a `Trajectory` for `load`. `.png` keeps the picture of a
+            `Frame` (the visual and the tactile image side by side) or of an image `(height, width, 3)` in [0, 1], with
+            8 bits a channel.
+        thing: what is kept.
+
+    Raises:
+        TypeError: this kind of thing cannot be written to this kind of file.
+        ValueError: another suffix, or the image has another shape or range.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix == ".png":
+        if isinstance(thing, Frame):
+            _one("Frame", thing.depth, 2)
+            image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
+        else:
+            image = _image(thing)
+        data = io.BytesIO()
+        Image.fromarray(np.round(255 * image).astype(np.uint8)).save(data, "png")
+    elif path.suffix == ".npz":
+        if not isinstance(thing, tuple(_KINDS.values())):
+            raise TypeError(f"an .npz file keeps one of {', '.join(_KINDS)}, got {type(thing).__name__}")
+        leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
+        arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}
+        arrays |= {"kind": np.array(type(thing).__name__), "format": np.array(_FORMAT)}
+        data = io.BytesIO()
+        np.savez_compressed(data, allow_pickle=False, **arrays)
+    else:
+        raise ValueError(f"path is {str(path)!r}; it must end in .npz (arrays) or .png (picture)")
+    write_bytes(path, data.getvalue())
+
+
+def load(path: str | os.PathLike[str]) -> Any:
+    """Read the `Frame`, `Body` or `Trajectory` that `save` wrote to an `.npz` file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        TornFileError: the file is damaged, or `save` did not write it.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file; sts.save writes one")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
+        if version != _FORMAT:
+            raise ValueError(f"it has format {version}, this version of sts_jax reads {_FORMAT}")
+        return _built(kind, {key: jnp.asarray(value) for key, value in arrays.items()})
+    except Exception as error:  # a damaged zip file raises one of many types
+        reason = f"{type(error).__name__}: {error}"
+        raise TornFileError(f"{path} is damaged or was not written by sts.save ({reason}); save it again.") from error
+
+
+def _built(kind: type, arrays: dict[str, Any]) -> Any:
+    """An instance from its leaves by their paths; `hidden/fill` belongs to the field `hidden`."""
+    fields: dict[str, Any] = {}
+    for key, value in arrays.items():
+        name, _, rest = key.partition("/")
+        if rest:
+            fields.setdefault(name, {})[rest] = value
+        else:
+            fields[name] = value
+    nested = {name: kind.__annotations__[name](**value) for name, value in fields.items() if isinstance(value, dict)}
+    return kind(**(fields | nested))
+
+
+def _one(name: str, array: Any, rank: int) -> None:
+    if np.ndim(array) != rank:
+        raise ValueError(
+            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}; give one item, such as "
+            "jax.tree.map(lambda x: x[0], ...)"
+        )
+
+
+def _image(thing: Any) -> np.ndarray:
+    if not isinstance(thing, np.ndarray | jax.Array):
+        raise TypeError(f"a Frame, a Body, a Prediction or an image is needed, got {type(thing).__name__}")
+    image = np.asarray(thing)
+    if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ValueError(f"the image has shape {image.shape}; it must be (height, width, 3)")
+    if image.dtype == np.uint8:
+        return image / 255
+    if image.dtype.kind != "f" or not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
+        raise ValueError(
+            f"the image is {image.dtype} in [{image.min()}, {image.max()}]; it must be uint8, or floats in [0, 1]"
+        )
+    return image

@@ -1,0 +1,135 @@
+"""What `show` draws and `save` keeps: read back with Pillow and NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import sts_jax as sts
+from sts_jax._files import TornFileError
+
+RNG = np.random.default_rng(0)
+FRAME = sts.Frame(
+    visual=jnp.asarray(RNG.uniform(size=(4, 6, 3)), jnp.float32),
+    tactile=jnp.asarray(RNG.uniform(size=(4, 6, 3)), jnp.float32),
+    depth=jnp.where(jnp.arange(24).reshape(4, 6) < 6, 0.1, jnp.inf),
+    segmentation=jnp.arange(24).reshape(4, 6) < 6,
+    pose=jnp.array([0.0, 0, 0.01, 1, 0, 0, 0]),
+    balanced=jnp.bool_(True),
+    pressure=jnp.asarray(RNG.uniform(0, 2000, size=(5, 5)), jnp.float32),
+    window=jnp.array([-0.1, -0.1, 0.2, 0.2]),
+)
+PREDICTION = sts.Prediction(FRAME.visual, FRAME.tactile, None, jnp.zeros(2), jnp.zeros(2))
+BODY = sts.objects.make(jax.random.key(0), "bottle")
+
+
+def same(left, right):
+    assert type(left) is type(right)
+    assert jax.tree.structure(left) == jax.tree.structure(right)
+    for a, b in zip(jax.tree.leaves(left), jax.tree.leaves(right), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_png_holds_both_streams_side_by_side(tmp_path):
+    sts.save(tmp_path / "frame.png", FRAME)
+    with Image.open(tmp_path / "frame.png") as picture:
+        got = np.asarray(picture) / 255
+    np.testing.assert_allclose(got, np.concatenate([FRAME.visual, FRAME.tactile], 1), atol=0.51 / 255)
+
+
+@pytest.mark.parametrize("thing", [FRAME, BODY], ids=["frame", "body"])
+def test_an_npz_gives_back_what_was_saved(tmp_path, thing):
+    sts.save(tmp_path / "thing.npz", thing)
+    same(sts.load(tmp_path / "thing.npz"), thing)
+
+
+def test_a_trajectory_keeps_its_hidden_values(tmp_path):
+    hidden = sts.physics.Hidden(jnp.array([0.5]), jnp.array([1.0]), jnp.array([0.6]), jnp.array([[0.0, 0, 1]]))
+    fields = {name: jnp.full(1, float(k)) for k, name in enumerate(sts.physics.Trajectory._fields)}
+    thing = sts.physics.Trajectory(**(fields | {"hidden": hidden}))
+    sts.save(tmp_path / "falls.npz", thing)
+    same(sts.load(tmp_path / "falls.npz"), thing)
+
+
+def test_a_damaged_file_is_refused_or_the_damage_is_outside_the_arrays(tmp_path):
+    path = tmp_path / "frame.npz"
+    sts.save(path, FRAME)
+    whole = path.read_bytes()
+    refused = 0
+    for position in range(0, len(whole), 37):
+        path.write_bytes(whole[:position] + bytes([whole[position] ^ 16]) + whole[position + 1 :])
+        try:
+            same(sts.load(path), FRAME)
+        except TornFileError:
+            refused += 1
+    assert refused > 20
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(TornFileError, match=r"frame\.npz is damaged or was not written by sts\.save"):
+        sts.load(path)
+
+
+def test_a_file_of_another_format_is_refused(tmp_path):
+    np.savez(tmp_path / "x.npz", kind=np.array("Frame"), format=np.array(99))
+    with pytest.raises(TornFileError, match="format 99"):
+        sts.load(tmp_path / "x.npz")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        sts.load(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize(
+    ("thing", "panels"),
+    [
+        (FRAME, ["visual", "tactile", "depth (mm)", "pressure (kPa)"]),
+        (
+            sts.Prediction(FRAME.visual, FRAME.tactile, None, jnp.zeros(2), jnp.zeros(2)),
+            ["predicted visual", "predicted tactile"],
+        ),
+        (FRAME.visual, [""]),
+        (np.zeros((4, 5, 3), np.uint8), [""]),
+    ],
+)
+def test_a_figure_has_the_panels_of_what_it_shows(thing, panels):
+    figure = sts.show(thing, title="title")
+    titles = [axes.get_title() for axes in figure.axes if axes.images and axes.get_label() != "<colorbar>"]
+    assert titles == panels
+    assert figure.get_suptitle() == "title"
+    first = figure.axes[0].images[0].get_array()
+    expected = thing.visual if hasattr(thing, "visual") else thing
+    np.testing.assert_allclose(first, np.asarray(expected) / (255 if np.asarray(expected).dtype == np.uint8 else 1))
+
+
+def test_a_body_is_seen_from_outside():
+    picture = sts.show(BODY).axes[0].images[0].get_array()
+    assert picture.shape == (400, 400, 3)
+    assert picture[:20].min() == 1  # white around it
+    assert picture.std() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("path", "thing", "error", "message"),
+    [
+        ("a.npz", np.zeros((2, 2, 3)), TypeError, "keeps one of Frame, Body, Trajectory, got ndarray"),
+        ("a.png", 3.0, TypeError, "got float"),
+        ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
+        ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),
+        ("a.png", np.full((2, 2, 3), np.nan), ValueError, "must be uint8, or floats"),
+        ("a.jpg", FRAME, ValueError, r"must end in \.npz"),
+        ("a.png", jax.tree.map(lambda x: x[None], FRAME), ValueError, r"leading axes \(1,\)"),
+    ],
+)
+def test_what_cannot_be_saved_is_named(tmp_path, path, thing, error, message):
+    with pytest.raises(error, match=message):
+        sts.save(tmp_path / path, thing)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_frame_prints_in_one_line():
+    pressure = f"{float(FRAME.pressure.max()) / 1e3:.3g}"
+    assert repr(FRAME) == f"Frame(6 x 4 pixels, object in 25.0% of the view, pressure up to {pressure} kPa, balanced)"
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), FRAME)
+    assert repr(batch) == "Frame(2 frames, 6 x 4 pixels)"
+    printed = []
+    jax.jit(lambda frame: printed.append(repr(frame)))(FRAME)
+    assert printed == ["Frame(6 x 4 pixels)"]
