@@ -129,7 +129,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; sts.save writes one")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = dict(file)
         kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
         if version != _FORMAT:
