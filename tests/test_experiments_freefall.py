@@ -35,7 +35,7 @@ def test_the_workdir_holds_what_is_promised(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
     assert {"config.json", "dataset", "metrics.json", "table.md"} <= names
     assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS} <= names
-    assert {f"figures/{name}.png" for name in ("predictions", "training", "strip", "line_up")} <= names
+    assert {f"figures/{name}.png" for name in ("predictions", "training", "strip")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
     predictors = metrics["predictors"]
     assert {
