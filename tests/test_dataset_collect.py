@@ -199,12 +199,12 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
     one, other = (copied / f"{name}.array_record" for name in SHARDS)
     whole = one.read_bytes()
     one.write_bytes(other.read_bytes())
-    with pytest.raises(dataset.TornFileError, match="00000.*is damaged or belongs to another shard"):
+    with pytest.raises(dataset.TornFileError, match=r"00000.*is damaged or belongs to another shard"):
         dataset.load(copied)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4
     one.write_bytes(flipped)
-    with pytest.raises(dataset.TornFileError, match="00000.*is damaged or belongs to another shard"):
+    with pytest.raises(dataset.TornFileError, match=r"00000.*is damaged or belongs to another shard"):
         dataset.load(copied)
     one.write_bytes(whole)
     assert dataset.load(copied).identity
@@ -277,7 +277,7 @@ def test_an_older_dataset_must_be_collected_again(copied):
     path.write_text(json.dumps(content))
     for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
         with pytest.raises(
-            ValueError, match="is a dataset of format 1, and this version reads format 2: delete .* and"
+            ValueError, match=r"is a dataset of format 1, and this version reads format 2: delete .* and"
         ):
             use(copied)
 
