@@ -3,46 +3,67 @@
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
 import sts_jax as sts
-from experiments import stages
+from experiments import errors, stages
 from experiments.plan import plan
 from experiments.progress import say
-from sts_jax import dataset
+from sts_jax import _files, dataset
 from sts_jax.compilation import cache_folder
 
 LEAST_OBJECTS = 10  # of a folder, so that whole ones can be held out to validate and to test
+
+
+def _folder(words: list[str]) -> Path:
+    if not words[0].strip():
+        raise ValueError("the name of the folder is empty: give a path, '.' for the current directory")
+    return Path(words[0])
+
+
+# An empty name, often that of an unset shell variable, would be the current directory.
+Folder = Annotated[
+    Path,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="PATH",
+        instance_from_str=_folder,
+        is_instance=lambda value: isinstance(value, Path),
+        str_from_instance=lambda path: [str(path)],
+    ),
+]
 
 
 @dataclasses.dataclass(frozen=True)
 class Args:
     """What the command line of an experiment says."""
 
-    workdir: Path
+    workdir: Folder
     preset: Literal["smoke", "default", "paper"] = "default"
     plan: bool = False  # print seconds per stage from a short measurement, and stop
     hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
-    objects: Path | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
+    objects: Folder | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
     # objects of these classes only, of the eight or of the folder's; if not given: the experiment's own, and where a
     # folder has none of those all of the folder's
     classes: tuple[str, ...] = ()
     scale: float | None = None  # m, of one unit of a folder's files: 0.001 where they are in millimetres
     up: Literal["x", "y", "z"] | None = None  # the axis of a folder's files that points up
     parts: bool = False  # what a hull fits badly collides as convex parts
+    debug: bool = False  # show the traceback of every error
 
 
 def run(presets: Mapping[str, stages.Config], workdir: str, description: str | None) -> None:
     """An experiment from the command line."""
     args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
-    sts.enable_compilation_cache()
-    config = configure(presets[args.preset], args)
-    if args.plan:
-        print(plan(config))
-    else:
-        stages.main(config, args.workdir)
+    with errors.on_one_line(debug=args.debug):
+        sts.enable_compilation_cache()
+        config = configure(presets[args.preset], args)
+        if args.plan:
+            print(plan(config))
+        else:
+            stages.main(config, args.workdir)
 
 
 def configure(config: stages.Config, args: Args) -> stages.Config:
@@ -87,22 +108,24 @@ def with_meshes(
     """
     there = dataset.mesh_classes(folder)
     taken = classes or tuple(name for name in there if name in collection.categories) or there
-    meshes, listing = dataset.survey_meshes(
-        folder,
-        collection.scenario,
-        classes=taken,
-        scale=scale,
-        up=up,
-        parts=collection.parts,
-        cache=cache_folder() / "objects",
-        progress=say,
-    )
     others = [name for name in there if name not in taken]
-    if others:
-        listing += f"classes left out: {', '.join(others)}; --classes takes others\n"
     path = workdir / "objects.txt"
-    if not (path.exists() and path.read_text().startswith(listing)):  # behind it is what collecting left out
-        dataset.write_bytes(path, listing.encode())
+    with _files.lock(workdir):  # another run there keeps its listing
+        meshes, listing = dataset.survey_meshes(
+            folder,
+            collection.scenario,
+            classes=taken,
+            scale=scale,
+            up=up,
+            parts=collection.parts,
+            cache=cache_folder() / "objects",
+            progress=say,
+        )
+        if others:
+            listing += f"classes left out: {', '.join(others)}; --classes takes others\n"
+        # Behind the listing is what collecting left out.
+        if not (path.exists() and path.read_text(errors="replace").startswith(listing)):
+            _files.write_bytes(path, listing.encode())
     say(f"classes taken: {', '.join(taken)}" + (f"; left out: {', '.join(others)}" if others else ""))
     say(f"{len(meshes.names)} objects can be used; {path} has them and what was left out")
     if len(meshes.names) < LEAST_OBJECTS:

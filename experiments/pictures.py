@@ -1,4 +1,4 @@
-"""The pictures of an experiment: what models predict, and a trajectory from outside and through the sensor."""
+"""A trajectory from outside and through the sensor, as an experiment shows it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,47 +10,9 @@ import sts_jax as sts
 from sts_jax import dataset, evaluation
 
 
-def draw_predictions(
-    folder: Path,
-    collection: dataset.Collection,
-    sensor: sts.Sensor,
-    test: dataset.Pairs,
-    shown: Mapping[str, evaluation.Predicted],
-    blank: np.ndarray,
-    *,
-    num: int,
-    title: str,
-) -> None:
-    """The first held-out trajectories in `predictions.png`; `line_up.png`, with its answers in `line_up.json`.
-
-    Args:
-        folder: Where the pictures go.
-        collection: What was collected.
-        sensor: The sensor that saw it.
-        test: Held-out trajectories.
-        shown: Predictions of the same, by name; the last one, of both streams and the pose, is lined up.
-        blank: The visual image of the empty sensor, in [0, 1].
-        num: How many trajectories `predictions.png` shows.
-        title: Of `predictions.png`.
-    """
-    if collection.scenario.condition_scale:
-        title += "; red: where to, and how hard, the jerk drives it"
-    evaluation.figures.predictions(folder / "predictions.png", test, shown, num=num, title=title)
-    best = list(shown.values())[-1]
-    assert best.pose is not None
-    category = np.array(dataset.class_names(collection))[test.object]
-    first = np.sort(np.unique(test.object, return_index=True)[1])[:10]  # the first one of each of the first objects
-    samples = [dataset.sample_of_class(collection, name) for name in category[first]]
-    stands = evaluation.stand_ins(sensor, samples, best.pose[first], collection.resolution)
-    line_up = folder / "line_up.png"
-    evaluation.figures.line_up(line_up, line_up.with_suffix(".json"), test, best, category, blank, stands, first)
-
-
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
-    """A fully rendered trajectory, the first with the most telling outcome, from outside and through the sensor."""
+    """The first fully rendered trajectory with the most telling outcome; there must be one."""
     full = data.full_trajectories()
-    if not len(full):
-        return
     rank = [collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
     index = int(full[np.argmin(rank)])
     one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import sts_jax as sts
-from experiments import pictures
+from experiments import pictures, results
 from experiments.progress import Bar, say
-from sts_jax import dataset, evaluation, mvae, training
+from sts_jax import _files, dataset, evaluation, mvae, training
 from sts_jax.dataset.collect import SPLITS
 
 # The rows of the paper's Table 1, by the modalities a model has.
@@ -79,18 +79,23 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
 
 
 def main(config: Config, workdir: Path) -> None:
-    """Collect, train, evaluate."""
+    """Collect, train, evaluate.
+
+    Raises:
+        LockedError: Another process works in the work directory.
+    """
     sensor = sts.Sensor()
-    claim(config, workdir)
-    data = collect(config, workdir, sensor)
-    for split in config.splits:
-        train(config, data, workdir, sensor, split)
-        print(evaluate(config, data, workdir, sensor, split))
+    with _files.lock(workdir):
+        claim(config, workdir)
+        data = collect(config, workdir, sensor)
+        for split in config.splits:
+            train(config, data, workdir, sensor, split)
+            print(evaluate(config, data, workdir, sensor, split))
 
 
 def claim(config: Config, workdir: Path) -> None:
-    """Make a work directory this experiment's, or insist that it is."""
-    dataset.claim(workdir / "config.json", dataclasses.asdict(config))
+    """Write `config.json`, or raise an error if an existing one differs."""
+    _files.claim(workdir / "config.json", dataclasses.asdict(config))
 
 
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
@@ -113,10 +118,10 @@ def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Datase
 
 def note(path: Path, lines: Sequence[str]) -> None:
     """Add to a text file those of some lines that it does not have."""
-    there = path.read_text() if path.exists() else ""
+    there = path.read_text(errors="replace") if path.exists() else ""
     new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in there)
     if new:
-        dataset.write_bytes(path, (there + new).encode())
+        _files.write_bytes(path, (there + new).encode())
 
 
 def train_share(split: str) -> float:
@@ -222,11 +227,21 @@ def empty_frame(sensor: sts.Sensor, collection: dataset.Collection) -> dataset.I
 
 
 def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
-    """Score every model on held-out trajectories; write `metrics.json`, `table.md` and `figures/`; return the table."""
+    """Score every model on held-out trajectories; write `metrics.json`, `table.md` and `figures/`; return the table.
+
+    `metrics.json` records the checksums of everything that was evaluated and written. As long as they hold, nothing
+    is done again.
+    """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
-    done = workdir / f"table{suffix}.md"
-    if done.exists():
-        return done.read_text()
+    done, table = workdir / f"metrics{suffix}.json", workdir / f"table{suffix}.md"
+    inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
+    for folder in (model_folder(workdir, name, config, split) for name in MODELS):
+        inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
+    reason = results.stale(done, inputs)
+    if reason is None:
+        return table.read_text()
+    if done.exists() or table.exists():
+        say(f"evaluate: again, because {reason}")
     rows_in = rows_of(data, split)
     train_pairs = data.pairs(rows_in["train"], symmetries=True)
     validation, test = data.pairs(rows_in["validation"]), data.pairs(rows_in["test"])
@@ -246,11 +261,15 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     if f"{TITLES['mvae']}, from all inputs" in rows:
         shown["MVAE from all"] = rows[f"{TITLES['mvae']}, from all inputs"]
     title = f"{workdir.name}: the first {config.num_shown} of the held-out list, by {split}"
-    pictures.draw_predictions(figures, config.collection, sensor, test, shown, blank, num=config.num_shown, title=title)
-    logs = {TITLES[name]: _read_lines(model_folder(workdir, name, config, split) / "metrics.jsonl") for name in MODELS}
-    evaluation.figures.training_curves(figures / "training.png", logs)
-    if split == config.splits[0]:
-        pictures.draw_strip(figures / "strip.png", config.collection, sensor, data)
+    if config.collection.scenario.condition_scale:
+        title += "; red: where to, and how hard, the jerk drives it"
+    drawn = [figures / "predictions.png", figures / "training.png"]
+    evaluation.figures.predictions(drawn[0], test, shown, num=config.num_shown, title=title)
+    logs = {TITLES[name]: _read_log(model_folder(workdir, name, config, split)) for name in MODELS}
+    evaluation.figures.training_curves(drawn[1], logs)
+    if split == config.splits[0] and len(data.full_trajectories()):
+        drawn.append(figures / "strip.png")
+        pictures.draw_strip(drawn[-1], config.collection, sensor, data)
 
     steps = {name: log[-1]["step"] if log else 0 for name, log in logs.items()}
     notes = [
@@ -258,11 +277,10 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         + ", ".join(f"{name} {count}" for name, count in steps.items())
         + f"; batch {config.training.batch_size}.",
     ]
-    content = json.dumps({"split": split, **summary}, indent=2) + "\n"
-    dataset.write_bytes(workdir / f"metrics{suffix}.json", content.encode())
     title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
     text = evaluation.table(summary, title=title, notes=notes)
-    dataset.write_bytes(done, text.encode())
+    _files.write_bytes(table, text.encode())
+    results.write(done, {"split": split, **summary}, inputs, [table, *drawn])
     return text
 
 
@@ -322,5 +340,11 @@ def predict(
     return out._replace(outcome=outcome)
 
 
-def _read_lines(path: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+def _read_log(folder: Path) -> list[dict[str, float]]:
+    path = folder / "metrics.jsonl"
+    try:
+        return [json.loads(line) for line in path.read_bytes().splitlines()]
+    except FileNotFoundError:
+        return []
+    except ValueError as error:  # invalid UTF-8 or no JSON
+        raise dataset.TornFileError(f"{path} is damaged ({error}); delete {folder} and train again.") from error

@@ -26,7 +26,8 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     An interruption leaves either the complete new file or the previous state.
 
     Raises:
-        OSError: the disk is full or the folder is not writable. The message names the file.
+        OSError: the disk is full or the folder is not writable. The message names the file. Any other error of
+            `write` passes through unchanged.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -35,7 +36,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
-    except (OSError, RuntimeError, ValueError) as error:
+    except OSError as error:
         raise OSError(
             f"cannot write {path}: {error}. Free some disk space or check the permissions, then start again; "
             "everything that was finished before is kept."
@@ -74,7 +75,7 @@ def read_json(path: Path, remedy: str) -> Any:
         return json.loads(path.read_bytes().decode())
     except FileNotFoundError:
         raise
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError) as error:  # ValueError: invalid UTF-8, no JSON, or an integer of thousands of digits
         raise TornFileError(f"{path} cannot be read as JSON ({error}); {remedy}.") from error
 
 
@@ -94,7 +95,7 @@ def claim(path: Path, content: dict) -> None:
     if difference is not None:
         field, old, new = difference
         raise ValueError(
-            f"{path} was made with {field} = {old!r}, and the current settings have {new!r}: "
+            f"{path} was made with {field or 'content'} = {old!r}, and the current settings have {new!r}: "
             f"choose another folder than {path.parent}, or delete it to start anew."
         )
 
@@ -115,24 +116,38 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def digest(content: Any) -> str:
+    """SHA-256 of a JSON file's content, in hexadecimal digits, however the file is laid out."""
+    plain = json.loads(json.dumps(content))
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
     """Hold a folder for this process; the lock ends with the block or with the process.
 
     Raises:
         LockedError: another process, or another part of this one, holds the folder.
+        OSError: the folder cannot be made or written to.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    owner = folder / ".lock-owner"
+    owner, held = folder / ".lock-owner", filelock.FileLock(folder / ".lock", timeout=0)
     try:
-        with filelock.FileLock(folder / ".lock", timeout=0):
-            owner.write_text(f"process {os.getpid()} on {platform.node()}")
-            try:
-                yield
-            finally:
-                owner.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        held.acquire()
+        owner.write_text(f"process {os.getpid()} on {platform.node()}")
     except filelock.Timeout:
-        holder = owner.read_text() if owner.exists() else "another process"
+        holder = "another process"
+        with contextlib.suppress(OSError):  # the holder may not have written it yet, or may have just finished
+            holder = owner.read_text(errors="replace") or holder
         raise LockedError(
             f"{folder} is in use by {holder}: wait until it has finished, or choose another folder."
         ) from None
+    except OSError as error:
+        held.release()
+        raise OSError(f"cannot work in {folder}: {error}. Choose a folder that can be written to.") from error
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # the folder may have been deleted meanwhile
+            owner.unlink(missing_ok=True)
+        held.release()

@@ -1,6 +1,8 @@
 """A small collection from objects to shards: resumable, reproducible, split by object."""
 
 import dataclasses
+import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from sts_jax import dataset, geometry
+from sts_jax import _files, dataset, geometry
 from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
 SMALL = dataset.Collection(
@@ -46,10 +48,6 @@ def test_classes_follow_the_categories():
         assert sts.objects.CATEGORIES[int(body.category)] == names[index]
     for part in dataset.split_objects(collection).values():
         assert sum(names[i] == "fork" for i in part) == len(part) / 2
-    sample = dataset.sample_of_class(collection, "fork")
-    assert sts.objects.CATEGORIES[int(sample.category)] == "fork"
-    with pytest.raises(ValueError, match="is a 'spoon': its classes are fork, bottle"):
-        dataset.sample_of_class(collection, "spoon")
 
 
 def test_frames_are_those_that_sense_draws(folder):
@@ -160,5 +158,138 @@ def test_a_scenario_with_a_mirror_alone_takes_any_pad(tmp_path, monkeypatch):
 
 def test_another_collection_in_the_same_folder_is_refused(folder):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
-    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, asked for now is 0\.02"):
+    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, and the current settings have 0\.02"):
         dataset.collect(other, sts.Sensor(), folder)
+
+
+SHARDS = ("shard-00000-of-00002", "shard-00001-of-00002")
+
+
+@pytest.fixture
+def copied(folder, tmp_path):
+    """A dataset that may be damaged."""
+    return shutil.copytree(folder, tmp_path / "copy")
+
+
+def swap(one, other):
+    between = one.with_name("between")
+    one.rename(between)
+    other.rename(one)
+    between.rename(other)
+
+
+@pytest.mark.parametrize(
+    ("endings", "message"),
+    [
+        ((".array_record",), r"00000-of-00002\.array_record is damaged or belongs to another shard"),
+        ((".npz",), r"00000-of-00002\.npz holds shard 1 instead of shard 0"),
+        ((".array_record", ".npz"), r"00000-of-00002\.npz holds shard 1 instead of shard 0"),
+    ],
+)
+def test_swapped_shards_are_refused(copied, endings, message):
+    for ending in endings:
+        swap(*(copied / f"{name}{ending}" for name in SHARDS))
+    with pytest.raises(dataset.TornFileError, match=message):
+        dataset.load(copied)
+    with pytest.raises(dataset.TornFileError, match=message):
+        dataset.collect(SMALL, sts.Sensor(), copied)
+
+
+def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
+    one, other = (copied / f"{name}.array_record" for name in SHARDS)
+    whole = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(dataset.TornFileError, match=r"00000.*is damaged or belongs to another shard"):
+        dataset.load(copied)
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 4
+    one.write_bytes(flipped)
+    with pytest.raises(dataset.TornFileError, match=r"00000.*is damaged or belongs to another shard"):
+        dataset.load(copied)
+    one.write_bytes(whole)
+    assert dataset.load(copied).identity
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda split: split["test"].append(split["train"][0]),
+            "object . must be in one part, and it is there 2 times",
+        ),
+        (lambda split: split["train"].pop(), "object . must be in one part, and it is there 0 times"),
+        (lambda split: split["test"].append(4), "test holds object 4, and the objects are 0 to 3"),
+        (lambda split: split["test"].append(-1), "test holds object -1"),
+        (lambda split: split["test"].append(1.5), "test must be a list of whole numbers"),
+        (lambda split: split.pop("validation"), "must have the parts train, validation, test, got 'train', 'test'"),
+        (lambda split: split.update(other=[]), "must have the parts train, validation, test, got .*'other'"),
+    ],
+)
+def test_a_split_that_is_none_is_refused(copied, change, message):
+    path = copied / "split.json"
+    split = json.loads(path.read_text())
+    change(split)
+    path.write_text(json.dumps(split))
+    with pytest.raises(dataset.TornFileError, match=rf"split\.json.*{message}"):
+        dataset.load(copied)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("sensor.json", None, r"sensor\.json is missing"),
+        ("sensor.json", b'{"gel"', r"sensor\.json cannot be read as JSON"),
+        ("sensor.json", b"{}", r"npz was made with another sensor\.json"),
+        ("split.json", b"\xff", r"split\.json cannot be read as JSON"),
+        ("split.json", b"7", r"split\.json must have the parts train, validation, test, got a int"),
+        ("collection.json", None, r"collection\.json is missing: .* is not a collected dataset"),
+        ("collection.json", b"\xff", r"collection\.json cannot be read as JSON"),
+        ("collection.json", b"[]", r"collection\.json holds no collection"),
+        (
+            "collection.json",
+            b'{"format": 2}',
+            r"collection\.json: num_objects must be a whole number of at least 1, got N",
+        ),
+    ],
+)
+def test_a_description_that_is_damaged_or_another_is_named(copied, name, content, message):
+    (copied / name).unlink()
+    if content is not None:
+        (copied / name).write_bytes(content)
+    with pytest.raises(OSError, match=message):
+        dataset.load(copied)
+
+
+def test_a_description_that_was_changed_afterwards_is_named(copied):
+    path = copied / "collection.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(content, indent=7))  # the layout does not matter
+    assert dataset.load(copied).collection == content
+    path.write_text(json.dumps({**content, "resolution": [32, 64]}))
+    with pytest.raises(dataset.TornFileError, match=r"was made with another collection\.json"):
+        dataset.load(copied)
+
+
+def test_an_older_dataset_must_be_collected_again(copied):
+    path = copied / "collection.json"
+    content = json.loads(path.read_text())
+    del content["format"]
+    path.write_text(json.dumps(content))
+    for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
+        with pytest.raises(
+            ValueError, match=r"is a dataset of format 1, and this version reads format 2: delete .* and"
+        ):
+            use(copied)
+
+
+def test_the_identity_of_a_dataset_is_that_of_its_files(folder, copied):
+    assert dataset.load(copied).identity == dataset.load(folder).identity
+    path = copied / "split.json"
+    split = json.loads(path.read_text())
+    path.write_text(json.dumps({**split, "train": split["test"], "test": split["train"]}))
+    assert dataset.load(copied).identity != dataset.load(folder).identity
+
+
+def test_a_folder_that_another_process_collects_into_is_refused(copied):
+    with _files.lock(copied), pytest.raises(dataset.LockedError, match="copy is in use by process"):
+        dataset.collect(SMALL, sts.Sensor(), copied)

@@ -1,5 +1,7 @@
 """Shards: what is written is read, torn files are named, a full disk loses nothing."""
 
+import resource
+
 import numpy as np
 import pytest
 
@@ -63,22 +65,111 @@ def test_a_kill_in_the_middle_of_writing_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_named_and_leaves_nothing(tmp_path):
-    def full(path):
-        path.write_bytes(b"half")
-        raise OSError(28, "No space left on device")
-
-    with pytest.raises(OSError, match=r"x\.npz.*Free some disk space"):
-        records.write_whole(tmp_path / "x.npz", full)
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("a.array_record", lambda path: records.write_images(path, [some_images(1000)])),
+        ("a.npz", lambda path: records.write_arrays(path, {"x": np.zeros(10_000)})),
+    ],
+)
+def test_a_full_disk_is_named_and_leaves_nothing(tmp_path, name, write):
+    path = tmp_path / name
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # no file of this process may be longer
+    try:
+        with pytest.raises(OSError, match=rf"cannot write {path}: .*Free some disk space"):
+            write(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_made_with_another_config_is_refused(tmp_path):
-    path = tmp_path / "config.json"
-    dataset.claim(path, {"seed": 0, "sizes": (1, 2)})
-    dataset.claim(path, {"seed": 0, "sizes": (1, 2)})
-    with pytest.raises(ValueError, match=r"config\.json.*seed = 0, asked for now is 1"):
-        dataset.claim(path, {"seed": 1, "sizes": (1, 2)})
-    path.write_text('{"seed"')
-    with pytest.raises(dataset.TornFileError, match=r"config\.json"):
-        dataset.claim(path, {"seed": 0, "sizes": (1, 2)})
+def test_a_fault_while_rendering_is_not_taken_for_a_full_disk(tmp_path):
+    def frames():
+        yield some_images()
+        raise ValueError("no such colour")
+
+    with pytest.raises(ValueError, match=r"^no such colour$"):
+        records.write_images(tmp_path / "a.array_record", frames())
+    assert list(tmp_path.iterdir()) == []
+
+
+COLLECTION, SENSOR = "c" * 64, "s" * 64
+
+
+def shard(folder, index, seed=0, collection=COLLECTION):
+    """A shard's record file, written with five images and arrays that hold nothing."""
+    path = folder / f"{index}.array_record"
+    images = some_images()._replace(visual=np.random.default_rng(seed).integers(0, 256, (5, 9, 7, 3), dtype=np.uint8))
+    arrays = {name: np.arange(3) for name in records.ARRAYS}
+    records.write_shard(path, [images], arrays, records.Identity(collection, SENSOR, index))
+    return path
+
+
+def test_a_shard_is_read_as_it_was_written(tmp_path):
+    arrays = records.read_shard(shard(tmp_path, 0), records.Identity(COLLECTION, SENSOR, 0))
+    assert set(arrays) == records.ARRAYS
+    np.testing.assert_array_equal(arrays["frames"], np.arange(3))
+
+
+def test_images_of_another_shard_are_refused(tmp_path):
+    one, other = shard(tmp_path, 0, seed=1), shard(tmp_path, 1, seed=2)
+    assert one.stat().st_size == other.stat().st_size  # noise: the length gives nothing away
+    one.write_bytes(other.read_bytes())
+    with pytest.raises(dataset.TornFileError, match=r"0\.array_record is damaged or belongs to another shard"):
+        records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
+    assert records.read_shard(other, records.Identity(COLLECTION, SENSOR, 1))
+
+
+def test_both_files_of_another_shard_are_refused(tmp_path):
+    one, other = shard(tmp_path, 0), shard(tmp_path, 1)
+    for ending in (".array_record", ".npz"):
+        one.with_suffix(ending).write_bytes(other.with_suffix(ending).read_bytes())
+    with pytest.raises(dataset.TornFileError, match=r"0\.npz holds shard 1 instead of shard 0; delete 0\.npz and"):
+        records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
+
+
+@pytest.mark.parametrize("changed", ["collection", "sensor"])
+def test_a_shard_of_another_collection_or_sensor_is_refused(tmp_path, changed):
+    wanted = records.Identity(COLLECTION, SENSOR, 0)._replace(**{changed: "f" * 64})
+    with pytest.raises(dataset.TornFileError, match=rf"0\.npz was made with another {changed}\.json"):
+        records.read_shard(shard(tmp_path, 0), wanted)
+
+
+def test_every_flipped_bit_is_found(tmp_path):
+    path, identity = shard(tmp_path, 0), records.Identity(COLLECTION, SENSOR, 0)
+    before = records.read_shard(path, identity)
+    rng = np.random.default_rng(0)
+    for ending in (".array_record", ".npz"):
+        file = path.with_suffix(ending)
+        whole = file.read_bytes()
+        unnoticed = 0
+        for bit in rng.integers(0, 8 * len(whole), 200):
+            torn = bytearray(whole)
+            torn[bit // 8] ^= 1 << bit % 8
+            file.write_bytes(torn)
+            try:
+                after = records.read_shard(path, identity)
+            except dataset.TornFileError:
+                continue
+            unnoticed += 1  # dates and the like in a zip's directory
+            assert all(np.array_equal(after[name], before[name]) for name in records.ARRAYS)
+            assert ending == ".npz"
+        assert unnoticed < 100
+        file.write_bytes(whole)
+
+
+def test_an_array_that_is_not_there_is_named(tmp_path):
+    path = shard(tmp_path, 0)
+    arrays = records.read_arrays(path.with_suffix(".npz"))
+    del arrays["trajectory/pose"]
+    records.write_arrays(path.with_suffix(".npz"), arrays)
+    with pytest.raises(dataset.TornFileError, match=r"0\.npz lacks trajectory/pose; delete"):
+        records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
+
+
+def test_images_that_are_gone_are_named(tmp_path):
+    path = shard(tmp_path, 0)
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"0\.array_record is missing; delete 0\.npz and collect again"):
+        records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))

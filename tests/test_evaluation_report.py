@@ -1,7 +1,5 @@
 """Baselines: what the nearest neighbour takes into account."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -48,25 +46,3 @@ def test_image_and_condition_count_alike_whatever_their_units(unit):
     assert nearest(train, pairs([190, 190], [[0.1, 0.1, unit], [0.9, 0.9, unit]]), physics.Perturbed()) == [1, 3]
     # The image is undecided: the condition alone decides.
     assert nearest(train, pairs([100] * 4, corners), physics.Perturbed()) == [0, 1, 2, 3]
-
-
-def test_a_line_up_s_two_ends_are_of_one_class_and_never_both_empty(tmp_path, monkeypatch):
-    fell, rests = physics.Outcome.FELL_OFF, physics.Outcome.RESTS
-    greys, category = np.arange(1, 8), np.array([0, 0, 0, 0, 1, 1, 1])
-    outcome = np.array([fell, fell, rests, fell, fell, rests, rests], np.int32)
-    test = pairs(greys, np.zeros((7, 0)))._replace(outcome=outcome)
-    predicted = evaluation.Predicted(visual=np.zeros((7, SIDE, SIDE, 3)), tactile=np.zeros((7, SIDE, SIDE, 3)))
-    rows, blank = np.array([0, 4]), np.zeros((SIDE, SIDE, 3))
-    for seed in range(8):
-        drawn = []
-        monkeypatch.setattr(evaluation.figures, "_show", lambda _, image, drawn=drawn: drawn.append(image))
-        paths = tmp_path / "a.png", tmp_path / "a.json"
-        stands = np.zeros((2, SIDE, SIDE, 3))
-        evaluation.figures.line_up(*paths, test, predicted, category, blank, stands, rows, seed=seed)
-        answers = json.loads(paths[1].read_text())
-        for row, (own, right) in enumerate(zip(rows, answers, strict=True)):
-            ends = [int(np.rint(255 * drawn[8 * row + column].max())) - 1 for column in (4, 6)]
-            assert ends["AB".index(right)] == own
-            other = ends[1 - "AB".index(right)]
-            assert category[other] == category[own]
-            assert outcome[other] == rests

@@ -1,14 +1,16 @@
 """What the command line makes of a preset, and what presets hold; nothing of it is run."""
 
 import dataclasses
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
 import sts_jax as sts
-from experiments import command, freefall, inclined, perturbed, stages
-from sts_jax import compilation, dataset, physics
+from experiments import command, errors, freefall, inclined, perturbed, pictures, results, stages
+from sts_jax import _files, compilation, dataset, evaluation, physics
 
 BOTTLES = ("bottle",)
 
@@ -136,3 +138,153 @@ def test_without_xdg_cache_home_things_are_kept_at_home(told, monkeypatch):
     else:
         monkeypatch.setenv("XDG_CACHE_HOME", told)
     assert compilation.cache_folder() == Path("/home/somebody/.cache/sts_jax")
+
+
+@pytest.mark.parametrize("flag", ["--workdir", "--objects"])
+@pytest.mark.parametrize("name", ["", " "])
+def test_an_empty_name_of_a_folder_is_refused(flag, name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["freefall", flag, name])
+    with pytest.raises(SystemExit) as stopped:
+        command.run(freefall.PRESETS, str(tmp_path), None)
+    assert stopped.value.code == 2
+    assert "name of the folder is empty" in " ".join("".join(capsys.readouterr()).replace("│", " ").split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_the_user_can_mend_is_one_line_and_debug_shows_more(tmp_path, monkeypatch):
+    path = tmp_path / "a.txt"
+    path.write_text("")
+    monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(path)])
+    with pytest.raises(SystemExit, match=rf"^error: cannot work in {path}: .*Choose a folder"):
+        command.run(freefall.PRESETS, "unused", None)
+    monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot"])
+    with pytest.raises(SystemExit, match=r"^error: unknown classes teapot"):
+        command.run(freefall.PRESETS, str(tmp_path), None)
+    monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot", "--debug"])
+    with pytest.raises(ValueError, match="teapot"):
+        command.run(freefall.PRESETS, str(tmp_path), None)
+
+
+def locked_twice(folder: Path) -> None:
+    with _files.lock(folder), _files.lock(folder):
+        pass
+
+
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda folder: physics.variant(physics.Freefall(), "sideways"),
+        lambda folder: (folder / "none").read_text(),
+        dataset.load,
+        locked_twice,
+    ],
+)
+def test_what_is_refused_is_one_line(refused, tmp_path):
+    with pytest.raises(SystemExit, match=r"^error: ") as raised, errors.on_one_line():
+        refused(tmp_path)
+    assert raised.value.__suppress_context__
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [
+        (lambda: command.configure(freefall.SMOKE, None), AttributeError),
+        (lambda: pictures.describe("cup", {}, {}), KeyError),
+        (lambda: evaluation.emptiness(np.zeros((2, 3, 3, 3)), np.zeros((4, 4, 3))), ValueError),  # of NumPy
+    ],
+)
+def test_a_fault_of_the_program_keeps_its_traceback(fault, kind):
+    with pytest.raises(kind), errors.on_one_line():
+        fault()
+
+
+def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
+    with _files.lock(tmp_path), pytest.raises(_files.LockedError, match="wait until it has finished"):
+        stages.main(freefall.SMOKE, tmp_path)
+    assert not (tmp_path / "config.json").exists()
+
+
+def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "objects.txt").write_text("of the first\n")
+    with _files.lock(tmp_path / "run"), pytest.raises(_files.LockedError):
+        command.configure(freefall.SMOKE, command.Args(tmp_path / "run", objects=folder))
+    assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
+
+
+def test_a_damaged_log_of_a_training_is_named(tmp_path):
+    (tmp_path / "metrics.jsonl").write_bytes(b'{"step": 1}\n{"st')
+    with pytest.raises(dataset.TornFileError, match=r"metrics\.jsonl is damaged .*delete .* and train again"):
+        stages._read_log(tmp_path)
+    assert stages._read_log(tmp_path / "none") == []
+
+
+@pytest.fixture
+def evaluated(tmp_path: Path) -> Path:
+    """The results of one model, with a table and a figure."""
+    (tmp_path / "figures").mkdir()
+    outputs = [tmp_path / "table.md", tmp_path / "figures" / "a.png"]
+    for path in outputs:
+        path.write_bytes(path.name.encode())
+    results.write(tmp_path / "metrics.json", {"split": "object"}, INPUTS, outputs)
+    return tmp_path
+
+
+INPUTS = {"dataset": "d" * 64, "models/mvae": "m" * 64}
+
+
+def test_results_hold_as_long_as_nothing_changes(evaluated):
+    assert results.stale(evaluated / "metrics.json", INPUTS) is None
+    content = json.loads((evaluated / "metrics.json").read_text())
+    assert (content["split"], content["inputs"]) == ("object", INPUTS)
+    assert set(content["outputs"]) == {"table.md", "figures/a.png"}
+
+
+@pytest.mark.parametrize(
+    ("inputs", "reason"),
+    [
+        ({**INPUTS, "models/mvae": "n" * 64}, "models/mvae has changed since"),
+        ({**INPUTS, "models/vae": "n" * 64}, "models/vae has changed since"),
+        ({"dataset": INPUTS["dataset"]}, "models/mvae has changed since"),
+    ],
+)
+def test_results_of_other_inputs_are_stale(evaluated, inputs, reason):
+    assert results.stale(evaluated / "metrics.json", inputs) == reason
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("table.md", b"rubbish", "table.md is missing or was changed"),
+        ("table.md", None, "table.md is missing or was changed"),
+        ("figures/a.png", None, "figures/a.png is missing or was changed"),
+        ("metrics.json", None, "metrics.json is missing"),
+        ("metrics.json", b"{", "metrics.json is damaged"),
+        ("metrics.json", b'{"split": "object"}', "metrics.json has no record of its inputs"),
+    ],
+)
+def test_results_that_are_missing_or_changed_are_stale(evaluated, name, content, reason):
+    (evaluated / name).unlink()
+    if content is not None:
+        (evaluated / name).write_bytes(content)
+    assert results.stale(evaluated / "metrics.json", INPUTS) == reason
+
+
+def test_a_changed_number_is_found(evaluated):
+    path = evaluated / "metrics.json"
+    path.write_text(path.read_text().replace('"object"', '"trajectory"'))
+    assert results.stale(path, INPUTS) == "metrics.json was changed"
+
+
+def test_the_identity_of_a_model_is_that_of_all_its_files(tmp_path):
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
+    weights = tmp_path / "checkpoints" / "1" / "weights"
+    weights.write_bytes(b"1234")
+    before = results.identity(tmp_path)
+    (tmp_path / ".lock").write_bytes(b"")
+    assert results.identity(tmp_path) == before
+    weights.write_bytes(b"1235")
+    changed = results.identity(tmp_path)
+    weights.rename(tmp_path / "weights")
+    assert len({before, changed, results.identity(tmp_path)}) == 3

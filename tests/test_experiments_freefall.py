@@ -35,7 +35,7 @@ def test_the_workdir_holds_what_is_promised(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
     assert {"config.json", "dataset", "metrics.json", "table.md"} <= names
     assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS} <= names
-    assert {f"figures/{name}.png" for name in ("predictions", "training", "strip", "line_up")} <= names
+    assert {f"figures/{name}.png" for name in ("predictions", "training", "strip")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
     predictors = metrics["predictors"]
     assert {
@@ -54,9 +54,31 @@ def test_the_workdir_holds_what_is_promised(workdir):
 
 
 def test_started_again_it_touches_nothing(workdir):
-    stamps = {path: path.stat().st_mtime_ns for path in workdir.rglob("*")}
+    stamps = {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
     stages.main(TINY, workdir)
-    assert stamps == {path: path.stat().st_mtime_ns for path in workdir.rglob("*")}
+    assert stamps == {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
+
+
+def test_results_that_no_longer_hold_are_made_again(workdir, capsys):
+    metrics, table = workdir / "metrics.json", workdir / "table.md"
+    before = metrics.read_text(), table.read_text()
+    table.write_text("rubbish")
+    (workdir / "figures" / "strip.png").unlink()
+    stages.main(TINY, workdir)
+    assert (metrics.read_text(), table.read_text()) == before
+    assert (workdir / "figures" / "strip.png").exists()
+    said = capsys.readouterr()
+    assert "evaluate: again, because table.md is missing or was changed\n" in said.err
+    assert said.out == before[1] + "\n"
+
+    log = workdir / "models" / "mvae" / "metrics.jsonl"  # as another training would leave another one
+    old = log.read_bytes()
+    log.write_bytes(old + b'{"step": 2, "loss": 1.0}\n')
+    stages.main(TINY, workdir)
+    assert "evaluate: again, because models/mvae has changed since\n" in capsys.readouterr().err
+    log.write_bytes(old)
+    stages.main(TINY, workdir)
+    assert metrics.read_text() == before[0]
 
 
 def test_another_configuration_is_refused(workdir):

@@ -47,7 +47,7 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     lines = (workdir / "table.md").read_text().splitlines()
     assert next(line for line in lines if line.startswith("| VAE visual only")).endswith("| - |")
     assert {path.name for path in (workdir / "figures").glob("*.png")} == {
-        f"{name}.png" for name in ("predictions", "training", "strip", "line_up")
+        f"{name}.png" for name in ("predictions", "training", "strip")
     }
 
 

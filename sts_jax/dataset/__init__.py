@@ -1,8 +1,8 @@
 """Collections on disk: made shard by shard, read as arrays."""
 
+from sts_jax._files import LockedError as LockedError
 from sts_jax._files import TornFileError as TornFileError
 from sts_jax._files import claim as claim
-from sts_jax._files import write_bytes as write_bytes
 from sts_jax.dataset.collect import Collected as Collected
 from sts_jax.dataset.collect import Collection as Collection
 from sts_jax.dataset.collect import Meshes as Meshes
@@ -13,7 +13,6 @@ from sts_jax.dataset.collect import head as head
 from sts_jax.dataset.collect import make_bodies as make_bodies
 from sts_jax.dataset.collect import mesh_classes as mesh_classes
 from sts_jax.dataset.collect import render_uint8 as render_uint8
-from sts_jax.dataset.collect import sample_of_class as sample_of_class
 from sts_jax.dataset.collect import split_objects as split_objects
 from sts_jax.dataset.collect import survey_meshes as survey_meshes
 from sts_jax.dataset.collect import symmetries_of as symmetries_of
@@ -28,6 +27,7 @@ __all__ = [
     "Collection",
     "Dataset",
     "Images",
+    "LockedError",
     "Meshes",
     "Pairs",
     "Progress",
@@ -40,10 +40,8 @@ __all__ = [
     "make_bodies",
     "mesh_classes",
     "render_uint8",
-    "sample_of_class",
     "split_objects",
     "survey_meshes",
     "symmetries_of",
     "write_arrays",
-    "write_bytes",
 ]

@@ -14,15 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
+from scipy import spatial
 
 from sts_jax import geometry, objects, physics
-from sts_jax._files import claim
+from sts_jax._files import claim, digest, lock, read_json
 from sts_jax.dataset import records
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
 
 # Frames rendered by one compiled call.
 RENDER_BATCH = 32
+SAME = 1e-5  # m, by which files of one mesh in several formats differ at most
 SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
 
 
@@ -106,7 +108,8 @@ def survey_meshes(
         progress: Called with a line for each object.
 
     Returns:
-        The objects, and a listing of them and of what was left out, with the reasons.
+        The objects, and a listing of them and of what was left out, with the reasons. Two files with the same mesh,
+        whatever their names and formats, are one object: a second one could stand on the other side of the split.
 
     Raises:
         FileNotFoundError: No such folder.
@@ -119,18 +122,43 @@ def survey_meshes(
     items = tuple(item for item in library.items if not classes or item.label in classes)
     library, listing = objects.survey(dataclasses.replace(library, items=items), progress=progress)
     usable, digest = [], hashlib.sha256()
+    seen: dict[int, list[tuple[str, np.ndarray]]] = {}  # by the number of triangles: name and `_triangles`
     for index, item in enumerate(library.items):
-        reason = physics.refusal(objects.read(library, index).body, scenario)
-        if reason is None:
-            usable.append(item)
-            digest.update(item.name.encode() + hashlib.sha256(item.path.read_bytes()).digest())
-        else:
+        body = objects.read(library, index).body
+        reason = physics.refusal(body, scenario)
+        if reason is not None:
             listing += f"{item.name}: left out of {type(scenario).__name__}: {reason}\n"
+            continue
+        triangles = _triangles(body)
+        alike = seen.setdefault(len(triangles), [])
+        twin = next((name for name, other in alike if _same(triangles, other)), None)
+        if twin is not None:
+            listing += f"{item.name}: the same mesh as {twin}, left out\n"
+            continue
+        alike.append((item.name, triangles))
+        usable.append(item)
+        digest.update(item.name.encode() + hashlib.sha256(item.path.read_bytes()).digest())
     if not usable:
         raise ValueError(f"{folder}: holds no object that can be used; what was found:\n{listing}")
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)
     return Meshes(str(folder), names, labels, digest.hexdigest(), kept, scale, up), listing
+
+
+def _triangles(body: objects.Body) -> np.ndarray:
+    """The centres of a body's triangles (n, 3), without those that only pad it."""
+    corners = np.asarray(body.vertices)[np.asarray(body.faces)]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    return corners[area > 0].mean(1)
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two meshes of equally many triangles have them at the same places, in any order."""
+    box = [np.stack([x.min(0), x.max(0)]) for x in (one, other)]
+    if np.abs(box[0] - box[1]).max() > SAME:
+        return False
+    pairs = ((one, other), (other, one))
+    return all(spatial.cKDTree(x).query(y)[0].max() <= SAME for x, y in pairs)
 
 
 def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -181,22 +209,6 @@ def head(collection: Collection, count: int) -> Collection:
         return dataclasses.replace(collection, num_objects=count)
     few = dataclasses.replace(meshes, names=meshes.names[:count], labels=meshes.labels[:count])
     return dataclasses.replace(collection, meshes=few, num_objects=len(few.names))
-
-
-def sample_of_class(collection: Collection, name: str) -> objects.Body:
-    """Some object of a class: of the procedural ones the same for all collections, it may stand in for any of them.
-
-    Raises:
-        ValueError: No object of the collection is of that class.
-    """
-    names = class_names(collection)
-    if name not in names:
-        raise ValueError(
-            f"no object of the collection is a {name!r}: its classes are {', '.join(dict.fromkeys(names))}"
-        )
-    if collection.meshes is not None:
-        return make_bodies(collection, np.array([names.index(name)]))[0]
-    return objects.make(jax.random.key(0), name)
 
 
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
@@ -263,8 +275,11 @@ def collect(
 
     Raises:
         ValueError: The sensor cannot be (`Sensor.check`); the folder holds another collection, the message names the
-            field; or the pad does not have the scenario's symmetries; or no object of a shard can be simulated.
-        OSError: The disk is full.
+            field, or one of an older format; or the pad does not have the scenario's symmetries; or no object of a
+            shard can be simulated.
+        LockedError: Another process collects into the folder.
+        TornFileError: A file in the folder is damaged, or belongs to another dataset or shard; names it.
+        OSError: The disk is full, or the folder cannot be written to.
     """
     sensor.check()
     sides = [float(side) for side in sensor.gel.size]
@@ -273,19 +288,29 @@ def collect(
         raise ValueError(f"symmetries=True with gel.size={sides}: only a square pad is itself after a quarter turn")
     if collection.meshes is not None and collection.num_objects != len(collection.meshes.names):
         raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)}")
-    folder.mkdir(parents=True, exist_ok=True)
-    claim(folder / "collection.json", _as_json(collection))
-    claim(folder / "sensor.json", sensor.constants())
+    with lock(folder):
+        return _collect(collection, sensor, folder, progress)
+
+
+def _collect(
+    collection: Collection, sensor: Sensor, folder: Path, progress: Callable[[Progress], None] | None
+) -> Collected:
+    description, constants, path = _as_json(collection), sensor.constants(), folder / "collection.json"
+    if path.exists():
+        records.check_format(read_json(path, f"delete {folder} and collect again"), folder)
+    claim(path, description)
+    claim(folder / "sensor.json", constants)
     claim(
         folder / "split.json",
         {name: [int(i) for i in part] for name, part in split_objects(collection).items()},
     )
     made = Collected(0, ())
     for index in range(collection.num_shards):
-        path = shard_path(folder, collection, index).with_suffix(".npz")
-        if not path.exists():
-            _make_shard(collection, sensor, folder, index, progress)
-        shard = records.read_arrays(path)
+        identity = records.Identity(digest(description), digest(constants), index)
+        path = shard_path(folder, collection.num_shards, index)
+        if not path.with_suffix(".npz").exists():
+            _make_shard(collection, sensor, folder, identity, progress)
+        shard = records.read_shard(path, identity)
         resampled = made.resampled + int(shard["trajectory/resampled"].sum())
         made = Collected(resampled, made.left_out + tuple(shard["left_out"].tolist()))
     return made
@@ -296,18 +321,19 @@ def symmetries_of(collection: Collection) -> tuple[int, ...]:
     return collection.scenario.symmetries if collection.symmetries else (0,)
 
 
-def shard_path(folder: Path, collection: Collection, index: int) -> Path:
-    """The record file of a shard."""
-    return folder / f"shard-{index:05d}-of-{collection.num_shards:05d}.array_record"
+def shard_path(folder: Path, count: int, index: int) -> Path:
+    """The record file of one of `count` shards."""
+    return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
 
 
 def _make_shard(
     collection: Collection,
     sensor: Sensor,
     folder: Path,
-    index: int,
+    identity: records.Identity,
     progress: Callable[[Progress], None] | None,
 ) -> None:
+    index = identity.shard
     first = index * collection.objects_per_shard
     members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
     before = first * collection.num_per_object
@@ -333,14 +359,13 @@ def _make_shard(
             left_out.append(f"{_named(collection, number)}: {str(error).partition(': ')[2]}")
     trajectory = jax.tree.map(np.asarray, trajectory)
     frames = _frames_of(collection, members, trajectory)
-    path = shard_path(folder, collection, index)
     report = _report(progress, 0, len(frames), "frames")
-    records.write_images(path, _render(collection, sensor, list(bodies.values()), trajectory, frames, report))
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
     arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
     arrays |= {"frames": frames, "left_out": np.array(left_out, str)}
-    records.write_arrays(path.with_suffix(".npz"), arrays)
+    images = _render(collection, sensor, list(bodies.values()), trajectory, frames, report)
+    records.write_shard(shard_path(folder, collection.num_shards, index), images, arrays, identity)
 
 
 def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, objects.Body], list[str]]:
@@ -446,4 +471,4 @@ def _report(progress: Callable[[Progress], None] | None, before: int, total: int
 def _as_json(collection: Collection) -> dict:
     content = dataclasses.asdict(collection)
     content["scenario"] = {"name": type(collection.scenario).__name__, **content["scenario"]}
-    return content
+    return {"format": records.FORMAT, **content}

@@ -1,16 +1,15 @@
 """A collected folder as arrays: trajectories, rendered frames, and the pairs that learning sees."""
 
 import dataclasses
-import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax._files import TornFileError
+from sts_jax._files import TornFileError, digest, read_json, sha256
 from sts_jax.dataset import records
-from sts_jax.dataset.collect import turn, turn_condition
+from sts_jax.dataset.collect import SPLITS, shard_path, turn, turn_condition
 
 
 class Pairs(NamedTuple):
@@ -32,6 +31,7 @@ class Dataset:
     """Everything small in memory, images read when asked for."""
 
     collection: dict  # as collection.json has it
+    identity: str  # SHA-256 of everything that was collected, and of the split
     split: dict[str, np.ndarray]  # name -> object indices
     trajectory: dict[str, np.ndarray]  # physics.Trajectory's leaves, all shards: (num, ...)
     hidden: dict[str, np.ndarray]  # physics.Hidden's leaves, (num,)
@@ -109,44 +109,87 @@ class Dataset:
 
 
 def load(folder: str | Path) -> Dataset:
-    """Open a folder that `collect` has finished.
+    """Open a folder that `collect` has finished, and verify it: every image is read once, about 1 s a GB.
 
     Raises:
-        FileNotFoundError: The folder or one of its shards is missing; names it.
-        TornFileError: A file is not whole; names it.
+        FileNotFoundError: The folder or one of its files is missing; names it.
+        TornFileError: A file is damaged, or belongs to another dataset or shard; names it.
+        ValueError: The dataset has an older format.
     """
     folder = Path(folder)
-    collection = _read_json(folder / "collection.json")
-    split = {name: np.array(part, np.int64) for name, part in _read_json(folder / "split.json").items()}
-    count = -(-collection["num_objects"] // collection["objects_per_shard"])
-    shards = tuple(folder / f"shard-{i:05d}-of-{count:05d}.array_record" for i in range(count))
-    parts = []
-    for path in shards:
-        try:
-            parts.append(records.read_arrays(path.with_suffix(".npz")))
-        except FileNotFoundError:
+    path = folder / "collection.json"
+    collection = _read(path)
+    records.check_format(collection, folder)
+    objects, each = (_whole_number(collection, name, path) for name in ("num_objects", "objects_per_shard"))
+    split = _read_split(folder / "split.json", objects)
+    made_of, seen_by = digest(collection), digest(_read(folder / "sensor.json"))
+    count = -(-objects // each)
+    shards, parts = [], []
+    for index in range(count):
+        path = shard_path(folder, count, index)
+        if not path.with_suffix(".npz").exists():
             raise FileNotFoundError(
-                f"{path.with_suffix('.npz')} is missing: the collection is not finished; run it again, it goes on."
-            ) from None
+                f"{path.with_suffix('.npz')} is missing: the collection is not finished; run it again, it resumes."
+            )
+        parts.append(records.read_shard(path, records.Identity(made_of, seen_by, index)))
+        shards.append(path)
     starts = np.cumsum([0] + [len(part["trajectory/outcome"]) for part in parts])
     leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
     sizes = [len(part["frames"]) for part in parts]
+    contents = [sha256(shard.with_suffix(".npz")) for shard in shards]  # each holds the hash of its images
     return Dataset(
         collection=collection,
+        identity=digest([made_of, seen_by, {name: part.tolist() for name, part in split.items()}, contents]),
         split=split,
         trajectory={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("trajectory/")},
         hidden={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("hidden/")},
         frames=np.concatenate([p["frames"] + np.array([s, 0, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
-        shards=shards,
+        shards=tuple(shards),
         shard_of=np.repeat(np.arange(count), sizes),
         record_of=np.concatenate([np.arange(size) for size in sizes]),
     )
 
 
-def _read_json(path: Path) -> dict:
+def _read(path: Path) -> Any:
+    remedy = f"delete {path.parent} and collect again"
     try:
-        return json.loads(path.read_text())
+        return read_json(path, remedy)
     except FileNotFoundError:
-        raise FileNotFoundError(f"{path} is missing: {path.parent} is not a collected dataset.") from None
-    except json.JSONDecodeError as error:
-        raise TornFileError(f"{path} is torn ({error}); delete {path.parent} and collect again.") from error
+        raise FileNotFoundError(
+            f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of one, or collect into it."
+        ) from None
+
+
+def _whole_number(collection: dict, name: str, path: Path) -> int:
+    value = collection.get(name)
+    if type(value) is not int or value < 1:
+        raise TornFileError(
+            f"{path}: {name} must be a whole number of at least 1, got {value!r}; "
+            f"delete {path.parent} and collect again."
+        )
+    return value
+
+
+def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
+    """Read which objects train, validate and test: each object in one part."""
+    content = _read(path)
+    remedy = f"delete {path} and start the collection again, which writes it anew"
+    if not isinstance(content, dict) or set(content) != set(SPLITS):
+        parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
+        raise TornFileError(f"{path} must have the parts {', '.join(SPLITS)}, got {parts}; {remedy}.")
+    for name, part in content.items():
+        if not isinstance(part, list) or not all(type(i) is int for i in part):
+            raise TornFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}; {remedy}.")
+        outside = [i for i in part if not 0 <= i < num_objects]
+        if outside:
+            raise TornFileError(
+                f"{path}: {name} holds object {outside[0]}, and the objects are 0 to {num_objects - 1}; {remedy}."
+            )
+    named = np.array([i for part in content.values() for i in part], np.int64)
+    times = np.bincount(named, minlength=num_objects)
+    if (times != 1).any():
+        number = int(np.flatnonzero(times != 1)[0])
+        raise TornFileError(
+            f"{path}: object {number} must be in one part, and it is there {times[number]} times; {remedy}."
+        )
+    return {name: np.array(part, np.int64) for name, part in content.items()}

@@ -2,19 +2,28 @@
 
 A shard is two files. `NAME.array_record` holds one record per rendered frame: the visual image, the tactile image
 (`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. `NAME.npz` holds everything small as
-named arrays and is written last: a shard without it does not exist.
+named arrays and is written last: a shard without it does not exist. It also holds the shard's `Identity` and the
+SHA-256 of its record file, so that neither file can be exchanged for one of another shard or dataset.
 """
 
 import io
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
-from sts_jax._files import TornFileError, write_bytes, write_whole
+from sts_jax import physics
+from sts_jax._files import TornFileError, sha256, write_bytes, write_whole
 
+FORMAT = 2  # of a dataset's files; one more whenever older files can no longer be read
+ARRAYS = {  # the names that a shard's .npz holds beside its identity
+    *(f"trajectory/{name}" for name in physics.Trajectory._fields if name != "hidden"),
+    *(f"hidden/{name}" for name in physics.Hidden._fields),
+    "frames",
+    "left_out",
+}
 # One frame per group, so that a random read inflates one frame only.
 WRITER_OPTIONS = "group_size:1,zstd:3"
 
@@ -25,6 +34,87 @@ class Images(NamedTuple):
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
     segmentation: np.ndarray  # bool (n, height, width)
+
+
+class Identity(NamedTuple):
+    """Which part of which dataset a shard is."""
+
+    collection: str  # `digest` of collection.json
+    sensor: str  # `digest` of sensor.json
+    shard: int  # its number
+
+
+def check_format(content: Any, folder: Path) -> None:
+    """Check that this version reads a dataset, given what its `collection.json` holds.
+
+    Raises:
+        TornFileError: The content is no description of a collection.
+        ValueError: An older or newer version has written the dataset.
+    """
+    if not isinstance(content, dict):
+        raise TornFileError(f"{folder / 'collection.json'} holds no collection; delete {folder} and collect again.")
+    written = content.get("format", 1)  # the first format had no number
+    if written != FORMAT:
+        raise ValueError(
+            f"{folder} is a dataset of format {written!r}, and this version reads format {FORMAT}: "
+            f"delete {folder} and collect again, or choose another folder."
+        )
+
+
+def write_shard(path: Path, frames: Iterable[Images], arrays: dict[str, np.ndarray], identity: Identity) -> None:
+    """Write both files of a shard.
+
+    Args:
+        path: The `.array_record` file.
+        frames: The images, batch by batch.
+        arrays: Everything else, with the names ARRAYS.
+        identity: Which shard this is.
+
+    Raises:
+        OSError: A file cannot be written; names it.
+    """
+    write_images(path, frames)
+    known = {f"identity/{name}": np.array(value) for name, value in identity._asdict().items()}
+    write_arrays(path.with_suffix(".npz"), {**arrays, **known, "identity/images": np.array(sha256(path))})
+
+
+def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
+    """Read the arrays of a shard, once it is certain that both of its files are those that were written together.
+
+    Args:
+        path: The `.array_record` file.
+        identity: The shard that must be there.
+
+    Returns:
+        The arrays given to `write_shard`.
+
+    Raises:
+        FileNotFoundError: A file is missing; names it.
+        TornFileError: A file is damaged, or belongs to another shard or dataset; names it.
+    """
+    small = path.with_suffix(".npz")
+    arrays = read_arrays(small)
+    again = f"delete {small.name} and {path.name} and start the collection again"
+    names = {f"identity/{name}" for name in (*Identity._fields, "images")}
+    lacking = sorted((names | ARRAYS) - set(arrays))
+    if lacking:
+        raise TornFileError(f"{small} lacks {', '.join(lacking)}; {again}.")
+    there = {name.partition("/")[2]: arrays.pop(name).item() for name in names}
+    if there["shard"] != identity.shard:
+        raise TornFileError(f"{small} holds shard {there['shard']} instead of shard {identity.shard}; {again}.")
+    for name in ("collection", "sensor"):
+        if there[name] != getattr(identity, name):
+            raise TornFileError(
+                f"{small} was made with another {name}.json than the one beside it: put the right {name}.json back, "
+                f"or {again}."
+            )
+    if not path.is_file():
+        raise _missing(path)
+    if sha256(path) != there["images"]:
+        raise TornFileError(
+            f"{path} is damaged or belongs to another shard: its SHA-256 is not that in {small.name}; {again}."
+        )
+    return arrays
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -38,13 +128,22 @@ def write_images(path: Path, frames: Iterable[Images]) -> None:
     """Write the frames of each batch in order to an array_record file, whole or not at all."""
 
     def write(temporary: Path) -> None:
-        writer = ArrayRecordWriter(str(temporary), WRITER_OPTIONS)
+        writer = _or_os_error(ArrayRecordWriter, str(temporary), WRITER_OPTIONS)
         for batch in frames:
             for visual, tactile, segmentation in zip(*batch, strict=True):
-                writer.write(visual.tobytes() + tactile.tobytes() + np.packbits(segmentation).tobytes())
-        writer.close()
+                record = visual.tobytes() + tactile.tobytes() + np.packbits(segmentation).tobytes()
+                _or_os_error(writer.write, record)
+        _or_os_error(writer.close)
 
     write_whole(path, write)
+
+
+def _or_os_error(call: Callable[..., Any], *args: Any) -> Any:
+    """Call array_record, which raises RuntimeError or ValueError where the disk is full."""
+    try:
+        return call(*args)
+    except (RuntimeError, ValueError) as error:
+        raise OSError(str(error)) from error
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -77,7 +176,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
         TornFileError: The file is truncated or holds another number of records.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is missing; delete {path.with_suffix('.npz').name} and collect again.")
+        raise _missing(path)
     torn = f"{path} is torn; delete it and {path.with_suffix('.npz').name} and start the collection again"
     try:
         reader = ArrayRecordReader(str(path))
@@ -98,3 +197,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
         .reshape(-1, height, width)
         .astype(bool),
     )
+
+
+def _missing(path: Path) -> FileNotFoundError:
+    return FileNotFoundError(f"{path} is missing; delete {path.with_suffix('.npz').name} and collect again.")

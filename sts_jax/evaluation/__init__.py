@@ -12,7 +12,7 @@ from sts_jax.evaluation.report import (
     summarise,
     table,
 )
-from sts_jax.evaluation.views import outside, stand_ins
+from sts_jax.evaluation.views import outside
 
 __all__ = [
     "Predicted",
@@ -25,7 +25,6 @@ __all__ = [
     "outcome_of_pose",
     "outside",
     "score",
-    "stand_ins",
     "summarise",
     "table",
 ]

@@ -1,6 +1,5 @@
 """Pictures of what was predicted, learnt and simulated, each written to one PNG file."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from matplotlib.axes import Axes
 from PIL import Image, ImageDraw, ImageFont
 
 from sts_jax import physics
+from sts_jax._files import write_whole
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation.report import Predicted
 
@@ -206,9 +206,12 @@ def animation(
         pages.append(page)
     # A GIF counts hundredths of a second.
     step = 10 * max(round(100 * SLOWER * float(np.mean(np.diff(time)))), 2) if len(time) > 1 else 100
-    path.parent.mkdir(parents=True, exist_ok=True)
     durations = [step] * (len(pages) - 1) + [1500]
-    pages[0].save(path, save_all=True, append_images=pages[1:], duration=durations, loop=0)
+
+    def write(temporary: Path) -> None:
+        pages[0].save(temporary, "GIF", save_all=True, append_images=pages[1:], duration=durations, loop=0)
+
+    write_whole(path, write)
 
 
 def _curves(
@@ -239,74 +242,6 @@ def _curves(
         draw.line([*zip(across[: last + 1], heights[: last + 1, k], strict=True)], ink, 2)
 
 
-def line_up(
-    path: Path,
-    key_path: Path,
-    test: Pairs,
-    predicted: Predicted,
-    category: np.ndarray,
-    blank: np.ndarray,
-    stand_ins: np.ndarray,
-    rows: np.ndarray,
-    *,
-    seed: int = 0,
-) -> None:
-    """A test for fresh eyes: a prediction, and two last moments of which one is its own.
-
-    The other candidate is the target of a held-out trajectory of another object of the same category. Where there is
-    one, its object has no row of its own: rows must not tell of one another; nor do both candidates show an empty
-    sensor. Which side is right is written to `key_path` only.
-
-    Args:
-        path: The PNG to write.
-        key_path: The JSON file with the answers, "A" or "B" for each row.
-        test: Held-out trajectories.
-        predicted: Predictions of the same.
-        category: The category of each, `(n,)`.
-        blank: The visual image of the empty sensor, in [0, 1]; the prediction is also shown with four times its
-            difference from it, since a blurred one is faint.
-        stand_ins: The predicted poses of the rows as pictures in [0, 1], `(rows, h, w, 3)`: some object of the category
-            at each, the same one whatever the trajectory's own looks like, so that they tell the pose alone.
-        rows: Which held-out trajectories are shown, of different objects, `(rows,)`.
-        seed: Of sides and other candidates.
-    """
-    if predicted.visual is None or predicted.tactile is None:
-        raise ValueError("a line-up needs a prediction of both streams; give one of a model that has both.")
-    rng = np.random.default_rng(seed)
-    figure, axes = plt.subplots(len(rows), 8, figsize=(12.5, 1.5 * len(rows) + 0.6), squeeze=False)
-    shown = np.isin(test.object, test.object[rows])
-    answers = []
-    for place, own in enumerate(rows.tolist()):
-        other = int(rng.choice(_candidates(test, category, shown, own)))
-        right = int(rng.integers(2))
-        answers.append("AB"[right])
-        a, b = (own, other) if right == 0 else (other, own)
-        images = [
-            predicted.visual[own],
-            blank + 4 * (predicted.visual[own] - blank),
-            predicted.tactile[own],
-            stand_ins[place],
-            *(stream[i, 1] / 255 for i in (a, b) for stream in (test.visual, test.tactile)),
-        ]
-        heads = ["prediction", "contrast x 4", "(touch)", "(pose)", "A", "(touch)", "B", "(touch)"]
-        for axis, image, head in zip(axes[place], images, heads, strict=True):
-            _show(axis, image)
-            if place == 0:
-                axis.set_title(head, fontsize=9)
-        axes[place, 0].set_ylabel(str(place + 1), fontsize=9, rotation=0, labelpad=12)
-    _save(figure, path)
-    key_path.write_text(json.dumps(answers) + "\n")
-
-
-def _candidates(test: Pairs, category: np.ndarray, shown: np.ndarray, own: int) -> np.ndarray:
-    others = test.object != test.object[own]
-    same = others & (category == category[own])
-    empty = test.outcome == physics.Outcome.FELL_OFF
-    differ = ~(empty & empty[own])
-    choices = [same & ~shown & differ, same & differ, same, others, np.arange(len(shown)) != own]
-    return np.flatnonzero(next(choice for choice in choices if choice.any()))
-
-
 def _show(axis: Axes, image: np.ndarray) -> None:
     axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
     axis.set_xticks([])
@@ -314,7 +249,8 @@ def _show(axis: Axes, image: np.ndarray) -> None:
 
 
 def _save(figure: plt.Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.set_layout_engine("constrained")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    try:
+        write_whole(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))
+    finally:
+        plt.close(figure)

@@ -1,23 +1,18 @@
-"""Pictures of an object at a pose: by a bystander, and of a stand-in at a predicted pose."""
+"""Pictures of an object at a pose, seen by a bystander."""
 
-import dataclasses
 import functools
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, ScalarLike
 
-from sts_jax import geometry, optics, physics
-from sts_jax.dataset import render_uint8
+from sts_jax import geometry, optics
 from sts_jax.objects import Body
-from sts_jax.sensor import Sensor
 
 _THICKNESS = 0.012  # m, how much of the sensor's housing is drawn
 _PAD = optics.to_linear(jnp.array([178.0, 178.0, 204.0]) / 255)
 _HOUSING = jnp.array([0.05, 0.05, 0.055])
-_STAND_IN = 0.1  # albedo
 
 
 @functools.partial(jax.jit, static_argnames=("resolution",))
@@ -76,33 +71,3 @@ def outside(
         resolution=resolution,
         two_sided=body.two_sided,
     )
-
-
-def stand_ins(
-    sensor: Sensor, bodies: Sequence[Body], poses: np.ndarray, resolution: tuple[int, int]
-) -> Float[np.ndarray, "n h w 3"]:
-    """What the sensor would see of other objects, in grey, at predicted poses.
-
-    Where the same one stands in for all objects of a class, the picture tells a pose and nothing else of an object. A
-    predicted pose lies a little in the gel or over it: the stand-in is drawn with its lowest point on the gel, and not
-    at all where the pose is one that fell off.
-
-    Args:
-        sensor: The sensor.
-        bodies: The one that stands in at each pose, `n`.
-        poses: Predicted, `(n, 7)`.
-        resolution: (height, width), pixels.
-
-    Returns:
-        Images in [0, 1].
-    """
-    images = []
-    for body, where in zip(bodies, jnp.asarray(poses, jnp.float32), strict=True):
-        grey, plain = jnp.full_like(body.colors, _STAND_IN), jnp.ones_like(body.texture)
-        body = dataclasses.replace(body, colors=grey, texture=plain)
-        lowest = jnp.min(geometry.transform(where, body.vertices)[:, 2])
-        height = jnp.where(physics.fell_off(where), -1.0, where[2] - lowest)
-        pose = where.at[2].set(height)[None]
-        visual, _, _ = render_uint8(sensor, body, pose, jnp.zeros((1, 6)), resolution=resolution, crop=False)
-        images.append(np.asarray(visual[0]) / 255)
-    return np.stack(images)

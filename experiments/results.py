@@ -1,0 +1,57 @@
+"""A record of what results were made of: while its checksums hold, the results are up to date."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sts_jax import _files
+
+
+def identity(folder: Path) -> str:
+    """SHA-256 over the names and contents of all files of a model's folder, hidden ones left out."""
+    files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return _files.digest({path.relative_to(folder).as_posix(): _files.sha256(path) for path in files})
+
+
+def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], outputs: Sequence[Path]) -> None:
+    """Write results as JSON, with the checksums of what they were made of and of the files made with them.
+
+    Args:
+        path: The JSON file; written last, it marks the results as complete.
+        content: The results.
+        inputs: A checksum for each input, by a name that a user understands.
+        outputs: The other files, all below the folder of `path`.
+    """
+    record = {
+        **content,
+        "inputs": dict(inputs),
+        "outputs": {file.relative_to(path.parent).as_posix(): _files.sha256(file) for file in outputs},
+    }
+    _files.write_json(path, {**record, "checksum": _files.digest(record)})
+
+
+def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
+    """Why results must be made again, or None if they need not.
+
+    Args:
+        path: The file that `write` wrote.
+        inputs: The checksum of each input as it is now.
+    """
+    try:
+        record = _files.read_json(path, "it will be written again")
+    except FileNotFoundError:
+        return f"{path.name} is missing"
+    except _files.TornFileError:
+        return f"{path.name} is damaged"
+    if not isinstance(record, dict) or "checksum" not in record:
+        return f"{path.name} has no record of its inputs"
+    if record.pop("checksum") != _files.digest(record):
+        return f"{path.name} was changed"
+    for name in {**record["inputs"], **inputs}:
+        if record["inputs"].get(name) != inputs.get(name):
+            return f"{name} has changed since"
+    for name, checksum in record["outputs"].items():
+        file = path.parent / name
+        if not file.is_file() or _files.sha256(file) != checksum:
+            return f"{name} is missing or was changed"
+    return None

@@ -1,0 +1,144 @@
+"""Files that are whole or absent, JSON that cannot change unnoticed, checksums, and a lock on a folder."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sts_jax import _files
+
+
+def test_an_interrupted_write_keeps_the_previous_file(tmp_path):
+    path = tmp_path / "deep" / "a.txt"
+    _files.write_bytes(path, b"before")
+
+    def killed(temporary: Path) -> None:
+        temporary.write_bytes(b"half of")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        _files.write_whole(path, killed)
+    assert path.read_bytes() == b"before"
+    assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
+
+
+def test_a_full_disk_is_named_with_the_file_and_leaves_nothing(tmp_path):
+    def full(temporary: Path) -> None:
+        temporary.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match=r"cannot write .*x\.npz: .*No space left.*Free some disk space"):
+        _files.write_whole(tmp_path / "x.npz", full)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fault_of_the_writer_itself_passes_unchanged(tmp_path):
+    def wrong(temporary: Path) -> None:
+        raise ValueError("not of this shape")
+
+    with pytest.raises(ValueError, match=r"^not of this shape$"):
+        _files.write_whole(tmp_path / "x", wrong)
+
+
+def test_json_comes_back(tmp_path):
+    content = {"seed": 0, "sizes": [1, 2.5], "name": None}
+    _files.write_json(tmp_path / "a.json", content)
+    assert _files.read_json(tmp_path / "a.json", "delete it") == content
+    with pytest.raises(FileNotFoundError):
+        _files.read_json(tmp_path / "b.json", "delete it")
+
+
+@pytest.mark.parametrize("content", [b"", b'{"seed"', b"\xff\xfe{}", b"1" * 5000])
+def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
+    path = tmp_path / "a.json"
+    path.write_bytes(content)
+    with pytest.raises(_files.TornFileError, match=r"a\.json cannot be read as JSON .*; delete it\.$"):
+        _files.read_json(path, "delete it")
+    with pytest.raises(_files.TornFileError, match=r"a\.json"):
+        _files.claim(path, {"seed": 0})
+    assert path.read_bytes() == content
+
+
+def test_a_folder_in_the_place_of_a_file_is_named(tmp_path):
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(_files.TornFileError, match=r"a\.json.*delete it"):
+        _files.read_json(tmp_path / "a.json", "delete it")
+
+
+def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
+    path = tmp_path / "config.json"
+    _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
+    before = path.stat().st_mtime_ns
+    _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
+    assert path.stat().st_mtime_ns == before
+    with pytest.raises(ValueError, match=r"config\.json was made with seed = 0, and the current settings have 1"):
+        _files.claim(path, {"seed": 1, "gel": {"sizes": (1, 2)}})
+    with pytest.raises(ValueError, match=r"gel\.sizes = \[1, 2\], and the current settings have \[1, 3\]"):
+        _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 3)}})
+    path.write_text("[]")
+    with pytest.raises(ValueError, match=r"content = \[\]"):
+        _files.claim(path, {"seed": 0})
+
+
+def test_a_checksum_is_that_of_the_content(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"abc")  # the example of FIPS 180-4
+    assert _files.sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_a_digest_depends_on_the_content_and_not_on_the_layout():
+    content = {"b": (1, 2), "a": 0.1}
+    assert _files.digest(content) == hashlib.sha256(b'{"a": 0.1, "b": [1, 2]}').hexdigest()
+    assert _files.digest(json.loads(json.dumps(content, indent=7))) == _files.digest(content)
+    assert _files.digest({"b": (1, 3), "a": 0.1}) != _files.digest(content)
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from sts_jax import _files
+with _files.lock(Path(sys.argv[1])):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_folder_held_by_another_process_is_refused_until_that_ends(tmp_path):
+    folder = tmp_path / "runs" / "one"
+    command = [sys.executable, "-c", HOLD, str(folder)]
+    root = str(Path(_files.__file__).parents[1])
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": root}, **pipes) as other:
+        assert other.stdout.readline() == "held\n"
+        with (
+            pytest.raises(_files.LockedError, match=rf"one is in use by process {other.pid} on .*: wait until it"),
+            _files.lock(folder),
+        ):
+            pytest.fail("held twice")
+        other.kill()  # nothing is tidied up
+        other.wait()
+    with _files.lock(folder), pytest.raises(_files.LockedError, match=f"process {os.getpid()}"), _files.lock(folder):
+        pytest.fail("held twice")
+    with _files.lock(folder), _files.lock(folder / "dataset"):  # one folder in another is another folder
+        pass
+
+
+def test_an_error_in_the_block_passes_and_frees_the_folder(tmp_path):
+    for _ in range(2):
+        with pytest.raises(OSError, match=r"^of the block$"), _files.lock(tmp_path):
+            raise OSError("of the block")
+
+
+def test_a_file_in_the_place_of_a_folder_cannot_be_held(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("")
+    for folder in (path, path / "below"):
+        with (
+            pytest.raises(OSError, match=r"cannot work in .*Choose a folder that can be written to"),
+            _files.lock(folder),
+        ):
+            pytest.fail("held")
