@@ -19,6 +19,7 @@ import tyro
 from matplotlib import pyplot
 
 import sts_jax as sts
+from experiments import output
 from sts_jax import optics
 
 DISTANCE = 0.42  # m, from the photographer to the object
@@ -82,6 +83,7 @@ def main(config: Config) -> None:
     unknown = set(config.categories) - set(sts.objects.CATEGORIES)
     if unknown:
         raise ValueError(f"unknown categories {sorted(unknown)}: take some of {', '.join(sts.objects.CATEGORIES)}")
+    output.check_picture(config.out)
     key = jax.random.key(config.seed)
     drawn = []
     for category in config.categories:

@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import compilation, freefall, inclined, perturbed, pictures
+from experiments import compilation, freefall, inclined, output, perturbed, pictures
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -42,6 +42,7 @@ def main(config: Config) -> None:
         raise ValueError(f"scenario is {config.scenario!r}: give one of {', '.join(SCENARIOS)}")
     if config.num < 1:
         raise ValueError(f"num is {config.num}: give at least 1")
+    output.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)
     names, bodies = dataset.class_names(collection), dataset.make_bodies(collection, np.arange(config.num))
@@ -70,7 +71,7 @@ def main(config: Config) -> None:
             one.wrench,
             one.gravity,
             title=words,
-            outcome=sts.physics.Outcome(int(one.outcome)).name.lower().replace("_", " "),
+            outcome=str(sts.physics.Outcome(int(one.outcome))),
         )
         print(f"{path.with_suffix('')}: {words}")
 

@@ -132,7 +132,7 @@ def test_bodies_that_cannot_be_placed_are_named(bodies):
     leaning = Rotation.from_euler("x", 30, degrees=True).as_matrix().astype(np.float32)
     with pytest.raises(ValueError, match=r"face is 'upright', but the body does not stand"):
         physics.place(dataclasses.replace(bodies[0], hulls=bodies[0].hulls @ leaning.T), sts.Sensor(), face="upright")
-    outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.0, 0.3, 0.0]), contents_density=jnp.float32(0))
+    outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
     with pytest.raises(ValueError, match="the body rests on no face"):
         physics.place(outside, sts.Sensor())
     with pytest.raises(ValueError, match="hulls spans no volume"):

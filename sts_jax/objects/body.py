@@ -79,8 +79,8 @@ class Body:
             )
 
     def __repr__(self) -> str:
-        leaves = jax.tree.leaves(self)
-        if not all(isinstance(leaf, np.ndarray | jax.Array) and not isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        arrays = [isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in vars(self).values()]
+        if not all(arrays) or is_traced(self):
             shapes = (f"{field.name}={_form(getattr(self, field.name))}" for field in dataclasses.fields(self))
             return f"Body({', '.join(shapes)})"
         if np.ndim(self.vertices) != 2:
@@ -100,6 +100,11 @@ class Body:
         full = float(self.contents_density) * volume
         holds = f"holds {full:.3g} kg in {1e6 * volume:.3g} ml" if full > 0 else "solid"
         return f"Body({name}, {size} mm, {float(self.shell_mass):.3g} kg, {holds}, {faces:,} faces, {hull})"
+
+
+def is_traced(tree: object) -> bool:
+    """Whether any leaf of a tree is traced, so that its values are not known."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _form(leaf: object) -> str:

@@ -178,5 +178,6 @@ def _check_numbers(
         raise ValueError(f"fill is {fill}; it is a share of the interior's volume, from 0 to 1")
     if not shell_scale > 0:
         raise ValueError(f"shell_scale is {shell_scale}; it must be above 0")
-    if abs(np.linalg.norm(np.asarray(up, float)) - 1) > 1e-3:
-        raise ValueError(f"up is {up!r}, of length {np.linalg.norm(np.asarray(up, float)):.3g}; it must be a unit vector")
+    length = float(np.linalg.norm(np.asarray(up, float)))
+    if abs(length - 1) > 1e-3:
+        raise ValueError(f"up is {up!r}, of length {length:.3g}; it must be a unit vector")
