@@ -9,6 +9,7 @@ off the surface; `--parts` makes convex parts first of what a hull fits badly (s
 """
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Literal
 
@@ -114,4 +115,7 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    try:
+        main(tyro.cli(Config))
+    except (OSError, ValueError, ImportError) as error:
+        sys.exit(f"error: {error}")

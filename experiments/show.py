@@ -6,6 +6,7 @@ Writes OUT/SCENARIO-NUMBER.png and .gif, of the first objects of the scenario's 
 """
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -78,4 +79,7 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     compilation.keep()
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except (OSError, ValueError, ImportError) as error:
+        sys.exit(f"error: {error}")
