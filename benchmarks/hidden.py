@@ -156,7 +156,7 @@ def painted(body: objects.Body) -> objects.Body:
 
 def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
     """Objects in the air, as freefall begins: starts, visual frames, and those with the fuller objects painted."""
-    starts = roll(key, items, physics.Freefall(frames=1), num)
+    starts = roll(key, items, physics.Freefall(frames=11), num)  # the fewest in which a fall can end
     plain, _ = draw(items, starts)
     both, _ = draw([painted(body) for body in items], starts)
     return starts, plain, np.where((starts.fill > 0.5)[:, None, None, None], both, plain)

@@ -152,7 +152,7 @@ def worlds(count: int, frames: int) -> tuple[_Worlds, mjx.Model, mjx.Data]:
     return _Worlds(fields, hull, start, gravity), model, data
 
 
-def scaling(frames: int = 4, chunk: int = 32) -> None:
+def scaling(frames: int = 8, chunk: int = 32) -> None:
     """Steps per second against the number of worlds; a table and a plot."""
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]

@@ -201,7 +201,7 @@ def main(config: Config) -> None:
         raise ValueError("force is 0: what does not press leaves no imprint to fit, give one above 0")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     body = sense.read(config, config.mesh)
-    pose, wrench, words = sense.lay(config, body)
+    pose, wrench, words = sense.lay(config, sensor, body)
     given = jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     target = touch(sensor, body, *given, resolution=config.resolution)
     empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)

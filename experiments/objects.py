@@ -9,6 +9,7 @@ off the surface; `--parts` makes convex parts first of what a hull fits badly (s
 """
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ import tyro
 from matplotlib import pyplot
 
 import sts_jax as sts
+from experiments import output
 from sts_jax import optics
 
 DISTANCE = 0.42  # m, from the photographer to the object
@@ -82,6 +84,7 @@ def main(config: Config) -> None:
     unknown = set(config.categories) - set(sts.objects.CATEGORIES)
     if unknown:
         raise ValueError(f"unknown categories {sorted(unknown)}: take some of {', '.join(sts.objects.CATEGORIES)}")
+    output.check_picture(config.out)
     key = jax.random.key(config.seed)
     drawn = []
     for category in config.categories:
@@ -112,4 +115,7 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    try:
+        main(tyro.cli(Config))
+    except (OSError, ValueError, ImportError) as error:
+        sys.exit(f"error: {error}")

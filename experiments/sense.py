@@ -27,6 +27,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
+from experiments import output
 from sts_jax import tactile
 
 G = 9.81  # m/s^2
@@ -86,8 +87,7 @@ def check(config: Config) -> None:
     for name, value in (("mass", config.mass), ("force", config.force)):
         if value is not None and (value < 0 or (name == "mass" and value == 0)):
             raise ValueError(f"{name} is {value}: give one above 0" + (", or 0" if name == "force" else ""))
-    if not config.out.parent.is_dir():
-        raise FileNotFoundError(f"{config.out.parent}: no such folder for {config.out.name}: make it, or give --out")
+    output.check_picture(config.out)
 
 
 def read(config: Config, name: str) -> sts.objects.Body:
@@ -122,40 +122,34 @@ def read(config: Config, name: str) -> sts.objects.Body:
     )
 
 
-def lay(config: Config, body: sts.objects.Body) -> tuple[np.ndarray, np.ndarray, str]:
-    """Where the object lies: its pose and the wrench that carries it, and in words what it rests on.
+def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.ndarray, np.ndarray, str]:
+    """Where the object lies: its pose and the wrench that carries it, and the face it rests on in words.
+
+    The object is placed at rest by `physics.place`, then tilted, turned and moved as the configuration asks.
 
     Raises:
         ValueError: there is no such face to rest on.
     """
-    mass, com, _ = (np.asarray(value, float) for value in sts.objects.rigid(body, FILL, 1.0))
-    ups, shares = sts.objects.rest_poses(np.unique(np.asarray(body.hulls, float).reshape(-1, 3), axis=0), com)
-    order = np.argsort(-shares, kind="stable")
-    if not len(order):  # something round: as its file has it
-        ups, shares, order = np.array([[0.0, 0, 1]]), np.ones(1), np.zeros(1, int)
-    if not 0 <= config.rest < len(order):
-        raise ValueError(f"rest is {config.rest}: it rests on {len(order)} faces, give 0 to {len(order) - 1}")
-    up = ups[order[config.rest]]
-    # What lies has its own up towards the top of the picture; what stands looks that way with its back.
-    ahead = np.array([0.0, 0, 1]) if abs(up[2]) < 0.7 else np.array([0.0, -1, 0])
-    down = up @ ahead * up - ahead
-    y = down / np.linalg.norm(down)
-    turn = Rotation.from_matrix(np.stack([np.cross(y, up), y, up]))
+    shares = sts.physics.stable_faces(body, fill=FILL).share
+    if not 0 <= config.rest < len(shares):
+        raise ValueError(f"rest is {config.rest}: it rests on {len(shares)} faces, give 0 to {len(shares) - 1}")
+    rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
+    turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)
     turn = Rotation.from_rotvec([*config.tilt, 0], degrees=True) * turn
     turn = Rotation.from_rotvec([0, 0, config.turn], degrees=True) * turn
     turned = turn.apply(np.asarray(body.vertices, float))
     low, high = turned.min(0), turned.max(0)
     place = np.array([*config.position, config.height]) - np.array([*(low + high)[:2] / 2, low[2]])
-    x, y, z, w = turn.as_quat(canonical=True)
-    pose = np.array([*place, w, x, y, z])
-    over = place + turn.apply(com)
-    force = config.force if config.force is not None else G * float(mass) * (config.height <= 0)
-    wrench = np.array([0, 0, force, over[1] * force, -over[0] * force, 0])
-    face = f"face {config.rest} of the {len(order)} that it can rest on (share {shares[order[config.rest]]:.2f})"
+    pose = np.concatenate([place, turn.as_quat(canonical=True, scalar_first=True)])
+    carries = np.asarray(sts.physics.weight(body, pose.astype(np.float32), fill=FILL), float)
+    force = config.force if config.force is not None else carries[2] * (config.height <= 0)
+    wrench = force / carries[2] * carries
+    mass = float(carries[2]) / G
+    face = f"face {config.rest} of the {len(shares)} that it can rest on (share {shares[config.rest]:.2f})"
     if any(config.tilt):
         face += ", tilted by {:g} and {:g} degrees".format(*config.tilt)
     where = f"{1e3 * config.height:.1f} mm over the gel" if config.height > 0 else f"pressed by {force:.3g} N"
-    return pose, wrench, f"{face}; {float(mass):.3g} kg, {where}"
+    return pose, wrench, f"{face}; {mass:.3g} kg, {where}"
 
 
 @functools.partial(jax.jit, static_argnames=("resolution", "crop", "light"))
@@ -176,7 +170,7 @@ def see(
 
 def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[sts.Frame, np.ndarray, str]:
     """The frame, the image between its streams, and what there is to say of it."""
-    pose, wrench, words = lay(config, body)
+    pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     seconds = []
     for _ in range(2):

@@ -6,6 +6,7 @@ Writes OUT/SCENARIO-NUMBER.png and .gif, of the first objects of the scenario's 
 """
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed, pictures
+from experiments import freefall, inclined, output, perturbed, pictures
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -42,6 +43,7 @@ def main(config: Config) -> None:
         raise ValueError(f"scenario is {config.scenario!r}: give one of {', '.join(SCENARIOS)}")
     if config.num < 1:
         raise ValueError(f"num is {config.num}: give at least 1")
+    output.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)
     names, bodies = dataset.class_names(collection), dataset.make_bodies(collection, np.arange(config.num))
@@ -70,11 +72,14 @@ def main(config: Config) -> None:
             one.wrench,
             one.gravity,
             title=words,
-            outcome=sts.physics.Outcome(int(one.outcome)).name.lower().replace("_", " "),
+            outcome=str(sts.physics.Outcome(int(one.outcome))),
         )
         print(f"{path.with_suffix('')}: {words}")
 
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    main(tyro.cli(Config, description=__doc__))
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except (OSError, ValueError, ImportError) as error:
+        sys.exit(f"error: {error}")

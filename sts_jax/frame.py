@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 from sts_jax import _math, geometry, optics, tactile
 from sts_jax._loop import looped
 from sts_jax._tiles import where_active
-from sts_jax.objects.body import FACE_CLASSES, Body
+from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
 from sts_jax.sensor import Sensor
 
 # vertices' column and row on the screen and a third value; faces' corners
@@ -66,7 +66,8 @@ def sense(
     With a wrench the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`); without one the
     imprint follows from the pose alone. Both streams show the balanced pose. An object that lies wholly below the
     gel's face has fallen off: the images are those of an empty sensor. So they are where pose or wrench are not
-    finite; `balanced` is False then.
+    finite, where the quaternion is so long or short that its square is not a positive number, and where a traced body
+    has a vertex, normal or colour that is not finite; `balanced` is False then.
 
     It compiles itself, once for every resolution and size class of bodies (their faces and texture), and serves as
     well inside other compiled functions, `vmap` and `grad`.
@@ -91,17 +92,24 @@ def sense(
 
     Raises:
         ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
-            more faces than can be drawn, all of this under `jit` too; or the sensor cannot be, of what is known of it.
+            more faces than can be drawn, all of this under `jit` too; or the sensor or the body cannot be (`check`),
+            of what is known of them.
+        TypeError: an argument that is no sensor or no body.
     """
+    _check_kinds(sensor, body)
     pose, wrench = jnp.asarray(pose, float), None if wrench is None else jnp.asarray(wrench, float)
     _check_shapes(body, pose, wrench, resolution)
     sensor, sound = sensor.guard()
+    sound = jnp.asarray(sound)
+    if is_traced(body):
+        for values in (body.vertices, body.normals, body.colors):
+            sound &= jnp.all(jnp.isfinite(values))
     # What is not drawn is left out: things of one size then share a program, whatever collides or is inside.
     body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
     height, width = (int(n) for n in resolution)
-    return _sense(
-        sensor, sound, body, pose, wrench, resolution=(height, width), crop=bool(crop), moving_edges=bool(moving_edges)
-    )
+    # Two programs: the first one serves every resolution.
+    resting = _balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
+    return _draw(sensor, body, resting, resolution=(height, width), crop=bool(crop), moving_edges=bool(moving_edges))
 
 
 class _Resting(NamedTuple):
@@ -115,22 +123,6 @@ class _Resting(NamedTuple):
     pressing: Bool[Array, ""]  # it presses on the gel
     balanced: Bool[Array, ""]
     pressure: Float[Array, "r c"]  # Pa
-
-
-def _sense(
-    sensor: Sensor,
-    sound: Bool[Array, ""] | bool,
-    body: Body,
-    pose: Float[Array, "7"],
-    wrench: Float[Array, "6"] | None,
-    *,
-    resolution: tuple[int, int],
-    crop: bool,
-    moving_edges: bool,
-) -> Frame:
-    # Two programs: the first one serves every resolution.
-    resting = _balance(sensor.gel, jnp.asarray(sound), body.vertices, body.faces, body.two_sided, pose, wrench)
-    return _draw(sensor, body, resting, resolution=resolution, crop=crop, moving_edges=moving_edges)
 
 
 @jax.jit
@@ -155,7 +147,8 @@ def _balanced(
     pose: Float[Array, "7"],
     wrench: Float[Array, "6"] | None,
 ) -> _Resting:
-    finite = sound & jnp.all(jnp.isfinite(pose)) & (geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:]) > 0)
+    length = geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:])
+    finite = sound & jnp.all(jnp.isfinite(pose)) & (length > 0) & jnp.isfinite(length)
     if wrench is not None:
         finite &= jnp.all(jnp.isfinite(wrench))
         wrench = jnp.where(finite, wrench, 0)
@@ -195,6 +188,21 @@ def _placed(
     # What comes out of a condition is kept; else XLA works it out anew wherever it is needed.
     planes = jax.lax.cond(so, lambda: tuple(geometry.transform(pose, vertices).T), lambda: tuple(otherwise.T))
     return jnp.stack(planes, axis=-1)
+
+
+def _check_sensor(sensor: Any) -> None:
+    if not isinstance(sensor, Sensor):
+        raise TypeError(f"sensor is {sensor!r}; it takes a Sensor, for instance sts.Sensor()")
+
+
+def _check_kinds(sensor: Any, body: Any) -> None:
+    _check_sensor(sensor)
+    if not isinstance(body, Body):
+        several = isinstance(body, Sequence) and not isinstance(body, str)
+        remedy = "For several use objects.stack and jax.vmap" if several else "objects.load reads a mesh file"
+        raise TypeError(f"body is {body!r}; it takes one Body. {remedy}")
+    if body.vertices.ndim != 2 or not is_traced(body):
+        body.check()
 
 
 def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:
@@ -240,6 +248,7 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         ValueError: `light` is outside [0, 1] or not one number; or the sensor cannot be, of what is known of it. Of a
             traced one that cannot be, the default's exposure counts.
     """
+    _check_sensor(sensor)
     sensor, _ = sensor.guard()
     if jnp.ndim(light):
         raise ValueError(f"light has the shape {jnp.shape(light)}; it takes one number. For several use jax.vmap")
@@ -272,9 +281,16 @@ def touch(
         constants.
 
     Raises:
-        ValueError: the imprint is no image, the window has no area or is not finite, or the sensor cannot be, of what
-            is known of them.
+        ValueError: the imprint is no image or has whole numbers, the window has no area or is not finite, or the sensor
+            cannot be, of what is known of them.
     """
+    _check_sensor(sensor)
+    imprint = jnp.asarray(imprint)
+    if not jnp.issubdtype(imprint.dtype, jnp.floating):
+        raise ValueError(
+            f"imprint has the type {imprint.dtype}; it takes floating-point numbers in metres, 0.0005 for half a "
+            "millimetre. Multiply a depth image of whole numbers by the metres of one unit first"
+        )
     imprint = jnp.asarray(imprint, float)
     if imprint.ndim != 2 or 0 in imprint.shape:
         raise ValueError(f"imprint has the shape {imprint.shape}; it takes (height, width). For several use jax.vmap")

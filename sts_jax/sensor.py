@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from sts_jax._files import read_json, write_json
 from sts_jax.optics import Camera, Room
 from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
 
@@ -110,12 +110,10 @@ class Sensor:
 
         Raises:
             ValueError: see `check`.
+            OSError: the file cannot be written. The message names the file and the remedy.
         """
         self.check()
-        path = Path(path)
-        part = path.with_name(path.name + ".part")
-        part.write_text(json.dumps(self.constants(), indent=2) + "\n")
-        part.replace(path)
+        write_json(Path(path), self.constants())
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Sensor":
@@ -129,12 +127,10 @@ class Sensor:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is torn, or a field is missing, unknown, of another shape or out of range (`check`).
+            OSError: the file cannot be read, or is torn or no JSON (`TornFileError`).
+            ValueError: a field is missing, unknown, of another shape or out of range (`check`).
         """
-        try:
-            values = json.loads(Path(path).read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is torn or no JSON: {error}. Write it again with Sensor.save.") from error
+        values = read_json(Path(path), "write it again with Sensor.save")
         try:
             sensor = _typed(cls(), values, "")
             sensor.check()

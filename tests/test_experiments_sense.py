@@ -38,7 +38,7 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
     assert lines[4] == str(out)
 
     body, sensor = sense.read(config, "bottle"), sts.Sensor()
-    pose, wrench, _ = sense.lay(config, body)
+    pose, wrench, _ = sense.lay(config, sensor, body)
     frame = jax.jit(sts.sense, static_argnames="resolution")(
         sensor, body, pose.astype(np.float32), wrench.astype(np.float32), resolution=TINY
     )
@@ -74,7 +74,7 @@ def test_where_it_lies_is_where_it_was_told(box):
     body = sense.read(config, str(box))
 
     def corners(config):
-        pose, wrench, words = sense.lay(config, body)
+        pose, wrench, words = sense.lay(config, sts.Sensor(), body)
         w, x, y, z = pose[3:]
         return Rotation.from_quat([x, y, z, w]).apply(np.asarray(body.vertices, float)) + pose[:3], wrench, words
 
@@ -100,7 +100,7 @@ def test_a_round_thing_lies_as_its_file_has_it(tmp_path):
     path = tmp_path / "ball.stl"
     trimesh.creation.icosphere(subdivisions=3, radius=0.02).export(path)
     config = sense.Config(str(path))
-    pose, _, words = sense.lay(config, sense.read(config, str(path)))
+    pose, _, words = sense.lay(config, sts.Sensor(), sense.read(config, str(path)))
     assert pose[2] == pytest.approx(0.02, rel=0.01)
     assert "that it can rest on" in words
 
@@ -145,6 +145,8 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
         ({"longest_side": 0.2}, "longest_side is 0.2 m, the pad is 0.15 m wide"),
         ({"scale": 100.0}, r"longest side is 4 m, the pad is 0.15 m wide: give longest_side"),
         ({"out": "nowhere/a.png"}, "nowhere: no such folder"),
+        ({"out": "."}, "is a folder; give the name of a picture"),
+        ({"out": "a.xyz"}, r"a\.xyz: its suffix is '\.xyz'; it must be one of \.png"),
         ({"sensor": "none.json"}, r"none\.json"),
     ],
 )
@@ -152,7 +154,7 @@ def test_what_cannot_be_shown_is_named(box, tmp_path, monkeypatch, changes, mess
     monkeypatch.chdir(tmp_path)
     changes = {"mesh": str(box), "out": tmp_path / "a.png", "resolution": TINY} | changes
     config = sense.Config(**{**changes, "out": sense.Path(changes["out"])})
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
+    with pytest.raises((ValueError, OSError), match=message):
         sense.main(config)
     assert not (tmp_path / "a.png").exists()
 

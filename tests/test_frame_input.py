@@ -71,6 +71,55 @@ def test_a_body_with_too_many_faces_is_refused():
             call(SENSOR, body, POSE, WRENCH)
 
 
+def test_what_is_no_sensor_or_body_is_named():
+    cases = [
+        ((SENSOR, "mug.obj"), r"body is 'mug\.obj'; it takes one Body\. objects\.load reads a mesh file"),
+        ((SENSOR, [BODY, BODY]), r"body is .*; it takes one Body\. For several use objects\.stack and jax\.vmap"),
+        ((SENSOR, None), "body is None; it takes one Body"),
+        (("sensor.json", BODY), r"sensor is 'sensor\.json'; it takes a Sensor"),
+        ((BODY, SENSOR), r"sensor is Body\(.*; it takes a Sensor"),
+    ]
+    for given, message in cases:
+        with pytest.raises(TypeError, match=message):
+            sense(*given, POSE, WRENCH)
+    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\); one body .* jax\.vmap"):
+        sense(SENSOR, objects.stack([BODY, BODY]), POSE, WRENCH)
+    for call in (touch, expose):
+        with pytest.raises(TypeError, match="sensor is None; it takes a Sensor"):
+            call(None, jnp.zeros((4, 4)), 0.5)
+
+
+@pytest.mark.parametrize("field", ["vertices", "normals", "colors"])
+def test_a_known_body_with_a_value_that_is_not_finite_is_an_error(field):
+    bad = dataclasses.replace(BODY, **{field: getattr(BODY, field).at[7, 1].set(jnp.nan)})
+    for call in (sense, jax.jit(functools.partial(sense, SENSOR, bad))):
+        with pytest.raises(ValueError, match=rf"{field} has \d values that are not finite.*repair the mesh"):
+            call(SENSOR, bad, POSE, WRENCH) if call is sense else call(POSE, WRENCH)
+
+
+def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_sensor(monkeypatch):
+    monkeypatch.setattr(objects.Body, "check", lambda self: None)  # as if traced: no program of its own to compile
+    draw = functools.partial(sense, resolution=(16, 16))
+    gone = draw(SENSOR, BODY, POSE.at[2].set(-1), WRENCH)
+    fields = {name: getattr(BODY, name).at[7, 1].set(jnp.nan) for name in ("vertices", "normals", "colors")}
+    cases = [(dataclasses.replace(BODY, **{name: values}), POSE) for name, values in fields.items()]
+    cases += [(BODY, POSE.at[4].set(1e30)), (BODY, POSE.at[3:].multiply(1e-30))]
+    for body, pose in cases:
+        frame = draw(SENSOR, body, pose, WRENCH)
+        assert not bool(frame.balanced)
+        for name in ("visual", "tactile", "pressure"):
+            np.testing.assert_allclose(getattr(frame, name), getattr(gone, name), atol=1e-6)
+    assert bool(draw(SENSOR, BODY, POSE, WRENCH).balanced)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.bool_, np.int32])
+def test_an_imprint_of_whole_numbers_is_refused(kind):
+    imprint = np.ones((5, 6), kind)
+    for call in (touch, jax.jit(touch)):
+        with pytest.raises(ValueError, match=rf"imprint has the type {np.dtype(kind)}; .* metres"):
+            call(SENSOR, imprint)
+
+
 def with_field(sensor, field, value):
     room, name = field.split(".")
     return dataclasses.replace(sensor, **{room: dataclasses.replace(getattr(sensor, room), **{name: value})})

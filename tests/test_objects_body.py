@@ -1,3 +1,6 @@
+import dataclasses
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +56,44 @@ def test_rigid_against_samples(jar, fill, scale):
     np.testing.assert_allclose(mass, true_mass, rtol=1e-4)
     np.testing.assert_allclose(com, true_com, atol=2e-4)
     np.testing.assert_allclose(inertia, true_inertia, atol=0.015 * np.trace(true_inertia))
+
+
+def test_a_body_is_described_in_a_line_with_or_without_values(jar):
+    body, solid = jar
+    size = " x ".join(f"{1e3 * side:.0f}" for side in solid.extents)
+    held = rf"holds \S+ kg in {1e6 * solid.volume:.3g} ml"
+    assert re.fullmatch(rf"Body\(mesh, {size} mm, \S+ kg, {held}, 480 faces, hull of \d+ points\)", repr(body))
+    made = objects.make(jax.random.key(0), "fork")
+    assert repr(made).startswith("Body(fork, ")
+    assert "solid" in repr(made)
+    assert repr(objects.stack([made, made])).startswith("Body(bodies of shape (2,), 1024 faces")
+    seen = []
+    jax.jit(lambda body: seen.append(repr(body)))(made)
+    assert "vertices=float32[1024, 3]" in seen[0]
+    object.__setattr__(made, "vertices", jax.ShapeDtypeStruct((1024, 3), jnp.float32))  # past the tests' own checks
+    object.__setattr__(made, "hulls", None)
+    assert "vertices=float32[1024, 3]" in repr(made)
+    assert "hulls=None" in repr(made)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"colors": np.nan}, "colors has 9,216 values that are not finite"),
+        ({"shell_mass": np.inf}, "shell_mass is inf; all must be finite"),
+        ({"faces": 1024}, "faces has indices from 1024 to 1024; there are 1024 vertices"),
+        ({"category": 8}, "category is 8; it must be from 0 to 7, an index into objects.CATEGORIES, or -1"),
+        ({"category": -2}, "category is -2"),
+    ],
+)
+def test_a_body_that_cannot_be_is_named(changes, message):
+    body = objects.make(jax.random.key(0), "fork")
+    body.check()
+    changes = {name: jnp.full_like(getattr(body, name), value) for name, value in changes.items()}
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(body, **changes).check()
+    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\); one body .* jax.vmap"):
+        objects.stack([body, body]).check()
 
 
 def test_full_box_by_hand(tmp_path):

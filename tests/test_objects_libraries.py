@@ -277,7 +277,7 @@ def bad_objects(root: Path) -> dict[str, str]:
         "thin.stl": "sheet 0.1 mm thick",
         "tiny.stl": "longest side is 1 mm",
         "torn.glb": "cannot be read as a mesh",
-        "empty.stl": "no faces",
+        "empty.stl": "is empty",
         "points.obj": "no faces",
         "nan.obj": "NaN",
         "beyond.off": "",

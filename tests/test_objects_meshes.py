@@ -264,6 +264,10 @@ def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
         ({"longest_side": 0.0}, "longest_side must be a positive"),
         ({"longest_side": -0.1}, "longest_side must be a positive"),
         ({"longest_side": 0.2}, "the pad is 0.15 m"),
+        ({"longest_side": 0.004}, "longest_side is 0.004 m, the smallest object is 0.005 m"),
+        ({"scale": 0.001}, r"longest side is 0\.1 mm, and the smallest object is 5 mm long.*longest_side, or scale"),
+        ({"category": 99}, "category is 99; it must be from 0 to 7"),
+        ({"category": -2}, "category is -2; it must be from 0 to 7"),
     ],
 )
 def test_bad_arguments(box, arguments, message):
@@ -296,6 +300,43 @@ def test_missing_torn_and_empty_files(tmp_path):
     (tmp_path / "text.xyzzy").write_text("no mesh")
     with pytest.raises(ValueError, match=r"text\.xyzzy"):
         objects.load(tmp_path / "text.xyzzy")
+
+
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+@pytest.mark.parametrize("part", [0.01, 0.3, 0.98])
+def test_a_truncated_stl_is_said_to_be_truncated(tmp_path, kind, part):
+    whole = trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(file_type=kind)
+    whole = whole.encode() if isinstance(whole, str) else whole
+    torn = tmp_path / "torn.stl"
+    torn.write_bytes(whole)
+    assert int(np.asarray(objects.load(torn).faces).any(axis=1).sum()) == 320
+    torn.write_bytes(whole[: int(part * len(whole))])
+    with pytest.raises(ValueError, match=r"torn\.stl: is truncated.*replace it"):
+        objects.load(torn)
+
+
+def test_an_off_of_random_bytes_is_said_to_be_damaged(tmp_path):
+    path = tmp_path / "damaged.off"
+    path.write_bytes(np.random.default_rng(0).integers(128, 256, 2000, np.uint8).tobytes())
+    with pytest.raises(ValueError, match=r"damaged\.off: cannot be read as a mesh") as error:
+        objects.load(path)
+    assert "charset" not in str(error.value) or "truncated or damaged" in str(error.value)
+
+
+def test_a_folder_an_empty_file_and_an_unreadable_one_are_named(tmp_path, box, monkeypatch):
+    for folder in (tmp_path, ""):
+        with pytest.raises(IsADirectoryError, match=r"is a folder; give a mesh file in it.*objects\.library"):
+            objects.load(folder)
+    (tmp_path / "empty.obj").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"empty\.obj: is empty"):
+        objects.load(tmp_path / "empty.obj")
+
+    def forbidden(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(meshes.Path, "open", forbidden)  # whoever runs the tests may be allowed to read everything
+    with pytest.raises(PermissionError, match=r"box.*cannot be opened \(Permission denied\): check its permissions"):
+        objects.load(box)
 
 
 def test_nan_vertices(tmp_path):

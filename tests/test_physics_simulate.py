@@ -2,6 +2,8 @@
 
 import copy
 import dataclasses
+import inspect
+import re
 
 import jax
 import jax.numpy as jnp
@@ -225,16 +227,24 @@ def test_gravity_may_change_with_time() -> None:
     np.testing.assert_allclose(record.velocity[:, :3], [[0, speed, 0]] * 3, atol=1e-6)
 
 
-def test_same_key_same_bytes_and_independent_of_number(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
-    again = physics.simulate(jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24)
+def test_same_key_same_bytes_and_independent_of_number_and_of_a_bar_that_is_shown_before_the_first_chunk(
+    bodies: list[objects.Body], drops: physics.Trajectory, capsys: pytest.CaptureFixture
+) -> None:
+    again = physics.simulate(jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24, progress=True)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.search(r"simulate: compiling: +0%.* 0/3 .*simulate: 100%.* 3/3 ", err, re.DOTALL)
     for name in ("pose", "velocity", "wrench", "settled", "touches"):
         np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[:3])
 
 
-def test_hidden_rolls_the_same_start_again(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+def test_hidden_rolls_the_same_start_again_and_nothing_is_printed_unasked(
+    bodies: list[objects.Body], drops: physics.Trajectory, capsys: pytest.CaptureFixture
+) -> None:
     hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
     heavy = hidden._replace(fill=np.append(hidden.fill[:1], np.ones(NUM - 1, np.float32)))
     other = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, hidden=heavy, chunk=24)
+    assert capsys.readouterr() == ("", "")
     np.testing.assert_array_equal(other.pose[:, 0], drops.pose[:NUM, 0])
     np.testing.assert_array_equal(other.pose[0], drops.pose[0])
     assert not np.any(np.all(other.pose[1:, -1] == drops.pose[1:NUM, -1], axis=1))
@@ -301,6 +311,12 @@ def test_the_outcome_is_read_from_the_last_pose() -> None:
         ({"tilt": -0.1}, 1, r"scenario.tilt"),
         ({"rate": 30.0}, 1, "rate 30"),
         ({"frames": 0}, 1, r"scenario.frames"),
+        (
+            {"frames": 1},
+            1,
+            r"scenario.frames is 1, which last 0 s; .* 0.05 m .* at least 0.301 s .* at least 11 frames",
+        ),
+        ({"height": 1000.0}, 1, r"scenario.frames is 60, which last 1.89 s; .* 1000 m .* at least 14.5 s"),
     ],
 )
 def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:
@@ -316,6 +332,8 @@ def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: 
         ({"hulls": jnp.full((1, 64, 3), jnp.nan)}, "body 1: hulls has a non-finite"),
         ({"hulls": jnp.zeros((1, 64, 3))}, "body 1: the collision hull spans no volume"),
         ({"hulls": jnp.zeros((3, 64, 3))}, "body 1: hulls has shape"),
+        ({"vertices": jnp.full((1024, 3), jnp.nan)}, "body 1: vertices has 3,072 values that are not finite"),
+        ({"category": jnp.int32(99)}, "body 1: category is 99; it must be from 0 to 7"),
         ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
     ],
 )
@@ -323,6 +341,69 @@ def test_bad_bodies_are_named(bodies: list[objects.Body], change: dict, match: s
     bad = dataclasses.replace(bodies[1], **change)
     with pytest.raises(ValueError, match=match):
         physics.simulate(jax.random.key(0), [bodies[0], bad], Sensor(), SCENARIO)
+
+
+def test_the_fewest_frames_that_are_allowed_let_an_object_settle() -> None:
+    dataclasses.replace(SCENARIO, frames=11).check()
+    with pytest.raises(ValueError, match=r"scenario.frames is 10"):
+        dataclasses.replace(SCENARIO, frames=10).check()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "wanted"),
+    [
+        ("frames", 59.5, "a whole number"),
+        ("frames", True, "a whole number"),
+        ("frames", "60", "a whole number"),
+        ("height", "0.05", "a number"),
+        ("rate", False, "a number"),
+        ("fill", [0.0, 1.0], "a tuple of two numbers"),
+        ("fill", (0.0, "1"), "a tuple of two numbers"),
+        ("contact", 0.001, r"a physics\.Contact"),
+    ],
+)
+def test_fields_of_another_kind_are_named(field: str, value: object, wanted: str) -> None:
+    scenario = physics.Freefall()
+    object.__setattr__(scenario, field, value)  # past the tests' own checks of types
+    with pytest.raises(ValueError, match=rf"scenario\.{field} is .*it takes {wanted}"):
+        scenario.check()
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"body": "bottle.obj"}, r"body 0 is 'bottle\.obj'; it takes a Body .*objects\.load"),
+        ({"sensor": None}, "sensor is None; it takes a Sensor"),
+        ({"scenario": "freefall"}, r"scenario is 'freefall'; it takes Freefall\(\)"),
+        ({"num": 1.5}, "num is 1.5; it takes a whole number"),
+        ({"chunk": 0}, "chunk is 0; it takes a whole number"),
+        ({"progress": "bar"}, "progress is 'bar'; it takes True, False or a function"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(bodies: list[objects.Body], changes: dict, match: str) -> None:
+    given = {"body": bodies[0], "sensor": Sensor(), "scenario": SCENARIO, "num": 1}
+    with pytest.raises((TypeError, ValueError), match=match):
+        inspect.unwrap(physics.simulate)(jax.random.key(0), **given | changes)
+
+
+def test_outcomes_are_words_and_a_trajectory_is_summed_up_in_a_line(drops: physics.Trajectory) -> None:
+    assert len(drops.outcomes) == 4 * NUM
+    assert all(isinstance(outcome, physics.Outcome) for outcome in drops.outcomes)
+    np.testing.assert_array_equal(drops.outcomes, drops.outcome)
+    assert f"{physics.Outcome.FELL_OFF}" == str(physics.Outcome.FELL_OFF) == "fell off"
+    ended = drops._replace(outcome=np.repeat(np.int32([0, 1]), [22, 2]), settled=np.arange(24) > 0)
+    text = "24 trajectories of 4 bodies, 60 frames in 1.89 s; 22 rests, 2 fell off; 1 not settled at the end"
+    assert repr(ended) == f"Trajectory({text})"
+    assert repr(jax.tree.map(lambda x: x[0], ended)).startswith("Trajectory(1 trajectory of 1 body, 60 frames")
+
+
+def test_a_trajectory_s_line_does_without_values(drops: physics.Trajectory) -> None:
+    seen: list[str] = []
+    jax.jit(lambda x: seen.append(repr(x)))(drops)
+    jax.vmap(lambda x: seen.append(repr(x)))(drops)
+    seen += [repr(jax.eval_shape(lambda x: x, drops)), repr(jax.tree.map(np.shape, drops))]
+    assert ["pose=(24, 60, 7)" in text for text in seen] == [True, False, True, True]
+    assert "pose=(60, 7)" in seen[1]
 
 
 def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:

@@ -218,5 +218,16 @@ def test_a_torn_or_missing_file_is_named(tmp_path):
     text = path.read_bytes()
     for torn in (text[:200], b"", b"\xff\xfe" + text):
         path.write_bytes(torn)
-        with pytest.raises(ValueError, match=r"sensor\.json is torn"):
+        with pytest.raises(OSError, match=r"sensor\.json cannot be read as JSON .* write it again with Sensor\.save"):
             Sensor.load(path)
+
+
+def test_a_path_that_cannot_be_read_or_written_is_named(tmp_path):
+    with pytest.raises(OSError, match=r"cannot be read as JSON .*directory"):
+        Sensor.load(tmp_path)
+    with pytest.raises(OSError, match=rf"cannot write {tmp_path}.*directory"):
+        Sensor().save(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"cannot write .*file/sensor\.json"):
+        Sensor().save(tmp_path / "file" / "sensor.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

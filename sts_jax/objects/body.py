@@ -49,6 +49,67 @@ class Body:
     contents_density: Float[Array, "*n"]  # kg/m^3; 0 for solid things
     category: Int[Array, "*n"]  # index into CATEGORIES, -1 for a loaded mesh
 
+    def check(self) -> None:
+        """See that this is one body that can be drawn and simulated: on the host, never under `jit`.
+
+        Raises:
+            ValueError: the body has leading axes, a value that is not finite, a face of a vertex that does not exist,
+                or an unknown category. The message names the field.
+        """
+        if jnp.ndim(self.vertices) != 2:
+            raise ValueError(
+                f"vertices has the shape {jnp.shape(self.vertices)}; one body has (v, 3). For several use jax.vmap"
+            )
+        for field in dataclasses.fields(self):
+            values = np.asarray(getattr(self, field.name))
+            if values.dtype.kind == "f" and not np.isfinite(values).all():
+                number = int((~np.isfinite(values)).sum())
+                which = f"is {values}" if values.ndim == 0 else f"has {number:,} values that are not finite"
+                raise ValueError(f"{field.name} {which}; all must be finite: repair the mesh, or leave the body out")
+        faces, category = np.asarray(self.faces), int(self.category)
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
+            raise ValueError(
+                f"faces has indices from {faces.min()} to {faces.max()}; there are {len(self.vertices)} vertices, "
+                f"so they must be from 0 to {len(self.vertices) - 1}"
+            )
+        if not -1 <= category < len(CATEGORIES):
+            raise ValueError(
+                f"category is {category}; it must be from 0 to {len(CATEGORIES) - 1}, an index into "
+                "objects.CATEGORIES, or -1 for an object of none of them"
+            )
+
+    def __repr__(self) -> str:
+        arrays = [isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in vars(self).values()]
+        if not all(arrays) or is_traced(self):
+            shapes = (f"{field.name}={_form(getattr(self, field.name))}" for field in dataclasses.fields(self))
+            return f"Body({', '.join(shapes)})"
+        if np.ndim(self.vertices) != 2:
+            return (
+                f"Body(bodies of shape {np.shape(self.shell_mass)}, {np.shape(self.faces)[-2]} faces and hulls of "
+                f"{' x '.join(map(str, np.shape(self.hulls)[-3:-1]))} points each)"
+            )
+        category = int(self.category)
+        name = CATEGORIES[category] if 0 <= category < len(CATEGORIES) else "mesh"
+        size = " x ".join(f"{1e3 * side:.0f}" for side in np.ptp(np.asarray(self.vertices), axis=0))
+        faces = int(np.asarray(self.faces).any(axis=1).sum())
+        parts = np.unique(np.asarray(self.hulls), axis=0)
+        hull = f"hull of {len(np.unique(parts.reshape(-1, 3), axis=0))} points"
+        hull += f" in {len(parts)} parts" if len(parts) > 1 else ""
+        triangles = np.asarray(self.interior, float)
+        volume = np.einsum("fi,fi->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6
+        full = float(self.contents_density) * volume
+        holds = f"holds {full:.3g} kg in {1e6 * volume:.3g} ml" if full > 0 else "solid"
+        return f"Body({name}, {size} mm, {float(self.shell_mass):.3g} kg, {holds}, {faces:,} faces, {hull})"
+
+
+def is_traced(tree: object) -> bool:
+    """Whether any leaf of a tree is traced, so that its values are not known."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _form(leaf: object) -> str:
+    return f"{leaf.dtype}{list(leaf.shape)}" if hasattr(leaf, "shape") and hasattr(leaf, "dtype") else repr(leaf)
+
 
 def stack(bodies: Sequence[Body]) -> Body:
     """Bodies of one class as one `Body` with a leading axis, for `jax.vmap`.

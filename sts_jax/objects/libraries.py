@@ -30,7 +30,6 @@ from sts_jax.objects.procedural import STEEL
 from sts_jax.objects.solids import WALL, decompose, gaps
 
 LARGEST = 0.12  # m, longest side: what is larger is scaled down to it, so that it can lie on the 0.15 m pad
-SMALLEST = 0.005  # m, longest side: anything shorter has a wrong unit
 THINNEST = 0.0005  # m, a hull thinner than this is a sheet, on which no contact is stable
 HOLLOW = 0.002  # m, a hull that stands off the surface by more is worth decomposing
 NUM_FACES = 4096  # of the padding classes, the one up to which rendering stays cheap
@@ -447,8 +446,6 @@ def _made(collection: Library, item: Item) -> Entry:
     notes = [_short(warning.message, item) for warning in said]
     vertices = np.asarray(body.vertices, float)
     longest = float(np.ptp(vertices, axis=0).max())
-    if longest < SMALLEST:
-        raise ValueError(f"its longest side is {longest * 1e3:.2g} mm: is its unit right?")
     if item.stated is not None and not 0.9 < longest / min(item.stated, collection.largest) < 1.1:
         notes.append(f"the table's aligned.dims give a longest side of {item.stated * 1e3:.0f} mm")
     shape = ConvexHull(np.asarray(body.hulls[0], float))

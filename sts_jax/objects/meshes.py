@@ -14,10 +14,11 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.spatial import ConvexHull, KDTree
 
-from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, TEXTURE_CLASSES, Body
 from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
+SMALLEST = 0.005  # m, longest side: anything shorter has a wrong unit
 PLAIN = 0.7  # sRGB grey of a mesh that names no colour
 
 # Up and front of a file whose up axis alone is given; front becomes -y. A glTF's front is its +z (its specification).
@@ -105,9 +106,11 @@ def load(
     Raises:
         FileNotFoundError: the file or the texture is not there; with `strict` also one that the file names.
         ImportError: decimation or decomposition without its package.
-        ValueError: the file cannot be read as a mesh, has no faces, NaN, too many faces, no extent in some direction,
-            is larger than the pad; `mass`, `density`, a size or direction is not what it should be; not closed and
-            `strict`; it cannot be decimated so far, or decomposed.
+        IsADirectoryError: the path is a folder.
+        PermissionError: the file is not readable.
+        ValueError: the file is empty, truncated or no mesh, has no faces, NaN, too many faces, no extent in some
+            direction, is larger than the pad or smaller than 5 mm; `mass`, `density`, `category`, a size or direction
+            is not what it should be; not closed and `strict`; it cannot be decimated so far, or decomposed.
     """
     path = Path(path)
     for name, value, unit in (
@@ -122,6 +125,15 @@ def load(
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
             raise ValueError(f"{path}: {name} is {value} m, the pad is {PAD} m wide: give at most that")
+        if value is not None and value < SMALLEST:
+            raise ValueError(
+                f"{path}: {name} is {value} m, the smallest object is {SMALLEST} m long: give at least that"
+            )
+    if not -1 <= category < len(CATEGORIES):
+        raise ValueError(
+            f"{path}: category is {category}; it must be from 0 to {len(CATEGORIES) - 1}, an index into "
+            "objects.CATEGORIES, or -1"
+        )
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and faces < 4:
@@ -135,8 +147,7 @@ def load(
             turn = rotation(up, AXES["z"][1] if front is None else front)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such mesh file")
+    _check_file(path)
     sheet = None if texture is None else _image(Path(texture))
     images = None if textures is None else Path(textures)
     if sheet is None:
@@ -146,6 +157,10 @@ def load(
         resolver = None if images is None else _Resolver(path, images)
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
+    except ModuleNotFoundError as error:
+        # trimesh guesses the encoding of what is no UTF-8 with a package that is not among its requirements.
+        damaged = "it is truncated or damaged: replace it" if error.name == "charset_normalizer" else "install it"
+        raise ValueError(f"{path}: cannot be read as a mesh ({error}); {damaged}") from error
     except Exception as error:  # trimesh raises whatever its many readers raise
         raise ValueError(
             f"{path}: cannot be read as a mesh ({error}); is it complete, and its suffix right?"
@@ -178,6 +193,36 @@ def load(
         raise ValueError(f"{path}: {error}") from error
 
 
+def _check_file(path: Path) -> None:
+    """See that a file is there, readable, not empty, and, of an STL, complete."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; give a mesh file in it, or the folder to objects.library")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such mesh file")
+    try:
+        with path.open("rb") as file:
+            head = file.read(1024)
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 1024))
+            tail = file.read()
+    except OSError as error:
+        raise type(error)(f"{path}: cannot be opened ({error.strerror}): check its permissions") from error
+    if not size:
+        raise ValueError(f"{path}: is empty: replace it")
+    if path.suffix.lower() != ".stl":
+        return
+    if head.lstrip().startswith(b"solid") and b"facet" in head:
+        if b"endsolid" not in tail:
+            raise ValueError(f"{path}: is truncated, its text ends without endsolid: replace it")
+        return
+    number = int.from_bytes(head[80:84], "little")  # of triangles, of 50 bytes each
+    if size < 84 + 50 * number or size < 84:
+        raise ValueError(
+            f"{path}: is truncated or no STL: it has {size:,} bytes, and a binary STL of {number:,} triangles has "
+            f"{84 + 50 * number:,}: replace it"
+        )
+
+
 class _Surface(NamedTuple):
     vertices: np.ndarray  # (v, 3), m; those at one place are one, whatever seams the colours have
     faces: np.ndarray  # (f, 3)
@@ -196,6 +241,11 @@ def _factor(
         return longest_side / extent
     factor = 1.0 if scale is None else scale
     extent *= factor
+    if extent < SMALLEST:
+        raise ValueError(
+            f"{path}: its longest side is {extent * 1e3:.2g} mm, and the smallest object is {SMALLEST * 1e3:g} mm "
+            "long: is its unit right? Give longest_side, or scale, the metres of one unit of the file"
+        )
     if largest is not None and extent > largest:
         warnings.warn(f"{path}: its longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
         return factor * largest / extent

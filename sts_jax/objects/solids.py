@@ -147,7 +147,8 @@ def rest_poses(
             edges = ConvexHull(support @ across.T).equations
         except QhullError:  # an edge or a corner
             continue
-        if np.max(edges[:, :2] @ (across @ com) + edges[:, 2]) < -REST_MARGIN:
+        above = normal @ com + offsets[first] < 0
+        if above and np.max(edges[:, :2] @ (across @ com) + edges[:, 2]) < -REST_MARGIN:
             ups.append(-normal)
             weights.append(angle[face].sum())
     return np.array(ups).reshape(-1, 3), np.array(weights) / max(np.sum(weights), 1e-12)

@@ -1,5 +1,6 @@
-"""Physics: objects fall, slide and topple on the pad in MJX; `simulate` gives trajectories in the sensor frame."""
+"""Physics: objects fall, slide and topple on the pad in MJX (`simulate`), or lie there at rest (`place`)."""
 
+from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
 from sts_jax.physics.scenarios import (
     Freefall,
     Hidden,
@@ -22,11 +23,16 @@ __all__ = [
     "Inclined",
     "Outcome",
     "Perturbed",
+    "Placement",
     "Scenario",
+    "StableFaces",
     "Trajectory",
     "Variant",
     "fell_off",
+    "place",
     "refusal",
     "simulate",
+    "stable_faces",
     "variant",
+    "weight",
 ]

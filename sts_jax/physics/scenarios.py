@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import math
+import numbers
 from typing import ClassVar, Literal, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax import geometry
+from sts_jax.physics.roll import SLOW_TIME
 from sts_jax.physics.scene import Contact
 
 G = 9.81  # m/s^2
@@ -25,7 +27,7 @@ TURNED = math.pi / 4  # rad; what leans more lies, what turned more rolled
 
 
 class Outcome(enum.IntEnum):
-    """How a trajectory ended; each scenario knows some of them."""
+    """How a trajectory ended; each scenario knows some of them. Printed in words: "fell off"."""
 
     RESTS = 0
     FELL_OFF = 1
@@ -34,6 +36,9 @@ class Outcome(enum.IntEnum):
     TOPPLES = 4
     STICKS = 5
     ROLLS = 6
+
+    def __str__(self) -> str:
+        return self.name.lower().replace("_", " ")
 
 
 class Hidden(NamedTuple):
@@ -111,6 +116,15 @@ class _Common:
         Raises:
             ValueError: one cannot; it is named.
         """
+        for name, default in vars(type(self)()).items():
+            _check_kind(name, getattr(self, name), default)
+        for name, default in vars(Contact()).items():
+            _check_kind(f"contact.{name}", getattr(self.contact, name), default)
+        if not self.rate > 0 or not self.contact.timestep > 0:
+            raise ValueError(
+                f"scenario.rate is {self.rate}/s and scenario.contact.timestep is {self.contact.timestep} s; both must "
+                "be above 0"
+            )
         steps = 1 / (self.rate * self.contact.timestep)
         if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
             raise ValueError(
@@ -131,6 +145,11 @@ class _Common:
 @dataclasses.dataclass(frozen=True)
 class Freefall(_Common):
     """An object in any orientation released above the flat pad; in frame 0 it is at rest in the air.
+
+    The frames must last at least as long as the fall to the pad and 0.2 s more, the time at rest after which an object
+    counts as settled: `(frames - 1) / rate >= sqrt(2 height / g) + 0.2 s`. A shorter trajectory has no outcome, since
+    no object can have come to rest by its end, and is refused. After the default's 1.9 s few objects still move
+    (`Trajectory.settled`).
 
     Paper, "Data Collection". Ranges are uniform.
     """
@@ -155,6 +174,13 @@ class Freefall(_Common):
         super().check()
         _check_length("height", self.height)
         _check_length("spread", self.spread)
+        lasts, needed = (self.frames - 1) / self.rate, math.sqrt(2 * self.height / G) + SLOW_TIME
+        if lasts < needed:
+            raise ValueError(
+                f"scenario.frames is {self.frames}, which last {lasts:.3g} s; an object released {self.height:g} m "
+                f"above the pad needs at least {needed:.3g} s to fall and come to rest: give at least "
+                f"{math.ceil(needed * self.rate) + 1} frames, or a smaller height"
+            )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draws one start; consumes `key`.
@@ -400,6 +426,25 @@ def _in_disc(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Float[Ar
     r = size * jnp.sqrt(jax.random.uniform(radius))
     a = jax.random.uniform(angle, maxval=2 * jnp.pi)
     return jnp.stack([r * jnp.cos(a), r * jnp.sin(a)])
+
+
+def _check_kind(name: str, value: object, default: object) -> None:
+    """A field takes the same kind of value as its default: a whole number, a number, two numbers or a `Contact`."""
+    if isinstance(default, Contact):
+        fits, wanted = isinstance(value, Contact), "a physics.Contact"
+    elif isinstance(default, tuple):
+        fits = isinstance(value, tuple) and len(value) == len(default) and all(map(_is_number, value))
+        wanted = "a tuple of two numbers, (low, high)"
+    elif isinstance(default, int):
+        fits, wanted = _is_number(value) and isinstance(value, numbers.Integral), "a whole number"
+    else:
+        fits, wanted = _is_number(value), "a number"
+    if not fits:
+        raise ValueError(f"scenario.{name} is {value!r}; it takes {wanted}, of Python's or NumPy's kind")
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool | np.bool_)
 
 
 def _check_range(name: str, values: tuple[float, float], *, positive: bool = True) -> None:

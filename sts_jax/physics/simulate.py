@@ -1,24 +1,28 @@
 """`simulate`: bodies, draws and chunks on the host, MJX underneath."""
 
 import concurrent.futures
+import contextlib
 import copy
 import functools
 import math
-from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from tqdm.auto import tqdm
 
 from sts_jax import objects
-from sts_jax.objects import Body
+from sts_jax.objects.body import Body, is_traced
 from sts_jax.physics import contact, scene
 from sts_jax.physics.contact import Hull
+from sts_jax.physics.rest import UPRIGHT
 from sts_jax.physics.roll import SLOW_TIME, Record, State, initial, roll
-from sts_jax.physics.scenarios import Hidden, Scenario, Shape, Start
+from sts_jax.physics.scenarios import Hidden, Outcome, Scenario, Shape, Start
 from sts_jax.physics.scene import Contact, mjx
 from sts_jax.sensor import Sensor
 
@@ -27,7 +31,6 @@ from sts_jax.sensor import Sensor
 SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before giving up
 CONTENTS = 16  # of each body, by which a start may be chosen
-UPRIGHT = math.radians(1)  # what stands leans less
 WORKERS = 2  # chunks under way at once: XLA runs these small steps on one CPU core each
 
 
@@ -56,13 +59,34 @@ class Trajectory(NamedTuple):
     wall: Bool[Array, "n f"]  # the stop wall pushes in the frame's last step
     gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
     settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
-    outcome: Int[Array, "n"]  # Outcome
+    # Outcome, of the poses of the first and the last frame; an end where `settled`, else what it is at the last frame
+    outcome: Int[Array, "n"]
     touches: Int[Array, "n"]  # contacts with pad or wall, parted by at least 5 ms
     sunk: Float[Array, "n"]  # m, deepest the hull went into pad or wall
     condition: Float[Array, "n c"]  # the scenario's input
     hidden: Hidden  # (n,) each, `up` (n, 3)
     body: Int[Array, "n"]  # index into the sequence of bodies
     resampled: Int[Array, "n"]  # draws thrown away because non-finite or sunken
+
+    @property
+    def outcomes(self) -> tuple[Outcome, ...]:
+        """The outcome of each trajectory: `Outcome.FELL_OFF` is printed as "fell off"."""
+        return tuple(Outcome(int(number)) for number in np.ravel(self.outcome))
+
+    def __repr__(self) -> str:
+        shown = (self.time, self.outcome, self.settled, self.body)
+        if not all(isinstance(x, np.ndarray | np.generic | jax.Array) for x in shown) or is_traced(shown):
+            fields = (f"{name}={getattr(leaf, 'shape', leaf)}" for name, leaf in self._asdict().items())
+            return f"Trajectory({', '.join(fields)})"
+        number, time = np.size(self.outcome), np.asarray(self.time)
+        counts = Counter(map(str, self.outcomes)).most_common()
+        moving = number - int(np.sum(self.settled))
+        return (
+            f"Trajectory({number} trajector{'y' if number == 1 else 'ies'} of {len(np.unique(self.body))} "
+            f"bod{'y' if len(np.unique(self.body)) == 1 else 'ies'}, {time.shape[-1] if time.ndim else 1} frames "
+            f"in {time.max(initial=0):.2f} s; {', '.join(f'{count} {name}' for name, count in counts)}; "
+            f"{moving} not settled at the end)"
+        )
 
 
 class _Worlds(NamedTuple):
@@ -110,13 +134,42 @@ def _roll(worlds: _Worlds, model: mjx.Model, data: mjx.Data) -> tuple[State, Rec
 _rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
 
 
-def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
-    if num < 1:
-        raise ValueError(f"num is {num}; at least one trajectory of each body is needed")
+@contextlib.contextmanager
+def _reported(progress: Any, count: int) -> Iterator[Callable[[int], object]]:
+    """The function to call with the number of trajectories done: the caller's, a bar's, or one that does nothing."""
+    if callable(progress):
+        yield progress
+        return
+    if not isinstance(progress, bool):
+        raise TypeError(f"progress is {progress!r}; it takes True, False or a function of the number done")
+    with tqdm(total=count, desc="simulate: compiling", unit=" trajectories", disable=not progress) as bar:
+
+        def show(done: int) -> None:
+            bar.set_description("simulate", refresh=False)
+            bar.update(done - bar.n)
+
+        yield show
+
+
+def _check(bodies: Sequence[Any], sensor: Any, scenario: Any, num: Any, chunk: Any) -> None:
+    """Raise an error for any argument that `simulate` cannot take, of whatever kind it is."""
+    for name, count in (("num", num), ("chunk", chunk)):
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        if not whole or count < 1:
+            raise ValueError(f"{name} is {count!r}; it takes a whole number of trajectories, at least 1")
     if not bodies:
         raise ValueError("no body was given; pass one Body or a sequence of them")
+    if not isinstance(sensor, Sensor):
+        raise TypeError(f"sensor is {sensor!r}; it takes a Sensor, for instance sts.Sensor()")
+    if not hasattr(scenario, "check"):
+        raise TypeError(f"scenario is {scenario!r}; it takes Freefall(), Inclined() or Perturbed()")
     scenario.check()
     for i, body in enumerate(bodies):
+        if not isinstance(body, Body):
+            raise TypeError(
+                f"body {i} is {body!r}; it takes a Body or a sequence of them: objects.make draws one, objects.load "
+                "reads a mesh file"
+            )
         known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
         if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
             raise BodyError(
@@ -128,6 +181,10 @@ def _check(bodies: Sequence[Body], scenario: Scenario, num: int) -> None:
             raise BodyError(i, "hulls has a non-finite vertex")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
             raise BodyError(i, f"shell_mass is {body.shell_mass} kg; it must be positive and finite: give load a mass")
+        try:
+            body.check()
+        except ValueError as error:
+            raise BodyError(i, str(error)) from error
 
 
 def refusal(body: Body, scenario: Scenario) -> str | None:
@@ -231,7 +288,7 @@ def simulate(
     num: int = 1,
     *,
     hidden: Hidden | None = None,
-    progress: Callable[[int], object] | None = None,
+    progress: bool | Callable[[int], object] = False,
     chunk: int = 32,
 ) -> Trajectory:
     """Simulates `num` trajectories of each body: random start, hidden values, contact with the pad.
@@ -247,7 +304,9 @@ def simulate(
         num: trajectories of each body.
         hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major: rolls the starts of `key` with these instead
             of drawn ones; where `resampled` is not 0 the start is another one.
-        progress: called with the number of trajectories done so far, after each chunk.
+        progress: True shows a bar on standard error, or in a notebook: the first call compiles for tens of seconds
+            before its first chunk is done. A function is called with the number of trajectories done so far, after
+            each chunk.
         chunk: trajectories that MJX steps at once; another number compiles anew and rounds
             differently. Larger ones suit a GPU.
 
@@ -258,9 +317,10 @@ def simulate(
         BodyError: a ValueError: a body that cannot start as the scenario asks, has bad values, or a trajectory of which
             fails in every attempt.
         ValueError: another argument out of range, named.
+        TypeError: an argument that is no body, sensor or scenario.
     """
-    bodies = [body] if isinstance(body, Body) else list(body)
-    _check(bodies, scenario, num)
+    bodies = list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
+    _check(bodies, sensor, scenario, num, chunk)
     count = len(bodies) * num
     given = None if hidden is None else _check_hidden(hidden, count)
     pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
@@ -286,29 +346,30 @@ def simulate(
     attempt = np.zeros(count, np.int32)
     pending = np.arange(count)
     rows: dict[int, tuple[State, Record]] = {}
-    while len(pending):
-        starts, drawn = _draw(key, which, nth, attempt, shapes, scenario=scenario, pad=pad)
-        drawn = drawn if given is None else given
-        fields = _draws(bodies, which, drawn, pad, scenario.contact, scenario.wall)
-        by_size = [pending[sizes[which[pending]] == size] for size in np.unique(sizes)]
-        chunks = [c for part in by_size for c in np.split(part, range(chunk, len(part), chunk)) if len(c)]
-        with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
-            results = pool.map(functools.partial(run, starts, fields), chunks)
-            for indices, result in zip(chunks, results, strict=True):
-                for row, i in enumerate(indices.tolist()):
-                    rows[i] = jax.tree.map(lambda x, row=row: x[row], result)
-                if progress is not None:
-                    progress(len(rows))
-        ok = np.array([bool(row[0].finite and row[0].sunk <= SUNK_LIMIT) for row in (rows[i] for i in range(count))])
-        pending = np.flatnonzero(~ok)
-        attempt[pending] += 1
-        if attempt.max() >= ATTEMPTS:
-            worst = int(attempt.argmax())
-            raise BodyError(
-                int(which[worst]),
-                f"trajectory {nth[worst]} is non-finite or sunken deeper than {SUNK_LIMIT} m in {ATTEMPTS} draws; is "
-                "its hull too thin or its mass out of scale?",
-            )
+    with _reported(progress, count) as report:
+        while len(pending):
+            starts, drawn = _draw(key, which, nth, attempt, shapes, scenario=scenario, pad=pad)
+            drawn = drawn if given is None else given
+            fields = _draws(bodies, which, drawn, pad, scenario.contact, scenario.wall)
+            by_size = [pending[sizes[which[pending]] == size] for size in np.unique(sizes)]
+            chunks = [c for part in by_size for c in np.split(part, range(chunk, len(part), chunk)) if len(c)]
+            with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
+                results = pool.map(functools.partial(run, starts, fields), chunks)
+                for indices, result in zip(chunks, results, strict=True):
+                    for row, i in enumerate(indices.tolist()):
+                        rows[i] = jax.tree.map(lambda x, row=row: x[row], result)
+                    report(len(rows))
+            states = [rows[i][0] for i in range(count)]
+            ok = np.array([bool(state.finite and state.sunk <= SUNK_LIMIT) for state in states])
+            pending = np.flatnonzero(~ok)
+            attempt[pending] += 1
+            if attempt.max() >= ATTEMPTS:
+                worst = int(attempt.argmax())
+                raise BodyError(
+                    int(which[worst]),
+                    f"trajectory {nth[worst]} is non-finite or sunken deeper than {SUNK_LIMIT} m in {ATTEMPTS} draws; "
+                    "is its hull too thin or its mass out of scale?",
+                )
 
     last, records = jax.tree.map(lambda *x: jnp.stack(x), *(rows[i] for i in range(count)))
     frozen_or_slow = last.gone | (last.slow * scenario.contact.timestep >= SLOW_TIME)

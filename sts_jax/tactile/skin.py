@@ -39,17 +39,23 @@ class Lights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Leds:
-    """Near lights: points that light the skin from where they are. All constants are ours."""
+    """Near lights: points that light the skin from where they are. All constants are ours.
 
-    # m, sensor frame: 5 mm beyond the pad's left, right, top and bottom edge, 5 mm under the gel
+    By default they shine at a grazing angle into the pad's edges, as bright as the camera's range allows: on the empty
+    pad no pixel is at the end of the range. Each side of the pad has its colour, and so have the flanks that face it.
+    """
+
+    # m, sensor frame: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm under the gel's face
     positions: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[-0.08, 0, -0.01], [0.08, 0, -0.01], [0, -0.08, -0.01], [0, 0.08, -0.01]])
+        default_factory=lambda: jnp.array(
+            [[-0.105, 0, -0.003], [0.105, 0, -0.003], [0, -0.105, -0.003], [0, 0.105, -0.003]]
+        )
     )
     # intensity per channel at the reference distance, diffuse and specular alike
     colors: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+        default_factory=lambda: jnp.array([[0.7, 0, 0], [0, 0.7, 0], [0, 0, 0.7], [0.7, 0.7, 0.7]])
     )
-    falloff: Scalar = 2.0  # power of the distance by which light falls off; 2: a point in the open, 0: none
+    falloff: Scalar = 1.0  # power of the distance by which light falls off; 2: a point, 1: a long strip, 0: none
     reference: Scalar = 0.08  # m, distance at which a light has its colour
 
 

@@ -1,0 +1,183 @@
+"""A body at rest on the flat pad: its stable faces, its pose, and the wrench that carries its weight."""
+
+import math
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, ScalarLike
+
+from sts_jax import geometry, objects
+from sts_jax.objects import Body
+from sts_jax.physics.scenarios import STANDING, G
+from sts_jax.sensor import Sensor
+
+UPRIGHT = math.radians(1)  # a body that stands leans less
+
+
+class StableFaces(NamedTuple):
+    """The faces of a body's convex hull that it can rest on, the most likely first."""
+
+    up: Float[np.ndarray, "k 3"]  # unit vectors in the mesh frame that point up while the body rests on the face
+    share: Float[np.ndarray, "k"]  # of the solid angle, see `objects.rest_poses`
+
+
+class Placement(NamedTuple):
+    """Where a body lies and the force that carries it: the arguments of `sense`."""
+
+    pose: Float[Array, "7"]  # m and quaternion, w >= 0: the mesh frame in the sensor frame
+    wrench: Float[Array, "6"]  # N and N m about the sensor's origin: what the pad exerts on the body
+
+
+def stable_faces(
+    body: Body,
+    *,
+    fill: float = 0.5,
+    shell_scale: float = 1.0,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> StableFaces:
+    """The faces that a body rests on: its centre of mass lies over the face. Runs on the host, not under `jit`.
+
+    Args:
+        body: one body.
+        fill, shell_scale, up: of its contents and its shell, see `objects.rigid`.
+
+    Returns:
+        The faces, none for a body that rests on nothing.
+
+    Raises:
+        ValueError: a value of the body is not finite, or its hull spans no volume.
+    """
+    body.check()
+    com = np.asarray(objects.rigid(body, fill, shell_scale, up)[1], np.float64)
+    points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
+    if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
+        raise ValueError("hulls spans no volume: a body needs at least four points that do")
+    ups, shares = objects.rest_poses(points, com)
+    order = np.argsort(-shares, kind="stable")
+    return StableFaces(ups[order], shares[order])
+
+
+def weight(
+    body: Body,
+    pose: Float[Array | np.ndarray, "7"],
+    *,
+    fill: ScalarLike = 0.5,
+    shell_scale: ScalarLike = 1.0,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> Float[Array, "6"]:
+    """The wrench that carries a body's weight on the flat pad, whatever its pose.
+
+    With the mass m and the centre of mass c in the sensor frame, the force is (0, 0, m g), and its moment about the
+    sensor's origin is c x (0, 0, m g) = (c_y m g, -c_x m g, 0). Without the moment the object would tilt.
+
+    Args:
+        body: one body.
+        pose: mesh frame in the sensor frame.
+        fill, shell_scale, up: of its contents and its shell, see `objects.rigid`.
+
+    Returns:
+        Force (N) and moment (N m).
+    """
+    mass, com, _ = objects.rigid(body, fill, shell_scale, up)
+    x, y, _ = geometry.transform(jnp.asarray(pose), com)
+    zero = jnp.zeros_like(mass)
+    return G * mass * jnp.stack([zero, zero, zero + 1, y, -x, zero])
+
+
+def place(
+    body: Body,
+    sensor: Sensor,
+    *,
+    face: int | Literal["upright"] = 0,
+    yaw: float = 0.0,
+    position: tuple[float, float] = (0.0, 0.0),
+    fill: float = 0.5,
+    shell_scale: float = 1.0,
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0),
+) -> Placement:
+    """Lay a body on the flat pad at rest on one of its stable faces, under its own weight.
+
+    The body sinks in by 0.01 mm, as deep as the physics' contact lets it: a simulation that starts there stays there.
+    The gel's indentation is much deeper and is found by `sense` from the wrench. Runs on the host, not under `jit`.
+
+    Args:
+        body: one body.
+        sensor: `sensor.gel.size` is the pad.
+        face: which of its `stable_faces`, 0 is the most likely one; or "upright": its +z points up.
+        yaw: rad, about the vertical. At 0, a body that lies has its +z towards the image's top, and one that stands,
+            upright or upside down, its -y.
+        position: m, x and y of the mesh frame's origin, which is `pose[:2]`.
+        fill: share of the interior's volume that is filled, 0 to 1.
+        shell_scale: factor on the shell's mass.
+        up: unit vector in the mesh frame; the contents have settled against it. They stay there when the body is laid.
+
+    Returns:
+        Pose and wrench.
+
+    Raises:
+        ValueError: there is no such face, or the body rests on none; the centre of mass does not lie over the pad; an
+            argument is out of range or not finite.
+    """
+    _check_numbers(yaw, position, fill, shell_scale, up)
+    faces = stable_faces(body, fill=fill, shell_scale=shell_scale, up=up)
+    above = faces.up[_index(faces, face)]
+    ahead = np.array([0.0, 0, 1]) if abs(above[2]) < 0.7 else np.array([0.0, -1, 0])
+    y = above @ ahead * above - ahead
+    y /= np.linalg.norm(y)
+    across, along = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[across, -along, 0], [along, across, 0], [0, 0, 1]]) @ np.stack([np.cross(y, above), y, above])
+    lowest = np.min(np.asarray(body.hulls, np.float64).reshape(-1, 3) @ turn[2])
+    quat = np.asarray(geometry.quat_from_matrix(jnp.asarray(turn, jnp.float32)))
+    pose = jnp.asarray([*position, -STANDING - lowest, *quat], jnp.float32)
+    wrench = weight(body, pose, fill=fill, shell_scale=shell_scale, up=up)
+    com = np.array([-wrench[4], wrench[3]]) / float(wrench[2])
+    half = np.asarray(sensor.gel.size) / 2
+    if not (np.abs(com) < half).all():
+        raise ValueError(
+            f"position is {position} m, so the centre of mass lies at ({com[0]:.3f}, {com[1]:.3f}) m, beyond the pad, "
+            f"and the body would fall off; |x| must be below {half[0]:g} m and |y| below {half[1]:g} m"
+        )
+    return Placement(pose, wrench)
+
+
+def _index(faces: StableFaces, face: int | str) -> int:
+    count = len(faces.up)
+    if not count:
+        raise ValueError(
+            "the body rests on no face: its centre of mass lies outside its hull, or less than 0.5 mm inside the edge "
+            "of every face; give sense a pose of your own"
+        )
+    numbered = f"it rests on {count} faces, 0 (the most likely) to {count - 1}" if count > 1 else "it rests on face 0"
+    if isinstance(face, str):
+        if face != "upright":
+            raise ValueError(f"face is {face!r}; it takes a number or 'upright': {numbered}")
+        best = int(np.argmax(faces.up[:, 2]))
+        if faces.up[best, 2] < math.cos(UPRIGHT):
+            raise ValueError(f"face is 'upright', but the body does not stand with its +z up: {numbered}")
+        return best
+    if isinstance(face, bool) or not isinstance(face, int | np.integer) or not 0 <= face < count:
+        raise ValueError(f"face is {face!r}: {numbered}")
+    return int(face)
+
+
+def _check_numbers(
+    yaw: float,
+    position: tuple[float, float],
+    fill: float,
+    shell_scale: float,
+    up: tuple[float, float, float],
+) -> None:
+    given = {"yaw": (yaw, ()), "position": (position, (2,)), "fill": (fill, ()), "shell_scale": (shell_scale, ())}
+    for name, (value, shape) in (given | {"up": (up, (3,))}).items():
+        array = np.asarray(value)
+        if array.shape != shape or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+            wanted = "one finite number" if shape == () else f"{shape[0]} finite numbers"
+            raise ValueError(f"{name} is {value!r}; it takes {wanted}")
+    if not 0 <= fill <= 1:
+        raise ValueError(f"fill is {fill}; it is a share of the interior's volume, from 0 to 1")
+    if not shell_scale > 0:
+        raise ValueError(f"shell_scale is {shell_scale}; it must be above 0")
+    length = float(np.linalg.norm(np.asarray(up, float)))
+    if abs(length - 1) > 1e-3:
+        raise ValueError(f"up is {up!r}, of length {length:.3g}; it must be a unit vector")

@@ -1,0 +1,65 @@
+"""An output path that cannot be written is found before any work."""
+
+import tempfile
+
+import pytest
+
+import sts_jax as sts
+from experiments import fit, objects, output, sense, show
+
+
+def forbidden(*_, **__):
+    raise PermissionError(13, "Permission denied")
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    def work(*_, **__):
+        raise AssertionError("an object was made before the output path was checked")
+
+    monkeypatch.setattr(sts.objects, "make", work)
+    monkeypatch.setattr(show.dataset, "make_bodies", work)
+
+
+MAINS = {
+    "sense": lambda out: sense.main(sense.Config("bottle", out=out)),
+    "fit": lambda out: fit.main(fit.Config("bottle", out=out)),
+    "objects": lambda out: objects.main(objects.Config(out=out)),
+}
+
+
+@pytest.mark.parametrize("name", MAINS)
+@pytest.mark.usefixtures("no_work")
+def test_a_picture_that_cannot_be_written_is_named_before_any_work(name, tmp_path, monkeypatch):
+    for path, kind, message in (
+        (tmp_path, IsADirectoryError, "is a folder; give the name of a picture"),
+        (tmp_path / "nowhere" / "a.png", FileNotFoundError, r"nowhere: no such folder for a\.png: make it"),
+        (tmp_path / "a.xyz", ValueError, r"its suffix is '\.xyz'; it must be one of \.png"),
+    ):
+        with pytest.raises(kind, match=message):
+            MAINS[name](path)
+    monkeypatch.setattr(tempfile, "TemporaryFile", forbidden)  # whoever runs the tests may write everywhere
+    with pytest.raises(PermissionError, match=r"cannot be written to \(Permission denied\): give another --out"):
+        MAINS[name](tmp_path / "a.png")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("no_work")
+def test_a_folder_that_cannot_be_written_is_named_before_any_work(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "inner"):
+        with pytest.raises(OSError, match=r"cannot be made \(.*\): give another --out"):
+            show.main(show.Config("perturbed", out=path))
+    monkeypatch.setattr(tempfile, "TemporaryFile", forbidden)
+    with pytest.raises(PermissionError, match=r"cannot be written to \(Permission denied\)"):
+        show.main(show.Config("perturbed", out=tmp_path / "new"))
+
+
+def test_a_path_that_can_be_written_leaves_no_trace(tmp_path):
+    output.check_picture(tmp_path / "a.PNG")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "old.jpg").write_bytes(b"old")
+    output.check_picture(tmp_path / "old.jpg")
+    assert (tmp_path / "old.jpg").read_bytes() == b"old"
+    output.make_folder(tmp_path / "a" / "b")
+    assert not list((tmp_path / "a" / "b").iterdir())
