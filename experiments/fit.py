@@ -12,7 +12,6 @@ and draws the target, the first start, where it ended and every start's way. To 
 
 import dataclasses
 import functools
-import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -26,7 +25,7 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments import sense
+from experiments import errors, sense
 from sts_jax import tactile
 
 # m, of the Gaussian that images are compared under: first as far as the tips of what is 12 cm long move in 10 degrees
@@ -243,7 +242,5 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     sts.enable_compilation_cache()
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
-    try:
+    with errors.on_one_line():
         main(tyro.cli(Config, description=__doc__))
-    except (OSError, ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")

@@ -9,7 +9,6 @@ off the surface; `--parts` makes convex parts first of what a hull fits badly (s
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +19,7 @@ import tyro
 from matplotlib import pyplot
 
 import sts_jax as sts
-from experiments import output
+from experiments import errors, output
 from sts_jax import optics
 
 DISTANCE = 0.42  # m, from the photographer to the object
@@ -115,7 +114,5 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
+    with errors.on_one_line():
         main(tyro.cli(Config))
-    except (OSError, ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")

@@ -12,7 +12,6 @@ it sinks in.
 import dataclasses
 import functools
 import math
-import sys
 import time
 import warnings
 from pathlib import Path
@@ -27,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
-from experiments import output
+from experiments import errors, output
 from sts_jax import tactile
 
 G = 9.81  # m/s^2
@@ -254,7 +253,5 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     sts.enable_compilation_cache()
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
-    try:
+    with errors.on_one_line():
         main(tyro.cli(Config, description=__doc__))
-    except (OSError, ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")

@@ -6,7 +6,6 @@ Writes OUT/SCENARIO-NUMBER.png and .gif, of the first objects of the scenario's 
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, inclined, output, perturbed, pictures
+from experiments import errors, freefall, inclined, output, perturbed, pictures
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {
@@ -79,7 +78,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     sts.enable_compilation_cache()
-    try:
+    with errors.on_one_line():
         main(tyro.cli(Config, description=__doc__))
-    except (OSError, ValueError, ImportError) as error:
-        sys.exit(f"error: {error}")

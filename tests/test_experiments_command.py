@@ -4,13 +4,12 @@ import dataclasses
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import trimesh
 
 import sts_jax as sts
 from experiments import command, errors, freefall, inclined, perturbed, pictures, results, stages
-from sts_jax import _files, compilation, dataset, evaluation, physics
+from sts_jax import _files, compilation, dataset, physics
 
 BOTTLES = ("bottle",)
 
@@ -191,7 +190,6 @@ def test_what_is_refused_is_one_line(refused, tmp_path):
     [
         (lambda: command.configure(freefall.SMOKE, None), AttributeError),
         (lambda: pictures.describe("cup", {}, {}), KeyError),
-        (lambda: evaluation.emptiness(np.zeros((2, 3, 3, 3)), np.zeros((4, 4, 3))), ValueError),  # of NumPy
     ],
 )
 def test_a_fault_of_the_program_keeps_its_traceback(fault, kind):
