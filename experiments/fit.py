@@ -25,7 +25,8 @@ import tyro
 from matplotlib.figure import Figure
 
 import sts_jax as sts
-from experiments import errors, sense
+from experiments import sense
+from experiments.errors import on_one_line
 from sts_jax import tactile
 
 # m, of the Gaussian that images are compared under: first as far as the tips of what is 12 cm long move in 10 degrees
@@ -242,5 +243,5 @@ def main(config: Config) -> None:
 if __name__ == "__main__":
     sts.enable_compilation_cache()
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
-    with errors.on_one_line():
+    with on_one_line():
         main(tyro.cli(Config, description=__doc__))
