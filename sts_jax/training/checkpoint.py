@@ -122,7 +122,7 @@ def read(path: Path, like: State) -> State:
             f"optimiser's state that training needs ({type(error).__name__}: {_first_line(error)}); give another "
             "folder, or delete this one and train again."
         ) from None
-    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in abstract])
+    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
 
 def seal(folder: Path) -> None:

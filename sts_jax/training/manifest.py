@@ -6,7 +6,7 @@ the older checkpoint is deleted. A kill at any moment leaves a manifest whose fi
 """
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from sts_jax import _files
 
@@ -37,15 +37,9 @@ def read(folder: Path) -> Manifest | None:
     if not path.exists():
         return None
     content = _files.read_json(path, remedy)
-    step, files = (content.get("step"), content.get("files")) if isinstance(content, dict) else (None, None)
-    if (
-        not (step is None or type(step) is int)
-        or not isinstance(files, dict)
-        or not all(isinstance(digest, str) for digest in files.values())
-        or content.get("format") != _FORMAT
-    ):
+    if not _is_manifest(content):
         raise _files.TornFileError(f"{path} is damaged, or of another version of sts_jax; {remedy}.")
-    return Manifest(step, files)
+    return Manifest(content["step"], content["files"])
 
 
 def write(folder: Path, step: int | None) -> Manifest:
@@ -100,6 +94,20 @@ def verify(folder: Path, manifest: Manifest) -> None:
                 f"{path} is not the file that {NAME} lists (its SHA-256 differs): it was edited, exchanged or damaged; "
                 f"{remedy}{again}."
             )
+
+
+def _is_manifest(content: Any) -> bool:
+    """Whether the content has the fields of a manifest, and lists files of its own checkpoint alone."""
+    if not isinstance(content, dict) or content.keys() != {"format", "step", "files"} or content["format"] != _FORMAT:
+        return False
+    step, files = content["step"], content["files"]
+    if type(step) not in (int, type(None)) or not isinstance(files, dict):
+        return False
+    of_checkpoint = [name for name in files if name not in _BESIDE]
+    if step is None:
+        return not of_checkpoint
+    prefix = checkpoint(Path(), step).as_posix() + "/"
+    return bool(of_checkpoint) and all(name.startswith(prefix) for name in of_checkpoint)
 
 
 def _there(folder: Path, step: int | None) -> list[str]:
