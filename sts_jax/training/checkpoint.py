@@ -5,7 +5,10 @@ A model's folder holds `config.json` (the model, the run and the caller's prepro
 (`sts_jax.training.manifest`). A kill while a checkpoint is written leaves the one before.
 """
 
+import contextlib
+import logging
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -54,7 +57,8 @@ def save(folder: Path, state: TrainState | Weights) -> None:
         _keep_only(folder, kept)  # a kill may have left a checkpoint that the manifest does not name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            ocp.save(str(path.absolute()), _plain(state))
+            with _quiet_orbax():
+                ocp.save(str(path.absolute()), _plain(state))
         except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
             left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
@@ -109,12 +113,13 @@ def read(path: Path, like: State) -> State:
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     try:
-        there = ocp.metadata(str(path.absolute())).metadata
+        with _quiet_orbax():
+            there = ocp.metadata(str(path.absolute())).metadata
         # Compared first: Orbax cuts or pads arrays of another shape, or prints thousands of lines.
         for name, x in abstract.items():
             if name not in there or (there[name].shape, there[name].dtype) != (x.shape, x.dtype):
                 raise ValueError(f"{name} is missing or has another shape")
-        with context:
+        with context, _quiet_orbax():
             loaded = ocp.load(str(path.absolute()), abstract)
     except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
         raise ValueError(
@@ -163,9 +168,20 @@ def _keep_only(folder: Path, step: int | None) -> None:
             shutil.rmtree(path, ignore_errors=True)  # one that stays does no harm: the manifest does not name it
 
 
+@contextlib.contextmanager
+def _quiet_orbax() -> Iterator[None]:
+    """Orbax logs the traces of all its threads before it raises their error: 237 lines for a full disk."""
+    logger = logging.getLogger("absl")
+    disabled, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = disabled
+
+
 def _first_line(error: Exception) -> str:
     lines = str(error).splitlines() or [type(error).__name__]
-    return lines[0][:200]
+    return lines[0][:500]
 
 
 def _plain(state: TrainState | Weights) -> dict[str, Any]:
