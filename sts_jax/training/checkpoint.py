@@ -170,7 +170,10 @@ def _keep_only(folder: Path, step: int | None) -> None:
 
 @contextlib.contextmanager
 def _quiet_orbax() -> Iterator[None]:
-    """Orbax logs the traces of all its threads before it raises their error: 237 lines for a full disk."""
+    """Silence the log in which Orbax prints its threads' traces before it raises their error.
+
+    For a full disk these are 237 lines. A thread that fails after the error was raised still logs its own.
+    """
     logger = logging.getLogger("absl")
     disabled, logger.disabled = logger.disabled, True
     try:
