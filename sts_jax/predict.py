@@ -1,9 +1,12 @@
 """A trained model as one function: from any of vision, touch and pose to what the sensor will see at rest."""
 
+import dataclasses
 import functools
 import math
+import operator
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +14,12 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from sts_jax import mvae, training
+from sts_jax import _files, mvae, training
 
 MODALITIES = ("visual", "tactile", "pose")
+_QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
+_FARTHEST = 10.0  # m, of a position: beyond it the numbers are no metres
+_LARGEST_CONDITION = 100.0  # in units of the condition's usual size
 
 
 class Prediction(NamedTuple):
@@ -25,6 +31,13 @@ class Prediction(NamedTuple):
     mean: Float[Array, "*n latent"]  # of the fused posterior
     log_var: Float[Array, "*n latent"]
     samples: "Prediction | None" = None  # the same with a leading axis of samples, each from its own latent
+
+    def __repr__(self) -> str:
+        shapes = (
+            f"{name}={leaf.dtype}{list(leaf.shape)}" if isinstance(leaf, jax.Array | np.ndarray) else f"{name}={leaf!r}"
+            for name, leaf in zip(self._fields, self, strict=True)
+        )
+        return f"Prediction({', '.join(shapes)})"
 
 
 @functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
@@ -94,21 +107,31 @@ def predict(
 
 
 class Predictor:
-    """A checkpoint that is called: `predictor(visual=image)` gives a `Prediction`."""
+    """A trained model as a function: `predictor(visual=image)` gives a `Prediction`.
 
-    def __init__(self, model: training.Model, preprocessing: training.Preprocessing, blank: np.ndarray, name: str):
+    It is pure, and works inside `jax.jit`, `jax.vmap` and `jax.grad`.
+    """
+
+    def __init__(
+        self,
+        model: training.Model,
+        preprocessing: training.Preprocessing,
+        blank: tuple[np.ndarray, np.ndarray],
+        name: str,
+    ):
         """Use `Predictor.load`.
 
         Args:
             model: Definition, parameters and running statistics.
-            preprocessing: What it was trained on.
-            blank: The tactile image of the untouched sensor, [0, 1] `(height, width, 3)`.
+            preprocessing: The preprocessing of its training.
+            blank: The visual and the tactile image of the untouched sensor, `uint8 (height, width, 3)`.
             name: The model's folder, for messages.
         """
         self.model = model
         self.preprocessing = preprocessing
         self.name = name
-        self._blank = jnp.asarray(blank)
+        self._images = blank
+        self._blank = jnp.asarray(blank[1].astype(np.float32) / 255)
 
     @classmethod
     def load(
@@ -121,25 +144,61 @@ class Predictor:
         """Read a model's folder, such as `runs/freefall/models/mvae`.
 
         Args:
-            folder: Where training left it.
+            folder: The `workdir` of a training, or the folder of `save`.
             resolution: The images that will be given; refused if the model was trained on another.
             crop: The view that will be given (True: the square around the object); refused likewise.
 
         Raises:
             FileNotFoundError: There is no model in the folder.
-            ValueError: The checkpoint is torn, or was trained on another view.
+            OSError: A file is damaged, missing or not listed in `manifest.json`.
+            ValueError: The model was trained on another view, by another version of sts_jax, or has no manifest.
         """
         model = training.load(folder)
-        preprocessing = training.preprocessing_from_json(model.settings["preprocessing"])
-        for field, asked in (("resolution", resolution), ("crop", crop)):
+        try:
+            preprocessing = training.preprocessing_from_json(model.settings.get("preprocessing", {}))
+        except ValueError as error:
+            raise ValueError(f"{Path(folder) / 'config.json'}, preprocessing: {error}") from error
+        for field, asked in (("resolution", resolution and tuple(resolution)), ("crop", crop)):
             there = getattr(preprocessing, field)
             if asked is not None and asked != there:
                 raise ValueError(
                     f"{folder} was trained on {field}={there}, asked for is {field}={asked}: "
                     "render that view, or train a model on this one."
                 )
-        _, tactile = training.load_blank(Path(folder))
-        return cls(model, preprocessing, tactile.astype(np.float32) / 255, str(folder))
+        blank = training.load_blank(Path(folder))
+        if any(image.shape[:2] != preprocessing.resolution for image in blank):
+            raise ValueError(
+                f"{Path(folder) / 'blank.npz'} has images of {blank[0].shape[:2]}, the model takes "
+                f"{preprocessing.resolution}: it is of another model; delete {folder} and train again."
+            )
+        return cls(model, preprocessing, blank, str(folder))
+
+    def save(self, folder: str | Path) -> None:
+        """Write a folder that `load` reads. Training cannot go on from it: it lacks the optimiser's state.
+
+        Args:
+            folder: A new or an empty folder.
+
+        Raises:
+            FileExistsError: The folder is not empty.
+            OSError: The disk is full or the folder is not writable.
+        """
+        folder = Path(folder)
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise FileExistsError(f"{folder} is not an empty folder; give the name of a new one.")
+        settings = {**self.model.settings, "preprocessing": dataclasses.asdict(self.preprocessing)}
+        params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
+        training.save_blank(folder, *self._images)
+        _files.write_json(folder / "config.json", settings)
+        training.save(folder, training.Weights(params, stats, jnp.int32(self.model.step)))
+
+    def __repr__(self) -> str:
+        config, view = self.model.config, self.preprocessing
+        return (
+            f"Predictor({self.name!r}: takes {', '.join(self.modalities) or 'nothing'}; predicts "
+            f"{', '.join(config.names)}; resolution={view.resolution}, crop={view.crop}, condition={config.condition}, "
+            f"latent={config.latent}, steps={self.model.step})"
+        )
 
     def __call__(
         self,
@@ -154,19 +213,22 @@ class Predictor:
     ) -> Prediction:
         """Predict the last moment from any non-empty subset of the first one's modalities.
 
+        Values that are traced by `jax.jit`, `jax.vmap` or `jax.grad` cannot be refused. There, an item whose values
+        would raise an error outside gives a prediction of NaN, and the other items are not affected.
+
         Args:
             visual: `(*n, height, width, 3)` in [0, 1], any leading axes, the same for all that is given.
             tactile: `(*n, height, width, 3)` in [0, 1]; items without contact are ignored.
             pose: `(*n, 7)` m and unit quaternion, mesh frame in the sensor frame.
-            condition: `(*n, c)`, the scenario's input in SI units, for models that have one. Of a jerk: acceleration of
-                the pad along x and y (m/s^2) and its duration (s).
+            condition: `(*n, c)`, the scenario's input in SI units, for models that have one. For a jerk: acceleration
+                of the pad along x and y (m/s^2) and its duration (s).
             present: By name, which items of a modality count, bool `(*n,)`; what does not count may be NaN.
             key: For `num_samples`; consumed.
             num_samples: Draw this many predictions from the posterior besides that of its mean.
 
         Raises:
             ValueError: Nothing given, a modality the model does not have or was never given in training, a wrong
-                shape, a value out of range, NaN. The message names it and what to do.
+                type or shape, a value out of range, NaN. The message names it and the remedy.
         """
         given = {
             name: value for name, value in zip(MODALITIES, (visual, tactile, pose), strict=True) if value is not None
@@ -178,19 +240,21 @@ class Predictor:
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
             raise ValueError(f"the leading axes differ: {leads}; give the same number of items of each modality.")
-        masks = {name: np.asarray(mask, bool) for name, mask in (present or {}).items()}
-        for name, mask in masks.items():
-            if name not in arrays or mask.shape != lead:
-                raise ValueError(
-                    f"present[{name!r}] has shape {mask.shape}; it must mask a given modality, one of "
-                    f"{list(arrays)}, with shape {lead}."
-                )
+        masks = _checked_masks(present, arrays, lead)
+        valid: Array | None = None  # items to be believed, (*n,); None while no value is traced
         for name, array in arrays.items():
-            self._check_values(name, array[masks[name]] if name in masks else array)
-        condition = self._checked_condition(condition, lead)
-        if num_samples < 0 or (num_samples > 0 and key is None):
-            raise ValueError(f"num_samples={num_samples} needs a key and a number that is not negative.")
-        return predict(
+            mask = masks.get(name)
+            if _traced(array) or _traced(mask):
+                fine = _plausible(name, jnp.asarray(array))
+                fine = fine if mask is None else fine | ~mask
+                valid = fine if valid is None else valid & fine
+            else:
+                _check_values(name, np.asarray(array if mask is None else array[mask]))
+        condition, plausible = self._checked_condition(condition, lead)
+        if plausible is not None:
+            valid = plausible if valid is None else valid & plausible
+        num_samples = _checked_samples(num_samples, key)
+        result = predict(
             self.model.graphdef,
             self.model.state,
             self.preprocessing,
@@ -201,25 +265,37 @@ class Predictor:
             key if num_samples else None,
             num_samples,
         )
+        return result if valid is None else _flagged(result, valid)
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
-        """What the model expects with no measurement given: the mean of the prior, for items of any leading `shape`.
+        """The prediction without any measurement: the mean of the prior, for items of any leading `shape`.
 
         Args:
-            shape: Of the items.
+            shape: Leading axes of the items.
             condition: `(*shape, c)`, as in a call.
+
+        Raises:
+            ValueError: A size is no positive whole number, or the condition is missing, superfluous or out of range.
         """
-        condition = self._checked_condition(condition, shape)
-        return predict(
+        try:
+            shape = tuple(operator.index(size) for size in shape)
+        except TypeError:
+            raise ValueError(f"shape is {shape!r}; give a tuple of whole numbers, such as (3,).") from None
+        if min(shape, default=1) < 1:
+            raise ValueError(f"shape is {shape}; each size must be at least 1.")
+        condition, plausible = self._checked_condition(condition, shape)
+        result = predict(
             self.model.graphdef, self.model.state, self.preprocessing, self._blank, {}, {}, condition, shape=shape
         )
+        return result if plausible is None else _flagged(result, plausible)
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """What this model can be given: what it has and was given in training."""
+        """The modalities that this model can be given: those it has and was given in training."""
         return tuple(name for name in self.model.config.names if name not in self.preprocessing.absent)
 
-    def _checked_name(self, name: str, value: ArrayLike) -> np.ndarray:
+    def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
+        """The value as float32, if type and shape are right; a traced one stays traced."""
         if name not in self.model.config.names:
             raise ValueError(f"{self.name} has no {name}: it was trained on {', '.join(self.model.config.names)}.")
         if name in self.preprocessing.absent:
@@ -227,8 +303,8 @@ class Predictor:
                 f"{self.name} cannot use {name}: no first moment it was trained on had any (in freefall nothing "
                 f"touches the pad yet). Leave {name}= out, or use a model of another scenario."
             )
-        array = np.asarray(value)
-        if array.dtype.kind != "f":
+        array = _checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
+        if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(
                 f"{name} is {array.dtype}; give floats" + ("." if name == "pose" else " in [0, 1] (uint8 / 255).")
             )
@@ -241,41 +317,136 @@ class Predictor:
             )
         if math.prod(array.shape) == 0:
             raise ValueError(f"{name} has shape {array.shape}: there is no item in it.")
-        return array.astype(np.float32)
+        return _float32(array)
 
-    def _checked_condition(self, value: ArrayLike | None, lead: tuple[int, ...]) -> np.ndarray | None:
+    def _checked_condition(
+        self, value: Any, lead: tuple[int, ...]
+    ) -> tuple[np.ndarray | Array | None, Bool[Array, "*n"] | None]:
+        """The condition as float32, and which items are plausible if it is traced."""
         width = self.model.config.condition
-        shape = None if value is None else np.shape(value)
+        array = None if value is None else _checked_array("condition", value, f"{width} numbers in SI units")
+        shape = None if array is None else array.shape
         if shape != (None if width == 0 else (*lead, width)):
             raise ValueError(f"condition has shape {shape}; {self.name} needs {(*lead, width) if width else 'none'}.")
-        if value is None:
-            return None
-        condition = np.asarray(value, np.float32)
+        if array is None:
+            return None, None
+        if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
+            raise ValueError(f"condition is {array.dtype}; give numbers in SI units.")
+        condition = _float32(array)
+        scale = np.array(self.preprocessing.condition_scale)
+        if _traced(condition):
+            return condition, jnp.all(jnp.abs(condition) <= _LARGEST_CONDITION * scale, axis=-1)
         if not np.isfinite(condition).all():
             raise ValueError("condition has NaN or infinite values; every item needs one.")
-        scale = np.array(self.preprocessing.condition_scale)
-        if (np.abs(condition) > 100 * scale).any():
+        if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
             raise ValueError(
                 f"condition has {np.abs(condition).reshape(-1, width).max(0).tolist()}, where {scale.tolist()} is "
                 "usual; are these SI units?"
             )
-        return condition
+        return condition, None
 
-    def _check_values(self, name: str, array: np.ndarray) -> None:
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} has NaN or infinite values; mask such items with present={{{name!r}: ...}}.")
-        if name == "pose":
-            lengths = np.linalg.norm(array[..., 3:], axis=-1)
-            if lengths.size and np.abs(lengths - 1).max() > 1e-2:
-                raise ValueError(
-                    f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}; "
-                    "give position (m) and a unit quaternion [w, x, y, z]."
-                )
-            if array.size and np.abs(array[..., :3]).max() > 10:
-                raise ValueError(
-                    f"pose has a position {np.abs(array[..., :3]).max():.3g} m away; are these millimetres?"
-                )
-        elif array.size and (array.min() < 0 or array.max() > 1):
+
+def _traced(value: object) -> bool:
+    return isinstance(value, jax.core.Tracer)
+
+
+def _checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
+    if _traced(value):
+        return value
+    if isinstance(value, str | bytes | Path):
+        raise ValueError(
+            f"{name} is {value!r}; give an array of {wanted}, not a path (for a picture: "
+            "np.asarray(PIL.Image.open(path)) / 255)."
+        )
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} is no array ({error}); give an array of {wanted}.") from error
+    if array.dtype.kind in "OUSMm":
+        raise ValueError(f"{name} is a {type(value).__name__}; give an array of {wanted}.")
+    return array
+
+
+def _float32(array: np.ndarray | Array) -> np.ndarray | Array:
+    with np.errstate(over="ignore"):  # a number beyond float32 becomes infinite, and is refused as such
+        return array.astype(np.float32)
+
+
+def _checked_masks(
+    present: Any, arrays: dict[str, np.ndarray | Array], lead: tuple[int, ...]
+) -> dict[str, np.ndarray | Array]:
+    if not isinstance(present, Mapping | None):
+        raise ValueError(f"present is a {type(present).__name__}; give a dict of bool arrays by modality.")
+    masks = {}
+    for name, value in (present or {}).items():
+        mask = _checked_array(f"present[{name!r}]", value, "bool")
+        if name not in arrays or mask.shape != lead:
             raise ValueError(
-                f"{name} has values in [{array.min():.3g}, {array.max():.3g}]; images are in [0, 1] (divide by 255?)."
+                f"present[{name!r}] has shape {mask.shape}; it must mask a given modality, one of "
+                f"{list(arrays)}, with shape {lead}."
             )
+        if mask.dtype != bool:
+            raise ValueError(f"present[{name!r}] is {mask.dtype}; give bool, True for the items that count.")
+        masks[name] = mask
+    return masks
+
+
+def _checked_samples(num_samples: Any, key: Any) -> int:
+    try:
+        number = operator.index(num_samples)
+    except TypeError:
+        raise ValueError(
+            f"num_samples={num_samples!r}; give a whole number, which cannot be an argument of a function inside "
+            "jax.jit (static_argnames makes it a constant)."
+        ) from None
+    if number < 0 or (number > 0 and key is None):
+        raise ValueError(f"num_samples={number} needs a key and a number that is not negative.")
+    if key is not None and not (
+        isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
+    ):
+        shown = f"{key.dtype} of shape {key.shape}" if isinstance(key, jax.Array | np.ndarray) else repr(key)
+        raise ValueError(f"key is {shown}; give one key, such as jax.random.key(0).")
+    return number
+
+
+def _plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
+    """Which items `_check_values` would accept."""
+    if name == "pose":
+        lengths = jnp.linalg.norm(jax.lax.stop_gradient(array[..., 3:]), axis=-1)
+        return (jnp.abs(lengths - 1) <= _QUAT_TOLERANCE) & (jnp.abs(array[..., :3]) <= _FARTHEST).all(-1)
+    return ((array >= 0) & (array <= 1)).all((-3, -2, -1))
+
+
+def _check_values(name: str, array: np.ndarray) -> None:
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has NaN or infinite values; mask such items with present={{{name!r}: ...}}.")
+    if name == "pose":
+        lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
+        if lengths.size and np.abs(lengths - 1).max() > _QUAT_TOLERANCE:
+            raise ValueError(
+                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}; "
+                "give position (m) and a unit quaternion [w, x, y, z]."
+            )
+        if array.size and np.abs(array[..., :3]).max() > _FARTHEST:
+            raise ValueError(f"pose has a position {np.abs(array[..., :3]).max():.3g} m away; are these millimetres?")
+    elif array.size and (array.min() < 0 or array.max() > 1):
+        raise ValueError(
+            f"{name} has values in [{array.min():.3g}, {array.max():.3g}]; images are in [0, 1] (divide by 255?)."
+        )
+
+
+def _flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
+    """NaN in every number of the items that are not valid."""
+
+    def flag(leaf: Array, axes: int) -> Array:
+        return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)
+
+    images, numbers = functools.partial(flag, axes=3), functools.partial(flag, axes=1)
+    return Prediction(
+        visual=jax.tree.map(images, prediction.visual),  # None stays None
+        tactile=jax.tree.map(images, prediction.tactile),
+        pose=jax.tree.map(numbers, prediction.pose),
+        mean=numbers(prediction.mean),
+        log_var=numbers(prediction.log_var),
+        samples=None if prediction.samples is None else _flagged(prediction.samples, valid),
+    )

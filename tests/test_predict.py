@@ -1,7 +1,10 @@
 """The predictor's promises: any subset, any batch shape, clear errors, one compilation a shape and subset."""
 
 import dataclasses
+import inspect
 import itertools
+import pathlib
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +16,8 @@ from sts_jax import mvae, training
 from sts_jax.predict import predict
 
 SIDE = 32
+# As its users call it: without the tests' own checks of types and shapes.
+call = inspect.unwrap(sts.Predictor.__call__)
 
 
 def train(folder, *, absent=(), condition_scale=()):
@@ -198,6 +203,9 @@ def test_a_condition_is_given_in_si_units(tmp_path):
             predictor(visual=given["visual"], condition=wrong)
     with pytest.raises(ValueError, match="condition has shape None"):
         predictor.prior()
+    traced = jax.jit(lambda condition: predictor(visual=given["visual"], condition=condition))
+    np.testing.assert_allclose(traced(condition).visual, out.visual, atol=1e-5)
+    assert np.isnan(traced(condition * np.array([[1], [1e3]])).pose).all(-1).tolist() == [False, True]
 
 
 def test_a_checkpoint_of_another_view_is_refused(folder):
@@ -211,15 +219,167 @@ def test_a_checkpoint_of_another_view_is_refused(folder):
 def test_a_missing_or_torn_model_is_named(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         sts.Predictor.load(tmp_path / "nowhere")
-    for path in folder.rglob("*"):
-        if path.is_file():
-            there = tmp_path / "torn" / path.relative_to(folder)
-            there.parent.mkdir(parents=True, exist_ok=True)
-            there.write_bytes(path.read_bytes())
-    (tmp_path / "torn" / "config.json").write_text('{"model": ')
-    with pytest.raises(ValueError, match=r"torn.*config\.json"):
-        sts.Predictor.load(tmp_path / "torn")
-    (tmp_path / "torn" / "config.json").write_bytes((folder / "config.json").read_bytes())
-    (tmp_path / "torn" / "blank.npz").write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"blank\.npz"):
-        sts.Predictor.load(tmp_path / "torn")
+    torn = shutil.copytree(folder, tmp_path / "torn")
+    (torn / "config.json").write_text('{"model": ')
+    with pytest.raises(OSError, match=r"torn.*config\.json"):
+        sts.Predictor.load(torn)
+    (torn / "config.json").write_bytes((folder / "config.json").read_bytes())
+    np.savez(
+        torn / "blank.npz", visual=np.zeros((SIDE, SIDE, 3), np.uint8), tactile=np.zeros((SIDE, SIDE, 3), np.uint8)
+    )
+    with pytest.raises(OSError, match=r"blank\.npz is not the file that manifest\.json lists"):
+        sts.Predictor.load(torn)
+
+
+def test_a_model_without_preprocessing_is_named(folder, tmp_path, monkeypatch):
+    model = training.load(folder)
+    for wrong in ({}, {"view": "pad"}, {**model.settings["preprocessing"], "resolution": 3}):
+        settings = {**model.settings, "preprocessing": wrong}
+        monkeypatch.setattr(training, "load", lambda _, settings=settings: model._replace(settings=settings))
+        with pytest.raises(ValueError, match=r"config\.json, preprocessing: .*preprocessing= to training\.train"):
+            sts.Predictor.load(folder)
+
+
+def test_a_saved_predictor_comes_back(predictor, tmp_path):
+    predictor.save(tmp_path / "copy")
+    again = sts.Predictor.load(tmp_path / "copy")
+    given = measurement(2)
+    jax.tree.map(np.testing.assert_array_equal, again(**given), predictor(**given))
+    assert repr(again) == repr(predictor).replace(predictor.name, str(tmp_path / "copy"))
+    again.save(tmp_path / "second")
+    for path in (tmp_path / "copy").glob("*.*"):
+        if path.name != "manifest.json":
+            assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes()
+    with pytest.raises(FileExistsError, match="copy is not an empty folder"):
+        predictor.save(tmp_path / "copy")
+    with pytest.raises(ValueError, match=r"saved by Predictor\.save"):
+        train(tmp_path / "copy")
+
+
+def test_reprs_fit_on_a_line(predictor, folder):
+    assert repr(predictor) == (
+        f"Predictor('{folder}': takes visual, tactile, pose; predicts visual, tactile, pose; resolution=(32, 32), "
+        "crop=False, condition=0, latent=8, steps=2)"
+    )
+    out = predictor(pose=measurement(2)["pose"])
+    assert repr(out._replace(visual=None)) == (
+        "Prediction(visual=None, tactile=float32[2, 32, 32, 3], pose=float32[2, 7], mean=float32[2, 8], "
+        "log_var=float32[2, 8], samples=None)"
+    )
+
+
+def close(a, b, atol=1e-5):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol), a, b)
+
+
+def test_jit_and_vmap_predict_the_same(predictor):
+    given, present = measurement(2), {"visual": np.array([True, False])}
+    more = {"key": jax.random.key(0), "num_samples": 5}
+    want = predictor(pose=given["pose"], **more)
+    close(jax.jit(lambda pose, key: predictor(pose=pose, key=key, num_samples=5))(given["pose"], more["key"]), want)
+    close(jax.vmap(lambda pose: predictor(pose=pose))(given["pose"]), predictor(pose=given["pose"]))
+    masked = predictor(**given, present=present)
+    close(jax.jit(lambda present: predictor(**given, present=present))(present), masked)
+
+
+def test_the_gradient_of_a_prediction_is_its_slope(predictor):
+    pose, way = measurement()["pose"], np.eye(7, dtype=np.float32)[1]
+    height = jax.jit(lambda pose: 1e3 * predictor(pose=pose).pose[2])
+    slope = jax.grad(height)(pose)[1]
+    step = 0.01
+    np.testing.assert_allclose(slope, (height(pose + step * way) - height(pose - step * way)) / (2 * step), rtol=0.02)
+    image = measurement()["visual"]
+    of_image = jax.grad(lambda image: predictor(visual=image).pose[0])(image)
+    assert np.isfinite(of_image).all()
+    assert np.abs(of_image).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("visual", lambda x: x.at[0, 3, 4, 0].set(jnp.nan)),
+        ("tactile", lambda x: x.at[0].set(jnp.nan)),  # no pixel differs from the blank gel by a comparison with NaN
+        ("visual", lambda x: x.at[0].multiply(255)),
+        ("pose", lambda x: x.at[0, 3:].multiply(2)),
+        ("pose", lambda x: x.at[0, 3:].set(0)),
+        ("pose", lambda x: x.at[0, 3].set(1e30)),
+        ("pose", lambda x: x.at[0, 0].set(40)),
+        ("pose", lambda x: x.at[0, 2].set(jnp.inf)),
+    ],
+)
+def test_a_traced_item_that_would_be_refused_gives_nan_alone(predictor, name, change):
+    given = {key: jnp.asarray(value) for key, value in measurement(2).items()}
+    want = predictor(**given)
+    wrong = {**given, name: change(given[name])}
+    out = jax.jit(lambda given: predictor(**given))(wrong)
+    for leaf, good in zip(jax.tree.leaves(out), jax.tree.leaves(want), strict=True):
+        assert np.isnan(leaf[0]).all()
+        np.testing.assert_allclose(leaf[1], good[1], atol=1e-5)
+    with pytest.raises(ValueError, match=name):
+        predictor(**wrong)
+
+
+def test_shapes_types_and_constants_are_checked_inside_jit(predictor):
+    given = measurement(2)
+    for wrong, message in (
+        ({"visual": given["visual"][:, 1:]}, "visual has shape"),
+        ({"visual": jnp.zeros((2, SIDE, SIDE, 3), jnp.uint8)}, "visual is uint8"),
+        ({**given, "pose": given["pose"][0]}, "the leading axes differ"),
+        ({**given, "present": {"pose": jnp.ones(2)}}, "bool"),
+        ({**given, "key": jnp.ones(2)}, "key is float32"),
+        ({**given, "num_samples": jnp.int32(2)}, "static_argnames"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jax.jit(lambda given: call(predictor, **given))(wrong)
+
+
+POSE = measurement()["pose"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"visual": "first.png"}, r"visual is 'first.png'; .*PIL"),
+        ({"visual": pathlib.Path("first.png")}, r"visual is PosixPath.*not a path"),
+        ({"visual": b"first.png"}, "not a path"),
+        ({"visual": {"image": 1}}, "visual is a dict"),
+        ({"visual": object()}, "visual is a object"),
+        ({"visual": [[1.0, 2.0], [3.0]]}, "visual is no array"),
+        ({"visual": True}, "visual is bool"),
+        ({"visual": 0.5}, r"visual has shape \(\)"),
+        ({"visual": np.zeros((SIDE, SIDE, 3), complex)}, "visual is complex128"),
+        ({"pose": [0, 0, 0, 1, 0, 0, 0]}, "pose is int"),
+        ({"pose": "0 0 0 1 0 0 0"}, "pose is '0 0"),
+        ({"pose": np.where(np.arange(7) == 4, 1e30, POSE).astype(np.float32)}, r"quaternion of length 1e\+30"),
+        ({"pose": np.where(np.arange(7) == 4, 1e300, POSE.astype(np.float64))}, "pose has NaN or infinite"),
+        ({"pose": np.where(np.arange(7) == 0, np.float32(np.nan), POSE)}, "pose has NaN or infinite"),
+        ({"pose": POSE, "key": 0, "num_samples": 1}, r"key is 0; give one key, such as jax.random.key\(0\)"),
+        ({"pose": POSE, "key": np.zeros(2, np.uint32), "num_samples": 1}, "key is uint32"),
+        ({"pose": POSE, "key": jax.random.split(jax.random.key(0)), "num_samples": 1}, r"of shape \(2,\)"),
+        ({"pose": POSE, "key": jax.random.key(0), "num_samples": 1.5}, r"num_samples=1\.5"),
+        ({"pose": POSE, "key": jax.random.key(0), "num_samples": "2"}, "num_samples='2'"),
+        ({"pose": POSE, "key": jax.random.key(0), "num_samples": -1}, "num_samples=-1"),
+        ({"pose": POSE, "present": [True]}, "present is a list"),
+        ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] is float64; give bool"),
+        ({"pose": POSE, "present": {"pose": "yes"}}, r"present\['pose'\] is 'yes'"),
+        ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*one of \['pose'\]"),
+        ({"pose": POSE, "condition": "fast"}, "condition is 'fast'"),
+        ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, 2, SIDE, SIDE, 3))}, "the leading axes differ"),
+        ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, SIDE, SIDE, 3))}, "the leading axes differ"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(predictor, given, message):
+    with pytest.raises(ValueError, match=message):
+        call(predictor, **given)
+
+
+@pytest.mark.parametrize("shape", [3, (0,), (-1,), (1.5,), ("two",)])
+def test_a_prior_of_no_shape_is_named(predictor, shape):
+    with pytest.raises(ValueError, match="shape is"):
+        inspect.unwrap(sts.Predictor.prior)(predictor, shape)
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, np.float64])
+def test_floats_of_any_precision_are_taken(predictor, dtype):
+    pose = np.array([0, 0, 0.5, 1, 0, 0, 0], np.float32)
+    close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))

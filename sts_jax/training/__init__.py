@@ -1,6 +1,6 @@
 """Training of `sts_jax.mvae` models: loop, schedules, checkpoints."""
 
-from sts_jax.training.checkpoint import TrainState, restore, save
+from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
 from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
 from sts_jax.training.train import Arrays, Model, TrainConfig, initial, load, optimiser, order, step, train
 
@@ -10,6 +10,7 @@ __all__ = [
     "Preprocessing",
     "TrainConfig",
     "TrainState",
+    "Weights",
     "initial",
     "load",
     "load_blank",
@@ -19,6 +20,7 @@ __all__ = [
     "restore",
     "save",
     "save_blank",
+    "seal",
     "step",
     "train",
 ]

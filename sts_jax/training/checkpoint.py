@@ -1,21 +1,24 @@
 """Training states on disk.
 
-A model's folder holds `config.json` (the model, the run and the caller's preprocessing), `metrics.jsonl` and
-`checkpoints/STEP/`, of which the newest counts. Orbax writes a checkpoint under a temporary name and renames it
-when it is complete, so a kill leaves the one before.
+A model's folder holds `config.json` (the model, the run and the caller's preprocessing), `metrics.jsonl`,
+`checkpoints/STEP/` and `manifest.json`, which names the checkpoint that counts and holds the checksums of its files
+(`sts_jax.training.manifest`). A kill while a checkpoint is written leaves the one before.
 """
 
-import json
-import os
+import contextlib
+import logging
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import optax
 from flax import nnx
 from jaxtyping import Array, Int
 from orbax.checkpoint import v1 as ocp
+
+from sts_jax.training import manifest
 
 
 class TrainState(NamedTuple):
@@ -27,18 +30,48 @@ class TrainState(NamedTuple):
     step: Int[Array, ""]  # gradient steps done
 
 
-def save(folder: Path, state: TrainState) -> None:
-    """Write `folder/checkpoints/STEP`; older ones go once it is complete."""
-    checkpoints = folder / "checkpoints"
-    checkpoints.mkdir(parents=True, exist_ok=True)
-    name = f"{int(state.step):08d}"
-    ocp.save(str(checkpoints.absolute() / name), _plain(state))
-    for old in checkpoints.iterdir():
-        if old.name != name:
-            shutil.rmtree(old)
+class Weights(NamedTuple):
+    """The part of a `TrainState` that a prediction needs."""
+
+    params: nnx.State
+    stats: nnx.State
+    step: Int[Array, ""]
 
 
-def restore(folder: Path, like: TrainState) -> TrainState | None:
+State = TypeVar("State", TrainState, Weights)
+
+
+def save(folder: Path, state: TrainState | Weights) -> None:
+    """Write `folder/checkpoints/STEP` and its checksums, then delete older checkpoints.
+
+    Raises:
+        OSError: the disk is full or the folder is not writable. The checkpoint before is still valid.
+        ValueError: the folder holds a checkpoint without a manifest.
+    """
+    before = _manifest(folder)
+    if before is None:
+        before = manifest.write(folder, None)
+    step, kept = int(state.step), before.step
+    path = manifest.checkpoint(folder, step)
+    try:
+        _keep_only(folder, kept)  # a kill may have left a checkpoint that the manifest does not name
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with _quiet_orbax():
+                ocp.save(str(path.absolute()), _plain(state))
+        except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
+            left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
+            raise OSError(
+                f"cannot write {path}: {_first_line(error)}. Free some disk space or check the permissions, then start "
+                f"again; {left}."
+            ) from None
+        manifest.write(folder, step)
+        kept = step
+    finally:
+        _keep_only(folder, kept)
+
+
+def restore(folder: Path, like: State) -> State | None:
     """The newest state in `folder`, or None where there is none yet.
 
     Args:
@@ -49,52 +82,112 @@ def restore(folder: Path, like: TrainState) -> TrainState | None:
         A state of the same structure and dtypes.
 
     Raises:
-        ValueError: the checkpoint is torn, or of another model.
+        TornFileError: a file is damaged, missing or not listed in the manifest.
+        ValueError: the checkpoint is of another model, or has no manifest.
     """
-    newest = _newest(folder)
-    if newest is None:
+    path = verified(folder)
+    return None if path is None else read(path, like)
+
+
+def verified(folder: Path) -> Path | None:
+    """The checkpoint that counts, once all files of the model match their checksums; None where there is none yet.
+
+    Raises:
+        TornFileError, ValueError: as `restore`.
+    """
+    listed = _manifest(folder)
+    if listed is None:
         return None
+    manifest.verify(folder, listed)
+    return None if listed.step is None else manifest.checkpoint(folder, listed.step)
+
+
+def read(path: Path, like: State) -> State:
+    """The arrays of a checkpoint that `like` asks for; further ones in it are not read.
+
+    Raises:
+        ValueError: it lacks one of them, or has it with another shape.
+    """
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), _plain(like))
+    context = ocp.Context()
+    context.pytree.loading.partial_load = True
     try:
-        loaded = ocp.load(str(newest.absolute()), abstract)
-    except Exception as error:  # Orbax and TensorStore raise many kinds
-        reason = (str(error).splitlines() or [""])[0]
+        with _quiet_orbax():
+            there = ocp.metadata(str(path.absolute())).metadata
+        # Compared first: Orbax cuts or pads arrays of another shape, or prints thousands of lines.
+        for name, x in abstract.items():
+            if name not in there or (there[name].shape, there[name].dtype) != (x.shape, x.dtype):
+                raise ValueError(f"{name} is missing or has another shape")
+        with context, _quiet_orbax():
+            loaded = ocp.load(str(path.absolute()), abstract)
+    except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
         raise ValueError(
-            f"{newest}: torn, or of another model ({type(error).__name__}: {reason}); delete {folder} and train again"
-        ) from error
+            f"{path} is the checkpoint of another model, or of a model saved by Predictor.save, which leaves out the "
+            f"optimiser's state that training needs ({type(error).__name__}: {_first_line(error)}); give another "
+            "folder, or delete this one and train again."
+        ) from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
 
-def read_settings(folder: Path) -> dict[str, Any] | None:
-    """What `config.json` holds, or None where there is none.
+def seal(folder: Path) -> None:
+    """Write the manifest of a model of sts_jax 0.1, which had none, from the files as they are now.
 
     Raises:
-        ValueError: the file is torn.
+        FileNotFoundError: the folder has no checkpoint.
+        ValueError: the folder has a manifest.
     """
-    path = folder / "config.json"
-    if not path.exists():
-        return None
-    try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: torn ({error}); delete {folder} and train again") from error
+    if (folder / manifest.NAME).exists():
+        raise ValueError(f"{folder} has a {manifest.NAME}: its files are verified whenever it is loaded.")
+    steps = _steps(folder)
+    if not steps:
+        raise FileNotFoundError(f"{folder} has no checkpoint; give the folder of a trained model.")
+    manifest.write(folder, max(steps))
 
 
-def write_text(path: Path, text: str) -> None:
-    """Replace a file as a whole."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+def _manifest(folder: Path) -> manifest.Manifest | None:
+    found = manifest.read(folder)
+    if found is None and _steps(folder):
+        raise ValueError(
+            f"{folder} has a checkpoint and no {manifest.NAME}: it was trained by an earlier version of sts_jax, or "
+            "the file was deleted, and nothing shows that its files are undamaged. Delete the folder and train again, "
+            f"or, if you trust these files, call training.seal({str(folder)!r}) once."
+        )
+    return found
 
 
-def _newest(folder: Path) -> Path | None:
+def _steps(folder: Path) -> list[int]:
     checkpoints = folder / "checkpoints"
-    found = [p for p in checkpoints.iterdir() if p.name.isdigit()] if checkpoints.is_dir() else []
-    return max(found, default=None, key=lambda p: int(p.name))
+    return [int(path.name) for path in checkpoints.iterdir() if path.name.isdigit()] if checkpoints.is_dir() else []
 
 
-def _plain(state: TrainState) -> dict[str, Any]:
-    """The leaves by their paths, so that what is on disk knows no class of Flax or optax."""
+def _keep_only(folder: Path, step: int | None) -> None:
+    checkpoints = folder / "checkpoints"
+    for path in checkpoints.iterdir() if checkpoints.is_dir() else ():
+        if step is None or path != manifest.checkpoint(folder, step):
+            shutil.rmtree(path, ignore_errors=True)  # one that stays does no harm: the manifest does not name it
+
+
+@contextlib.contextmanager
+def _quiet_orbax() -> Iterator[None]:
+    """Silence the log in which Orbax prints its threads' traces before it raises their error.
+
+    For a full disk these are 237 lines. A thread that fails after the error was raised still logs its own.
+    """
+    logger = logging.getLogger("absl")
+    disabled, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = disabled
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).splitlines() or [type(error).__name__]
+    return lines[0][:500]
+
+
+def _plain(state: TrainState | Weights) -> dict[str, Any]:
+    """The leaves by their paths, so that the files do not depend on the classes of Flax and optax."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

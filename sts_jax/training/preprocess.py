@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sts_jax import geometry
+from sts_jax import _files, geometry
+from sts_jax.training import manifest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,36 +71,67 @@ class Preprocessing:
 
 
 def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
-    """Store what the sensor shows with nothing on it, `uint8 (height, width, 3)` each; once, a second time not."""
+    """Write `folder/blank.npz`, the images of the sensor with nothing on it; an existing file is left alone.
+
+    Args:
+        folder: the model's folder.
+        visual: `uint8 (height, width, 3)`.
+        tactile: `uint8 (height, width, 3)`.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     path = folder / "blank.npz"
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name("blank.partial.npz")
-        np.savez(temporary, visual=visual, tactile=tactile)
-        temporary.replace(path)
+
+    def write(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # NumPy adds `.npz` to a name without it
+            np.savez(file, visual=visual, tactile=tactile)
+
+    new = not path.exists()
+    if new:
+        _files.write_whole(path, write)
+    listed = manifest.read(folder)
+    if listed is not None and (new or path.name not in listed.files):
+        manifest.add(folder, path.name)
 
 
 def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """The visual and the tactile image of the empty sensor, `uint8 (height, width, 3)` each.
 
     Raises:
-        FileNotFoundError: The file is missing.
-        ValueError: It is torn.
+        FileNotFoundError: the file is missing.
+        TornFileError: the file is damaged.
     """
     path = folder / "blank.npz"
+    if not path.exists():
+        raise FileNotFoundError(f"{path} is missing; start the training again, or write it with training.save_blank.")
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
-            return arrays["visual"], arrays["tactile"]
-    except (zipfile.BadZipFile, KeyError, ValueError, EOFError) as error:
-        raise ValueError(
-            f"{path} is torn ({error}); delete it and start the training again: it writes it anew."
+            images = arrays["visual"], arrays["tactile"]
+        if any(image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 for image in images):
+            raise ValueError(f"images of {images[0].dtype} {images[0].shape} and {images[1].dtype} {images[1].shape}")
+    except Exception as error:  # zipfile, zlib and NumPy raise many kinds for damaged archives
+        raise _files.TornFileError(
+            f"{path} is damaged ({type(error).__name__}: {error}); delete it and start the training again, which "
+            "writes it anew."
         ) from error
+    return images
 
 
 def preprocessing_from_json(content: dict) -> Preprocessing:
-    """The inverse of `dataclasses.asdict`, through JSON."""
-    content = json.loads(json.dumps(content))
-    content["resolution"] = tuple(content["resolution"])
-    content["absent"] = tuple(content["absent"])
-    content["condition_scale"] = tuple(content.get("condition_scale", ()))  # older models have no condition
-    return Preprocessing(**content)
+    """The inverse of `dataclasses.asdict`, through JSON.
+
+    Raises:
+        ValueError: a field is missing, unknown or of another type.
+    """
+    try:
+        content = json.loads(json.dumps(content))
+        content["resolution"] = tuple(content["resolution"])
+        content["absent"] = tuple(content["absent"])
+        content["condition_scale"] = tuple(content.get("condition_scale", ()))  # older models have no condition
+        return Preprocessing(**content)
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"{content!r} is no preprocessing ({type(error).__name__}: {error}); give dataclasses.asdict of a "
+            "training.Preprocessing as preprocessing= to training.train."
+        ) from error

@@ -1,5 +1,6 @@
 """The training loop: a Python loop over one compiled step (a convolution inside `lax.scan` is slow on a CPU)."""
 
+import contextlib
 import json
 import os
 import zlib
@@ -15,8 +16,9 @@ import optax
 from flax import nnx
 from jaxtyping import Array
 
-from sts_jax import mvae
-from sts_jax.training.checkpoint import TrainState, read_settings, restore, save, write_text
+from sts_jax import _files, mvae
+from sts_jax.training import manifest
+from sts_jax.training.checkpoint import TrainState, Weights, read, restore, save, verified
 
 Batch = dict[str, Any]  # `inputs`, `targets`, `present`, `target_present`: dicts by name; `condition`: array or None
 
@@ -95,6 +97,14 @@ class Model(NamedTuple):
     state: nnx.State  # parameters and running batch statistics
     step: int  # gradient steps done
     settings: dict[str, Any]  # config.json: `model`, `training`, `preprocessing`, ...
+
+    def __repr__(self) -> str:
+        modalities = ", ".join(f"{m.name} {m.kind} {m.shape}" for m in self.config.modalities)
+        numbers = sum(x.size for x in jax.tree.leaves(self.state))
+        return (
+            f"Model({modalities}; latent={self.config.latent}, condition={self.config.condition}, "
+            f"{numbers:,} numbers, step={self.step})"
+        )
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
@@ -181,13 +191,14 @@ def train(
     """Train a model in `workdir`, or go on where an earlier call on it stopped.
 
     A run that was killed gives the parameters, to the last bit, of one that was not, on one machine. Where the
-    last step is done, nothing is written. Other entries in `workdir` are left alone.
+    last step is done, nothing is written. Other entries in `workdir` are left alone. One process at a time trains in
+    a folder.
 
     Args:
         config: how.
         model: what.
         arrays: the training set.
-        workdir: the model's folder: `config.json`, `metrics.jsonl`, `checkpoints/`.
+        workdir: the model's folder: `config.json`, `metrics.jsonl`, `checkpoints/`, `manifest.json`.
         absent: modalities present in no sample; they may be missing from `arrays.inputs`.
         targets: `all` or `own`, see `mvae.loss`.
         preprocessing: plain values for `config.json`: how images and vectors were made.
@@ -198,8 +209,10 @@ def train(
         The trained model.
 
     Raises:
-        ValueError: `workdir` was made with other settings or data, or a checkpoint in it is torn; the arrays
-            contradict `absent` or lack a modality.
+        ValueError: `workdir` was made with other settings or data, or holds a checkpoint without a manifest; the
+            arrays contradict `absent` or lack a modality.
+        OSError: a file in `workdir` is damaged or cannot be written.
+        LockedError: another process trains in `workdir`.
         FloatingPointError: the loss is no longer finite.
     """
     workdir = Path(workdir)
@@ -213,94 +226,127 @@ def train(
         "data": {"samples": len(arrays), "checksum": arrays.checksum()},
         "preprocessing": preprocessing or {},
     }
-    settings = _settle(workdir, settings)
-    graphdef, state = initial(config, model, total)
-    state = restore(workdir, state) or state
-    start = int(state.step)
-    if start < total:
-        log = workdir / "metrics.jsonl"
-        record = _truncate(log, start)
-        compiled = jax.jit(
-            lambda state, batch: step(graphdef, config, total, state, batch, targets=targets, absent=absent),
-            donate_argnums=0,
-        )
-        recent: list[mvae.Terms] = []
-        for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
-            state, terms = compiled(state, arrays.take(index))
-            recent.append(jax.block_until_ready(terms))
-            at_checkpoint = done % config.checkpoint_every == 0 or done == total
-            if done % config.log_every == 0 or done == total:
-                record = _record(done, recent)
-                recent = []
-                with log.open("a") as file:
-                    file.write(json.dumps(record) + "\n")
-                if not np.isfinite(record["loss"]):
-                    raise FloatingPointError(
-                        f"{workdir}: the loss is {record['loss']} at step {done}; lower learning_rate="
-                        f"{config.learning_rate} or set clip"
-                    )
-            if at_checkpoint:
-                save(workdir, state)
-            if progress is not None:
-                progress(done, total, record)
+    settings = json.loads(json.dumps(settings))
+    there = manifest.read(workdir)
+    # A finished run is only read, and a lock is a file.
+    finished = there is not None and there.step == total
+    with contextlib.nullcontext() if finished else _files.lock(workdir):
+        _files.claim(workdir / "config.json", settings)
+        graphdef, state = initial(config, model, total)
+        state = restore(workdir, state) or state
+        start = int(state.step)
+        if start < total:
+            log = workdir / "metrics.jsonl"
+            record = _truncate(log, start)
+            compiled = jax.jit(
+                lambda state, batch: step(graphdef, config, total, state, batch, targets=targets, absent=absent),
+                donate_argnums=0,
+            )
+            recent: list[mvae.Terms] = []
+            for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
+                state, terms = compiled(state, arrays.take(index))
+                recent.append(jax.block_until_ready(terms))
+                if done % config.log_every == 0 or done == total:
+                    record = _record(done, recent)
+                    recent = []
+                    _append(log, record)
+                    if not np.isfinite(record["loss"]):
+                        raise FloatingPointError(
+                            f"{workdir}: the loss is {record['loss']} at step {done}; lower learning_rate="
+                            f"{config.learning_rate} or set clip"
+                        )
+                if done % config.checkpoint_every == 0 or done == total:
+                    save(workdir, state)
+                if progress is not None:
+                    progress(done, total, record)
     return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
 
 
 def load(workdir: str | os.PathLike[str]) -> Model:
     """The model in a folder, from this folder alone.
 
+    Every file is compared with its checksum before it is used. A training that runs in the folder may go on.
+
     Args:
-        workdir: what was `workdir` to `train`.
+        workdir: the `workdir` that was given to `train`.
 
     Returns:
         The model at its newest checkpoint.
 
     Raises:
         FileNotFoundError: the folder has no `config.json` or no checkpoint.
-        ValueError: one of them is torn.
+        OSError: a file is damaged, missing or not listed in `manifest.json`.
+        ValueError: `config.json` is of another version of sts_jax, or the folder has no manifest.
     """
     workdir = Path(workdir)
-    settings = read_settings(workdir)
-    if settings is None:
+    while True:
+        before = manifest.read(workdir)
+        try:
+            return _load(workdir)
+        except (OSError, ValueError):
+            if manifest.read(workdir) == before:
+                raise
+            # A training has replaced the checkpoint while it was read: read the new one.
+
+
+def _load(workdir: Path) -> Model:
+    path = workdir / "config.json"
+    if not path.exists():
         raise FileNotFoundError(
             f"{workdir}: has no config.json; give the folder of a trained model, or train one there"
         )
-    model, config = mvae.Config.from_json(settings["model"]), TrainConfig(**settings["training"])
-    total = config.total(settings["data"]["samples"])
-    graphdef = nnx.graphdef(nnx.eval_shape(lambda: mvae.MVAE(model)))
-    state = restore(workdir, jax.eval_shape(lambda: initial(config, model, total)[1]))
-    if state is None:
+    checkpoint = verified(workdir)
+    settings = _files.read_json(path, f"delete {workdir} and train again")
+    if checkpoint is None:
         raise FileNotFoundError(f"{workdir}: has no checkpoint; run its training to the first one")
-    return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
-
-
-def _settle(workdir: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """Write `config.json`, or compare with the one that is there."""
-    settings = json.loads(json.dumps(settings))
-    old = read_settings(workdir)
-    if old is None:
-        workdir.mkdir(parents=True, exist_ok=True)
-        write_text(workdir / "config.json", json.dumps(settings, indent=1) + "\n")
-    elif old != settings:
-        differ = sorted(key for key in old.keys() | settings.keys() if old.get(key) != settings.get(key))
+    try:
+        model = mvae.Config.from_json(settings["model"])
+        like = jax.eval_shape(lambda: Weights(*mvae.init(jax.random.key(0), model)[1:], jnp.zeros((), jnp.int32)))
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{workdir / 'config.json'}: made with another {', '.join(differ)}; give another workdir or delete it"
-        )
-    return settings
+            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}); load it with the "
+            f"version that trained it, or delete {workdir} and train again"
+        ) from error
+    weights = read(checkpoint, like)
+    graphdef = nnx.graphdef(nnx.eval_shape(lambda: mvae.MVAE(model)))
+    return Model(model, graphdef, nnx.merge_state(weights.params, weights.stats), int(weights.step), settings)
 
 
 def _truncate(log: Path, start: int) -> dict[str, float]:
-    """Drop records after step `start`; the last one that stays."""
+    """Drop the records after step `start` and return the last one that stays."""
+    try:
+        lines = log.read_bytes().splitlines() if log.exists() else []
+    except OSError as error:
+        raise OSError(
+            f"cannot read {log}: {error}. Check its permissions, or delete it to go on without it."
+        ) from error
     records = []
-    for line in log.read_text().splitlines() if log.exists() else []:
+    for number, line in enumerate(lines, 1):
         try:
-            record = json.loads(line)
-        except json.JSONDecodeError:  # torn by a kill
-            break
-        if record["step"] <= start:
+            record = json.loads(line.decode())
+            keep = record["step"] <= start
+        except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
+            if number == len(lines):  # torn by a kill
+                break
+            raise _files.TornFileError(
+                f"{log}, line {number}, is damaged ({type(error).__name__}: {error}); delete this line, or the "
+                "file, to go on without these records."
+            ) from error
+        if keep:
             records.append(record)
-    write_text(log, "".join(json.dumps(r) + "\n" for r in records))
+    _files.write_bytes(log, "".join(json.dumps(r) + "\n" for r in records).encode())
     return records[-1] if records else {}
+
+
+def _append(log: Path, record: dict[str, float]) -> None:
+    try:
+        with log.open("a") as file:
+            file.write(json.dumps(record) + "\n")
+    except OSError as error:
+        raise OSError(
+            f"cannot write {log}: {error}. Free some disk space or check the permissions, then start again; the last "
+            "checkpoint is kept."
+        ) from error
 
 
 def _record(done: int, recent: list[mvae.Terms]) -> dict[str, float]:

@@ -1,0 +1,122 @@
+"""Checksums of a model's folder.
+
+`manifest.json` holds the SHA-256 of `config.json`, of `blank.npz` where the folder has one, and of every file of one
+checkpoint. This checkpoint is the one that counts: it is written first, then the manifest is replaced as a whole, then
+the older checkpoint is deleted. A kill at any moment leaves a manifest whose files are complete.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sts_jax import _files
+
+NAME = "manifest.json"
+_FORMAT = 1
+_BESIDE = ("config.json", "blank.npz")  # files outside the checkpoint that a manifest lists where they exist
+
+
+class Manifest(NamedTuple):
+    """The files that belong to a model."""
+
+    step: int | None  # of the checkpoint that counts; None before the first one
+    files: dict[str, str]  # SHA-256 by path relative to the folder
+
+
+def checkpoint(folder: Path, step: int) -> Path:
+    """The folder of one checkpoint."""
+    return folder / "checkpoints" / f"{step:08d}"
+
+
+def read(folder: Path) -> Manifest | None:
+    """The manifest of a model's folder, or None where there is none.
+
+    Raises:
+        TornFileError: the manifest is damaged.
+    """
+    path, remedy = folder / NAME, _remedy(folder)
+    if not path.exists():
+        return None
+    content = _files.read_json(path, remedy)
+    if not _is_manifest(content):
+        raise _files.TornFileError(f"{path} is damaged, or of another version of sts_jax; {remedy}.")
+    return Manifest(content["step"], content["files"])
+
+
+def write(folder: Path, step: int | None) -> Manifest:
+    """Make a checkpoint the one that counts.
+
+    The checksums of `config.json` and `blank.npz` stay those of the manifest before, so that damage done in between is
+    still found.
+
+    Raises:
+        OSError: the manifest cannot be written.
+    """
+    old = read(folder)
+    files = {} if old is None else {name: digest for name, digest in old.files.items() if name in _BESIDE}
+    names = _there(folder, step)
+    files = {name: files.get(name) or _files.sha256(folder / name) for name in names}
+    _files.write_json(folder / NAME, {"format": _FORMAT, "step": step, "files": files})
+    return Manifest(step, files)
+
+
+def add(folder: Path, name: str) -> None:
+    """Enter the present content of a file beside the checkpoint in the manifest, if the folder has one."""
+    old = read(folder)
+    if old is not None:
+        files = old.files | {name: _files.sha256(folder / name)}
+        _files.write_json(folder / NAME, {"format": _FORMAT, "step": old.step, "files": files})
+
+
+def verify(folder: Path, manifest: Manifest) -> None:
+    """Compare every file with its checksum.
+
+    Raises:
+        TornFileError: a file is changed, missing or not listed. The message names it and the remedy.
+    """
+    remedy = _remedy(folder)
+    for name in _there(folder, manifest.step):
+        if name not in manifest.files:
+            raise _files.TornFileError(
+                f"{folder / name} is not listed in {NAME}: it does not belong to this model. Move it elsewhere, or "
+                f"{remedy}."
+            )
+    for name, digest in manifest.files.items():
+        path = folder / name
+        try:
+            found = _files.sha256(path)
+        except FileNotFoundError:
+            raise _files.TornFileError(f"{path} is missing, and {NAME} lists it; {remedy}.") from None
+        except (OSError, ValueError) as error:  # ValueError: a damaged manifest may list a name with a null byte
+            raise _files.TornFileError(f"{path} cannot be read ({error}); {remedy}.") from error
+        if found != digest:
+            again = " or delete this file and start the training again" if name == "blank.npz" else ""
+            raise _files.TornFileError(
+                f"{path} is not the file that {NAME} lists (its SHA-256 differs): it was edited, exchanged or damaged; "
+                f"{remedy}{again}."
+            )
+
+
+def _is_manifest(content: Any) -> bool:
+    """Whether the content has the fields of a manifest, and lists files of its own checkpoint alone."""
+    if not isinstance(content, dict) or content.keys() != {"format", "step", "files"} or content["format"] != _FORMAT:
+        return False
+    step, files = content["step"], content["files"]
+    if type(step) not in (int, type(None)) or not isinstance(files, dict):
+        return False
+    of_checkpoint = [name for name in files if name not in _BESIDE]
+    if step is None:
+        return not of_checkpoint
+    prefix = checkpoint(Path(), step).as_posix() + "/"
+    return bool(of_checkpoint) and all(name.startswith(prefix) for name in of_checkpoint)
+
+
+def _there(folder: Path, step: int | None) -> list[str]:
+    """The files that a manifest has to list, relative to the folder."""
+    found = [folder / name for name in _BESIDE if (folder / name).exists()]
+    if step is not None:
+        found += sorted(path for path in checkpoint(folder, step).rglob("*") if not path.is_dir())
+    return [path.relative_to(folder).as_posix() for path in found]
+
+
+def _remedy(folder: Path) -> str:
+    return f"restore it from a copy, or delete {folder} and train again"
