@@ -59,10 +59,10 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
         data = dataset.load(Path(name) / "0")
         tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",))
         pairs = data.pairs(np.arange(num), symmetries=True)
-        blank = stages.empty_frame(sensor, collection)
+        blank = dataset.empty_frame(sensor, collection)
         samples = round(stages.train_share(config.splits[0]) * collection.num_trajectories) * seen
         for number, (model, modalities) in enumerate(stages.MODELS.items()):
-            arrays, preprocessing = stages.learnable(pairs, modalities, stages.preprocessing_of(config), blank.tactile)
+            arrays, preprocessing = training.moments(pairs, modalities, stages.preprocessing_of(config), blank.tactile)
             folder = stages.model_folder(Path(name), model, tiny, "trajectory")
             stamps_of_steps = [time.perf_counter()]
 
@@ -72,7 +72,7 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
 
             training.train(
                 dataclasses.replace(config.training, steps=steps, log_every=1, checkpoint_every=steps),
-                stages.model_config(modalities, preprocessing),
+                training.paper_model(modalities, preprocessing),
                 arrays,
                 workdir=folder,
                 absent=preprocessing.absent,

@@ -7,13 +7,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 
 import sts_jax as sts
 from experiments import pictures, results
 from experiments.progress import Bar, say
-from sts_jax import _files, dataset, evaluation, mvae, training
+from sts_jax import _files, dataset, evaluation, training
 from sts_jax.dataset.collect import SPLITS
 
 # The rows of the paper's Table 1, by the modalities a model has.
@@ -150,9 +149,9 @@ def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
 def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
     """Train the models of the paper's Table 1 on one split."""
     pairs = data.pairs(rows_of(data, split)["train"], symmetries=True)
-    blank = empty_frame(sensor, config.collection)
+    blank = dataset.empty_frame(sensor, config.collection)
     for number, (name, modalities) in enumerate(MODELS.items()):
-        arrays, preprocessing = learnable(pairs, modalities, preprocessing_of(config), blank.tactile)
+        arrays, preprocessing = training.moments(pairs, modalities, preprocessing_of(config), blank.tactile)
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
@@ -165,7 +164,7 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
 
             training.train(
                 schedule,
-                model_config(modalities, preprocessing),
+                training.paper_model(modalities, preprocessing),
                 arrays,
                 workdir=folder,
                 absent=preprocessing.absent,
@@ -185,45 +184,6 @@ def preprocessing_of(config: Config) -> training.Preprocessing:
         mask_blank_touch=config.mask_blank_touch,
         condition_scale=collection.scenario.condition_scale,
     )
-
-
-def model_config(modalities: tuple[str, ...], preprocessing: training.Preprocessing) -> mvae.Config:
-    """The paper's networks for some modalities; lambda is 1 for images and 1000 for the pose."""
-    pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
-    shape = (*preprocessing.resolution, 3)
-    images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
-    kept = tuple({**images, "pose": pose}[name] for name in modalities)
-    return mvae.Config(kept, condition=len(preprocessing.condition_scale))
-
-
-def learnable(
-    pairs: dataset.Pairs, modalities: tuple[str, ...], preprocessing: training.Preprocessing, blank: np.ndarray
-) -> tuple[training.Arrays, training.Preprocessing]:
-    """First moments as inputs, last ones as targets, and which inputs no trajectory has."""
-    code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
-    moments = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
-    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
-    touched = np.asarray(
-        preprocessing.touched(jnp.asarray(pairs.tactile[:, 0] / 255, jnp.float32), jnp.asarray(blank / 255))
-    )
-    absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
-    arrays = training.Arrays(
-        inputs={name: np.ascontiguousarray(moments[name][:, 0]) for name in modalities if name not in absent},
-        targets={name: np.ascontiguousarray(moments[name][:, 1]) for name in modalities},
-        present={"tactile": touched} if "tactile" in modalities and not absent else {},
-        condition=condition if condition.shape[1] else None,
-    )
-    return arrays, dataclasses.replace(preprocessing, absent=absent)
-
-
-def empty_frame(sensor: sts.Sensor, collection: dataset.Collection) -> dataset.Images:
-    """Both streams with nothing on the sensor, `uint8`."""
-    body = dataset.make_bodies(collection, np.array([0]))[0]
-    gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
-    images = dataset.render_uint8(
-        sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop
-    )
-    return dataset.Images(*(np.asarray(leaf)[0] for leaf in images))
 
 
 def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:

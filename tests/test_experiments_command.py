@@ -45,7 +45,7 @@ def test_presets_hold_out_what_they_should_and_the_paper_s_has_its_counts(experi
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     assert not experiment.PAPER.mask_blank_touch
-    model = stages.model_config(stages.MODELS["mvae"], stages.preprocessing_of(experiment.PAPER))
+    model = training.paper_model(stages.MODELS["mvae"], stages.preprocessing_of(experiment.PAPER))
     assert [m.weight for m in model.modalities] == [1, 1, 1000]
     assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 

@@ -9,6 +9,7 @@ from sts_jax.dataset.collect import Meshes as Meshes
 from sts_jax.dataset.collect import Progress as Progress
 from sts_jax.dataset.collect import class_names as class_names
 from sts_jax.dataset.collect import collect as collect
+from sts_jax.dataset.collect import empty_frame as empty_frame
 from sts_jax.dataset.collect import head as head
 from sts_jax.dataset.collect import make_bodies as make_bodies
 from sts_jax.dataset.collect import mesh_classes as mesh_classes
@@ -35,6 +36,7 @@ __all__ = [
     "claim",
     "class_names",
     "collect",
+    "empty_frame",
     "head",
     "load",
     "make_bodies",

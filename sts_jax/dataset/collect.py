@@ -460,6 +460,14 @@ def render_uint8(
     return jax.lax.map(one, (pose, wrench), batch_size=1 if jax.default_backend() == "cpu" else len(pose))
 
 
+def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
+    """Both streams and the segmentation with nothing on the sensor, `uint8`, as the collection renders them."""
+    body = make_bodies(collection, np.array([0]))[0]
+    gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
+    images = render_uint8(sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop)
+    return records.Images(*(np.asarray(leaf)[0] for leaf in images))
+
+
 def _report(progress: Callable[[Progress], None] | None, before: int, total: int, stage: str) -> Callable[[int], None]:
     def report(done: int) -> None:
         if progress is not None:

@@ -1,6 +1,7 @@
 """Training of `sts_jax.mvae` models: loop, schedules, checkpoints."""
 
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
+from sts_jax.training.moments import moments, paper_model
 from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
 from sts_jax.training.train import Arrays, Model, TrainConfig, initial, load, optimiser, order, step, train
 
@@ -14,8 +15,10 @@ __all__ = [
     "initial",
     "load",
     "load_blank",
+    "moments",
     "optimiser",
     "order",
+    "paper_model",
     "preprocessing_from_json",
     "restore",
     "save",
