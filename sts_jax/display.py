@@ -25,6 +25,15 @@ _INCH = 2.6  # height of a panel
 _FORMAT = 1
 
 
+class NotebookFigure(Figure):
+    """A Matplotlib figure that a notebook displays without a plotting backend."""
+
+    def _repr_png_(self) -> bytes:
+        data = io.BytesIO()
+        self.savefig(data, format="png")
+        return data.getvalue()
+
+
 def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Figure:
     """Draw a frame, a body, a prediction or an image.
 
@@ -70,7 +79,8 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
             raise ValueError("the prediction has no image: the model predicts the pose alone; print it instead")
     else:
         panels = [("", _image(thing), None)]
-    figure = Figure(figsize=(1.15 * _INCH * len(panels), _INCH + 0.5), layout="constrained")
+    height = _INCH if len(panels) > 1 else 1.5 * _INCH
+    figure = NotebookFigure(figsize=(1.15 * height * len(panels), height + 0.4), layout="constrained")
     for axes, (name, values, colours) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
         drawn = axes.imshow(values, cmap=colours)
         if colours is not None:

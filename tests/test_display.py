@@ -1,5 +1,7 @@
 """What `show` draws and `save` keeps: read back with Pillow and NumPy."""
 
+import io
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,6 +97,8 @@ def test_a_figure_has_the_panels_of_what_it_shows(thing, panels):
     titles = [axes.get_title() for axes in figure.axes if axes.images and axes.get_label() != "<colorbar>"]
     assert titles == panels
     assert figure.get_suptitle() == "title"
+    with Image.open(io.BytesIO(figure._repr_png_())) as picture:  # for a notebook
+        assert np.asarray(picture.convert("L")).std() > 1
     first = figure.axes[0].images[0].get_array()
     expected = thing.visual if hasattr(thing, "visual") else thing
     np.testing.assert_allclose(first, np.asarray(expected) / (255 if np.asarray(expected).dtype == np.uint8 else 1))

@@ -107,7 +107,7 @@ def place(
         face: which of its `stable_faces`, 0 is the most likely one; or "upright": its +z points up.
         yaw: rad, about the vertical. At 0, a body that lies has its +z towards the image's top, and one that stands,
             upright or upside down, its -y.
-        position: m, x and y of the mesh frame's origin, which is `pose[:2]`.
+        position: m, x and y of the middle of the body's extent.
         fill: share of the interior's volume that is filled, 0 to 1.
         shell_scale: factor on the shell's mass.
         up: unit vector in the mesh frame; the contents have settled against it. They stay there when the body is laid.
@@ -123,13 +123,17 @@ def place(
     faces = stable_faces(body, fill=fill, shell_scale=shell_scale, up=up)
     above = faces.up[_index(faces, face)]
     ahead = np.array([0.0, 0, 1]) if abs(above[2]) < 0.7 else np.array([0.0, -1, 0])
-    y = above @ ahead * above - ahead
-    y /= np.linalg.norm(y)
+    down = above @ ahead * above - ahead
+    down /= np.linalg.norm(down)
     across, along = math.cos(yaw), math.sin(yaw)
-    turn = np.array([[across, -along, 0], [along, across, 0], [0, 0, 1]]) @ np.stack([np.cross(y, above), y, above])
-    lowest = np.min(np.asarray(body.hulls, np.float64).reshape(-1, 3) @ turn[2])
+    turn = np.array([[across, -along, 0], [along, across, 0], [0, 0, 1]]) @ np.stack(
+        [np.cross(down, above), down, above]
+    )
+    points = np.asarray(body.hulls, np.float64).reshape(-1, 3) @ turn.T
+    low, high = points.min(axis=0), points.max(axis=0)
+    x, y = position - (low + high)[:2] / 2
     quat = np.asarray(geometry.quat_from_matrix(jnp.asarray(turn, jnp.float32)))
-    pose = jnp.asarray([*position, -STANDING - lowest, *quat], jnp.float32)
+    pose = jnp.asarray([x, y, -STANDING - low[2], *quat], jnp.float32)
     wrench = weight(body, pose, fill=fill, shell_scale=shell_scale, up=up)
     com = np.array([-wrench[4], wrench[3]]) / float(wrench[2])
     half = np.asarray(sensor.gel.size) / 2

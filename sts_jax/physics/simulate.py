@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from sts_jax import objects
 from sts_jax.objects.body import Body, is_traced
