@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
 Flat = Callable[..., list[Array]]
 
@@ -85,7 +85,7 @@ def _is_zero(tangent: Any) -> bool:
 
 
 def _over_batch(
-    flat: Callable[..., Any], dense: Callable[..., Any], size: int, flags: Sequence[bool], leaves: Sequence[Array]
+    flat: Callable[..., Any], dense: Callable[..., Any], size: int, flags: Sequence[bool], leaves: Sequence[ArrayLike]
 ) -> Any:
     """A function over the first axis of the flagged arguments: a loop on a CPU, `jax.vmap` elsewhere."""
     if jax.default_backend() != "cpu" or not any(flags):
@@ -105,7 +105,7 @@ _linear = Primitive("looped_derivative")
 _linear.multiple_results = True
 
 
-def _apply(*operands: Array, function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
+def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
     arguments, vectors = operands[: len(active)], operands[len(active) :]
 
     def of_active(*moving: Array) -> list[Array]:
@@ -123,7 +123,9 @@ def _abstract(*operands: Any, **params: Any) -> list[Any]:
     return [jax.core.ShapedArray(leaf.shape, leaf.dtype) for leaf in shapes]
 
 
-def _derivative(primals: Sequence[Array], tangents: Sequence[Any], **params: Any) -> tuple[list[Array], list[Array]]:
+def _derivative(
+    primals: Sequence[ArrayLike], tangents: Sequence[Any], **params: Any
+) -> tuple[list[Array], list[Array]]:
     """Of second order, by the function itself: the operation is linear in its vectors only."""
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
 
@@ -148,10 +150,10 @@ def _transpose(cotangents: Sequence[Any], *operands: Any, transposed: bool, **pa
     return [None] * first + list(back)
 
 
-def _batch(operands: Sequence[Array], axes: Sequence[Any], **params: Any) -> tuple[list[Array], list[int]]:
-    flags = [axis is not batching.not_mapped for axis in axes]
+def _batch(operands: Sequence[ArrayLike], axes: Sequence[Any], **params: Any) -> tuple[list[Array], list[int]]:
+    flags = [axis is not None for axis in axes]
     moved = [jnp.moveaxis(x, axis, 0) if flag else x for x, axis, flag in zip(operands, axes, flags, strict=True)]
-    size = next(len(x) for x, flag in zip(moved, flags, strict=True) if flag)
+    size = next(jnp.shape(x)[0] for x, flag in zip(moved, flags, strict=True) if flag)
     dense = functools.partial(_apply, **params)
     if any(flags[: len(params["active"])]):
         result = _over_batch(functools.partial(_linear.bind, **params), dense, size, flags, moved)
