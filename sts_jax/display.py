@@ -41,7 +41,7 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
 
     Args:
         thing: a `Frame`: both streams, depth (mm) and pressure (kPa); a `Body`: a view from outside as it stands on a
-            pad; a `Prediction`: the images and poses that the model has; or one image `(height, width, 3)` in [0, 1].
+            pad; a `Prediction`: the images that the model predicts; or one image `(height, width, 3)` in [0, 1].
             One item each: index a batch with `jax.tree.map(lambda x: x[i], frames)`.
         title: of the figure.
 

@@ -40,7 +40,9 @@ def stable_faces(
 
     Args:
         body: one body.
-        fill, shell_scale, up: of its contents and its shell, see `objects.rigid`.
+        fill: share of the interior's volume that is filled, 0 to 1.
+        shell_scale: factor on the shell's mass.
+        up: unit vector in the mesh frame; the contents have settled against it.
 
     Returns:
         The faces, none for a body that rests on nothing.
@@ -74,7 +76,9 @@ def weight(
     Args:
         body: one body.
         pose: mesh frame in the sensor frame.
-        fill, shell_scale, up: of its contents and its shell, see `objects.rigid`.
+        fill: share of the interior's volume that is filled, 0 to 1.
+        shell_scale: factor on the shell's mass.
+        up: unit vector in the mesh frame; the contents have settled against it.
 
     Returns:
         Force (N) and moment (N m).
