@@ -41,6 +41,8 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     path = cache_folder() / processor() if folder is None else Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_compilation_cache_dir", str(path))
+    # By default JAX keeps only programs that took a second; a session runs hundreds of smaller ones.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     return path
 
 

@@ -3,9 +3,11 @@
 import math
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, ScalarLike
+from scipy.spatial.transform import Rotation
 
 from sts_jax import geometry, objects
 from sts_jax.objects import Body
@@ -13,6 +15,10 @@ from sts_jax.physics.scenarios import STANDING, G
 from sts_jax.sensor import Sensor
 
 UPRIGHT = math.radians(1)  # a body that stands leans less
+
+
+_rigid = jax.jit(objects.rigid)
+_transform = jax.jit(geometry.transform)
 
 
 class StableFaces(NamedTuple):
@@ -51,7 +57,7 @@ def stable_faces(
         ValueError: a value of the body is not finite, or its hull spans no volume.
     """
     body.check()
-    com = np.asarray(objects.rigid(body, fill, shell_scale, up)[1], np.float64)
+    com = np.asarray(_rigid(body, fill, shell_scale, up)[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
     if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
         raise ValueError("hulls spans no volume: a body needs at least four points that do")
@@ -83,8 +89,8 @@ def weight(
     Returns:
         Force (N) and moment (N m).
     """
-    mass, com, _ = objects.rigid(body, fill, shell_scale, up)
-    x, y, _ = geometry.transform(jnp.asarray(pose), com)
+    mass, com, _ = _rigid(body, fill, shell_scale, up)
+    x, y, _ = _transform(jnp.asarray(pose), com)
     zero = jnp.zeros_like(mass)
     return G * mass * jnp.stack([zero, zero, zero + 1, y, -x, zero])
 
@@ -136,7 +142,7 @@ def place(
     points = np.asarray(body.hulls, np.float64).reshape(-1, 3) @ turn.T
     low, high = points.min(axis=0), points.max(axis=0)
     x, y = position - (low + high)[:2] / 2
-    quat = np.asarray(geometry.quat_from_matrix(jnp.asarray(turn, jnp.float32)))
+    quat = Rotation.from_matrix(turn).as_quat(canonical=True, scalar_first=True)
     pose = jnp.asarray([x, y, -STANDING - low[2], *quat], jnp.float32)
     wrench = weight(body, pose, fill=fill, shell_scale=shell_scale, up=up)
     com = np.array([-wrench[4], wrench[3]]) / float(wrench[2])
