@@ -31,53 +31,59 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
         A function with the same values and derivatives.
     """
 
-    @jax.custom_batching.custom_vmap
-    def primal(*arguments: Any) -> Any:
-        return function(*arguments)
-
-    @primal.def_vmap
-    def batched(size: int, is_batched: Sequence[Any], *arguments: Any) -> tuple[Any, Any]:
+    def with_trees(*arguments: Any) -> Any:
         leaves, structure = jax.tree.flatten(arguments)
-        flags = jax.tree.leaves(is_batched)
-
-        def flat(*leaves: Array) -> Any:
-            return primal(*jax.tree.unflatten(structure, leaves))
-
-        def dense(*leaves: Array) -> Any:
-            return function(*jax.tree.unflatten(structure, leaves))
-
-        result = _over_batch(flat, dense, size, flags, leaves)
-        return result, jax.tree.map(lambda _: True, result)
-
-    @jax.custom_jvp
-    def differentiable(*arguments: Any) -> Any:
-        return primal(*arguments)
-
-    @functools.partial(differentiable.defjvp, symbolic_zeros=True)
-    def derivative(primals: tuple, tangents: tuple) -> tuple[Any, Any]:
-        result = differentiable(*primals)
-        leaves, structure = jax.tree.flatten(primals)
-        changes = jax.tree.leaves(tangents, is_leaf=_is_zero)
-        active = tuple(
-            not _is_zero(change) and jnp.issubdtype(leaf.dtype, jnp.inexact)
-            for leaf, change in zip(leaves, changes, strict=True)
-        )
-        results, result_structure = jax.tree.flatten(result)
-        real = tuple(jnp.issubdtype(leaf.dtype, jnp.inexact) for leaf in results)
+        structures = []
 
         def flat(*leaves: Array) -> list[Array]:
-            found = jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
-            return [leaf for leaf, kept in zip(found, real, strict=True) if kept]
+            results, result_structure = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
+            structures.append(result_structure)
+            return results
+
+        results = _looped(flat)(*leaves)
+        return jax.tree.unflatten(structures[-1], results)
+
+    return with_trees
+
+
+def _looped(function: Flat) -> Flat:
+    # JAX passes flags and symbolic zeros in the place of arrays. As leaves of the caller's trees they would be of
+    # another type than the trees' fields, so everything from here on is a list.
+    @jax.custom_batching.custom_vmap
+    def primal(*leaves: Array) -> list[Array]:
+        return function(*leaves)
+
+    @primal.def_vmap
+    def batched(size: int, flags: Sequence[bool], *leaves: Array) -> tuple[list[Array], list[bool]]:
+        results = _over_batch(primal, function, size, flags, leaves)
+        return results, [True] * len(results)
+
+    @jax.custom_jvp
+    def differentiable(*leaves: Array) -> list[Array]:
+        return primal(*leaves)
+
+    @functools.partial(differentiable.defjvp, symbolic_zeros=True)
+    def derivative(leaves: tuple, changes: tuple) -> tuple[list[Array], list[Any]]:
+        results = differentiable(*leaves)
+        active = tuple(not _is_zero(change) and _is_real(leaf) for leaf, change in zip(leaves, changes, strict=True))
+        real = tuple(_is_real(result) for result in results)
+
+        def reals(*leaves: Array) -> list[Array]:
+            return [result for result, kept in zip(function(*leaves), real, strict=True) if kept]
 
         moving = [change for change, used in zip(changes, active, strict=True) if used]
-        found = iter(_linear.bind(*leaves, *moving, function=flat, active=active, transposed=False) if moving else ())
-        out = [
-            (next(found) if moving else jnp.zeros_like(leaf)) if kept else np.zeros(leaf.shape, jax.dtypes.float0)
-            for leaf, kept in zip(results, real, strict=True)
+        found = iter(_linear.bind(*leaves, *moving, function=reals, active=active, transposed=False) if moving else ())
+        slopes = [
+            (next(found) if moving else jnp.zeros_like(result)) if kept else np.zeros(result.shape, jax.dtypes.float0)
+            for result, kept in zip(results, real, strict=True)
         ]
-        return result, jax.tree.unflatten(result_structure, out)
+        return results, slopes
 
     return differentiable
+
+
+def _is_real(value: Any) -> bool:
+    return jnp.issubdtype(value.dtype, jnp.inexact)
 
 
 def _is_zero(tangent: Any) -> bool:
@@ -85,16 +91,15 @@ def _is_zero(tangent: Any) -> bool:
 
 
 def _over_batch(
-    flat: Callable[..., Any], dense: Callable[..., Any], size: int, flags: Sequence[bool], leaves: Sequence[ArrayLike]
-) -> Any:
+    single: Flat, dense: Flat, size: int, flags: Sequence[bool], leaves: Sequence[ArrayLike]
+) -> list[Array]:
     """A function over the first axis of the flagged arguments: a loop on a CPU, `jax.vmap` elsewhere."""
     if jax.default_backend() != "cpu" or not any(flags):
-        result = jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
-        return result
+        return jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
 
-    def one(mapped: list[Array]) -> Any:
+    def one(mapped: list[Array]) -> list[Array]:
         own = iter(mapped)
-        return flat(*(next(own) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)))
+        return single(*(next(own) if flag else leaf for leaf, flag in zip(leaves, flags, strict=True)))
 
     return jax.lax.map(one, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
 

@@ -97,9 +97,8 @@ def test_a_known_body_with_a_value_that_is_not_finite_is_an_error(field):
             call(SENSOR, bad, POSE, WRENCH) if call is sense else call(POSE, WRENCH)
 
 
-def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_sensor(monkeypatch):
-    monkeypatch.setattr(objects.Body, "check", lambda self: None)  # as if traced: no program of its own to compile
-    draw = functools.partial(sense, resolution=(16, 16))
+def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_sensor():
+    draw = jax.jit(functools.partial(sense, resolution=(16, 16)))
     gone = draw(SENSOR, BODY, POSE.at[2].set(-1), WRENCH)
     fields = {name: getattr(BODY, name).at[7, 1].set(jnp.nan) for name in ("vertices", "normals", "colors")}
     cases = [(dataclasses.replace(BODY, **{name: values}), POSE) for name, values in fields.items()]

@@ -210,7 +210,8 @@ def test_a_full_disk_is_one_clear_error_and_keeps_the_checkpoint(folder, state):
     assert len(str(caught.value)) < 1000
     assert caught.value.__suppress_context__
     assert training.load(folder).step == 4
-    assert [path.name for path in (folder / "checkpoints").iterdir()] == ["00000004"]
+    # Orbax's threads may still be removing their own temporary folder.
+    assert [path.name for path in (folder / "checkpoints").iterdir() if path.name.isdigit()] == ["00000004"]
     del caught
     gc.collect()  # of the coroutines, whose warnings would fail a later test
 
