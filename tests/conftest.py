@@ -4,7 +4,7 @@ Most of the suite's time is compilation. Three settings shorten it:
 
 - All worker processes share one cache of compiled programs, however small. JAX_COMPILATION_CACHE_DIR keeps it.
 - XLA optimises less: compilation takes two thirds of its time, and small arrays do not need more. An XLA_FLAGS in the
-  environment, also an empty one, is respected. `.ci/run` tests with XLA's defaults too.
+  environment, also an empty one, is respected. The notebooks are tested with XLA's defaults.
 - Compiled programs stay in memory from one test file to the next, as long as there is room for them.
 """
 

@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks import classify
 
+pytestmark = pytest.mark.slow
+
 
 def test_gain_is_that_of_a_known_channel_and_folds_do_not_part_objects():
     # The outcome is whether what is seen and what is felt agree, except one time in ten: sight alone knows nothing.

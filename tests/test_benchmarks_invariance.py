@@ -10,6 +10,8 @@ import pytest
 from benchmarks import invariance
 from sts_jax import physics
 
+pytestmark = pytest.mark.slow
+
 NUM = 300
 
 

@@ -11,6 +11,8 @@ from benchmarks.starts import Starts
 from sts_jax import objects, physics
 from sts_jax.physics.scenarios import G
 
+pytestmark = pytest.mark.slow
+
 
 def test_what_the_classifier_is_told_of_a_shake_is_the_same_in_all_symmetries_of_the_pad():
     body = objects.make(jax.random.key(4), "bottle")

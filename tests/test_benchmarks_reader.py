@@ -2,8 +2,11 @@
 
 import jax
 import numpy as np
+import pytest
 
 from benchmarks import classify, reader
+
+pytestmark = pytest.mark.slow
 
 
 def test_reader_reads_a_faint_blob_and_its_presence():

@@ -3,8 +3,11 @@
 import math
 
 import numpy as np
+import pytest
 
 from benchmarks import slope
+
+pytestmark = pytest.mark.slow
 
 
 def test_balance_of_a_block_on_the_slope():

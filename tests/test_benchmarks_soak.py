@@ -10,6 +10,8 @@ from benchmarks.starts import Starts
 from sts_jax import physics
 from sts_jax.physics.simulate import SUNK_LIMIT
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("name", soak.SCENARIOS)
 def test_trajectories_end_sound_settled_and_weigh_what_they_weigh(name):

@@ -3,10 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import sts_jax as sts
 from benchmarks import touch
 from sts_jax import dataset, objects, physics
+
+pytestmark = pytest.mark.slow
 
 
 def test_mass_of_held_out_objects_is_read_from_uint8_touch_and_few_pixels_saturate():

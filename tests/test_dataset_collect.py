@@ -146,6 +146,7 @@ def test_symmetries_of_a_pad_that_is_not_square_are_refused(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_a_scenario_with_a_mirror_alone_takes_any_pad(tmp_path, monkeypatch):
     monkeypatch.setattr(sts.physics.Freefall, "symmetries", (0, 6))
     sensor = sts.Sensor()

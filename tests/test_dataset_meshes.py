@@ -10,6 +10,8 @@ import trimesh
 import sts_jax as sts
 from sts_jax import dataset, physics
 
+pytestmark = pytest.mark.slow
+
 SCENARIO = physics.Perturbed(frames=3)
 
 

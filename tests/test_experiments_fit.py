@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from experiments import fit
 
+pytestmark = pytest.mark.slow
+
 SMALL = (64, 64)
 
 

@@ -13,6 +13,8 @@ import sts_jax as sts
 from experiments import freefall, stages
 from sts_jax import dataset, physics
 
+pytestmark = pytest.mark.slow
+
 TINY = dataclasses.replace(
     freefall.SMOKE,
     collection=dataclasses.replace(

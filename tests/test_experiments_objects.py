@@ -8,6 +8,8 @@ import pytest
 import sts_jax as sts
 from experiments import objects
 
+pytestmark = pytest.mark.slow
+
 
 def test_contact_sheet(tmp_path):
     out = tmp_path / "sheet.png"

@@ -11,6 +11,8 @@ import sts_jax as sts
 from experiments import perturbed, show, stages
 from sts_jax import dataset, physics
 
+pytestmark = pytest.mark.slow
+
 TINY = dataclasses.replace(
     perturbed.SMOKE,
     collection=dataclasses.replace(

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 import sts_jax as sts
 from experiments import sense
 
+pytestmark = pytest.mark.slow
+
 TINY = (24, 32)
 
 

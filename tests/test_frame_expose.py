@@ -47,6 +47,7 @@ def encode(x):
     return 12.92 * x if x <= 0.0031308 else 1.055 * x ** (1 / 2.4) - 0.055
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
 @pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
 def test_the_streams_are_the_ends_to_the_last_bit(shape, exposure):

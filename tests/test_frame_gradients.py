@@ -18,6 +18,8 @@ from optics_bodies import from_trimesh
 import sts_jax as sts
 from sts_jax import optics, tactile
 
+pytestmark = pytest.mark.slow
+
 SHAPE = (40, 40)
 STEP = 1e-5  # of what a parameter is moved by to be seen
 RELATIVE = 3e-3  # the gel's implicit derivative is damped by as much: `_newton` adds 1e-5 to its matrix

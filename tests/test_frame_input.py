@@ -47,6 +47,7 @@ def test_a_wrench_of_another_shape_is_named(shape):
             call(SENSOR, BODY, POSE, jnp.zeros(shape))
 
 
+@pytest.mark.slow
 def test_lists_and_tuples_of_numbers_are_taken():
     small = {"resolution": (16, 16)}
     frame = sense(SENSOR, BODY, POSE, WRENCH, **small)
@@ -163,6 +164,7 @@ def possible(sensor):
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
 def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(lights):
     start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
@@ -188,6 +190,7 @@ def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(ligh
     assert refused > 3 * len(leaves)  # of six: three are not finite
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
 def test_touch_and_light_between_have_no_nan_of_a_traced_sensor_that_cannot_be(lights):
     start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
@@ -209,6 +212,7 @@ def test_touch_and_light_between_have_no_nan_of_a_traced_sensor_that_cannot_be(l
                 np.testing.assert_allclose(mixed, half, atol=1e-6, err_msg=words)
 
 
+@pytest.mark.slow
 def test_leds_that_fall_off_steeply_have_no_nan():
     steep = dataclasses.replace(SENSOR, lights=tactile.Leds(falloff=50.0))
     imprint = jnp.zeros((60, 80)).at[3:14, 1:20].set(5e-4)
@@ -246,6 +250,7 @@ def stl_of_a_million(path):
     return len(record)
 
 
+@pytest.mark.slow
 def test_a_mesh_of_a_million_faces_is_refused_or_decimated_with_a_line(tmp_path):
     path = tmp_path / "ball.stl"
     number = stl_of_a_million(path)

@@ -106,6 +106,7 @@ def test_the_view_depends_on_no_limit_of_the_gels_equilibrium():
         np.testing.assert_array_equal(frame.visual, sense(SENSOR, body, pose).visual)
 
 
+@pytest.mark.slow
 def test_beyond_the_pad_there_is_a_dark_housing_whatever_lies_there():
     body = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.03)), color=(0.9, 0.9, 0.1))
     gone = sense(SENSOR, body, at(0, 0, -1.0), resolution=(96, 128))
@@ -140,6 +141,7 @@ def test_objects_stand_out_as_they_did_without_shadow_milk_and_tint():
         assert ours > least * before
 
 
+@pytest.mark.slow
 def test_a_public_texture_is_where_rays_find_it():
     meshes = public_meshes()
     body = objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")

@@ -15,6 +15,8 @@ import sts_jax as sts
 from experiments.sense import Config, lay
 from sts_jax import geometry, objects, tactile
 
+pytestmark = pytest.mark.slow
+
 SENSOR = sts.Sensor()
 FINE = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, cells=(300, 300)))
 RADIUS = 0.03  # m
@@ -42,7 +44,7 @@ def rest(name):
         body = from_trimesh(trimesh.creation.box((0.05, 0.03, 0.02)))
     else:
         body = objects.make(jax.random.key(3), name)
-    return body, *lay(Config(name, position=(0.0113, -0.0071), turn=17.0), body)[:2]
+    return body, *lay(Config(name, position=(0.0113, -0.0071), turn=17.0), sts.Sensor(), body)[:2]
 
 
 def seen(name, sensor, size, crop=False):

@@ -69,6 +69,7 @@ def close(a, b, rtol=2e-4):
         np.testing.assert_allclose(x, y, rtol=rtol, atol=rtol * max(1e-3, float(jnp.max(jnp.abs(y)))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "asked", "absent"),
     [

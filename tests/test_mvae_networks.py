@@ -32,6 +32,7 @@ def test_sizes_are_the_papers():
     assert shapes["encoders"]["pose"]["first"]["kernel"] == (7, 512)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(32, 32, 3), (48, 64, 1)])
 def test_any_size_of_image_comes_back(shape):
     config = mvae.Config((mvae.Modality("a", "image", shape),), latent=6, hidden=9, widths=(4, 4, 4, 4), condition=2)
@@ -84,6 +85,7 @@ def test_batch_norm_without_a_present_sample_changes_nothing():
     np.testing.assert_array_equal(norm.var[...], 1)
 
 
+@pytest.mark.slow
 def test_an_untrained_model_uses_a_few_quiet_latents_and_leaves_the_others_at_the_prior():
     graphdef, params, stats = mvae.init(jax.random.key(1), PAPER)
     images = jax.random.uniform(jax.random.key(2), (8, 64, 64, 3))

@@ -368,6 +368,7 @@ def painted_ball(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
+@pytest.mark.slow
 def test_decimation_keeps_volume_and_colours(tmp_path):
     mesh = painted_ball(tmp_path / "ball.ply")
     entry = objects.read(objects.library(tmp_path), 0)

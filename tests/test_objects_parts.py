@@ -10,6 +10,8 @@ import trimesh
 from sts_jax import objects
 from sts_jax.objects.solids import convex_parts, outside_hull, surface_gaps
 
+pytestmark = pytest.mark.slow
+
 
 def corner_piece() -> trimesh.Trimesh:
     """An L of two arms, 100 and 80 mm long and 20 mm thick, in the plane y = 0; its cavity is x > 20 mm, z > 20 mm."""

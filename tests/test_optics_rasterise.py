@@ -157,6 +157,7 @@ def test_two_sided_faces_are_seen_from_behind():
         assert bool(jnp.any(seen >= 0)) == two_sided
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bumpy", "ring", "bottle"])
 def test_faces_within_an_order_have_an_image_of_their_own(name):
     body = BODIES[name]
@@ -191,6 +192,7 @@ def test_vmap_is_the_loop():
         assert np.sum(alone != winner) <= 4
 
 
+@pytest.mark.slow
 def test_depths_gradient_is_the_finite_difference():
     body = BODIES["box"]
     pose = jnp.asarray([0.004, -0.003, 0.06, 0.9, 0.3, 0.2, 0.24])

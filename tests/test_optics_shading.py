@@ -187,6 +187,7 @@ def test_nothing_hides_nothing():
     assert not np.any(hidden_by(box_heights(-0.1, 0.03, 0.03), -0.05, centres(30), centres(40)))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_the_finite_differences():
     room = optics.Room()
     x, y = jnp.linspace(-0.07, 0.07, 15), jnp.linspace(-0.07, 0.07, 15)

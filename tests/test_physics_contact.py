@@ -125,6 +125,7 @@ def test_flat_points_are_refused() -> None:
         contact.hull(np.random.default_rng(0).normal(size=(1, 32, 3)) * [1, 1, 0])
 
 
+@pytest.mark.slow
 def test_parts_leave_free_what_their_common_hull_fills() -> None:
     # An arch of two posts and a beam straddles the stop wall: only the beam, 5 mm above it, keeps it from the wall.
     def box(centre: list[float], size: list[float]) -> np.ndarray:
@@ -145,6 +146,7 @@ def test_parts_leave_free_what_their_common_hull_fills() -> None:
     assert np.min(roll._contacts(model, filled, pose).dist[8:]) < -0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lean", [0.0, 0.4, -0.4])
 def test_what_lies_across_the_wall_is_held_by_it_as_in_c(lean: float) -> None:
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.01, 0.05, 0.004]

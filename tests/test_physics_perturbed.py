@@ -36,6 +36,7 @@ def rigid(bodies: list[objects.Body], traj: physics.Trajectory, row: int) -> tup
     return float(mass), np.asarray(com, np.float64), np.asarray(inertia, np.float64)
 
 
+@pytest.mark.slow
 def test_it_stands_and_is_felt_in_the_first_frame(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
     up = jax.vmap(upright)(jnp.asarray(shaken.pose[:, 0, 3:]))
     np.testing.assert_allclose(up, 1, atol=1e-4)

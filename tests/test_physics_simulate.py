@@ -121,6 +121,7 @@ def energy(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> n
     return kinetic + mass * G * (drops.pose[row, :, 2] + (matrix @ com)[:, 2])
 
 
+@pytest.mark.slow
 def test_energy_out_of_contact_never_exceeds_the_start_s_in_any_step(bodies: list[objects.Body]) -> None:
     every_step = dataclasses.replace(SCENARIO, rate=1000.0, frames=400)
     drops = jax.tree.map(
@@ -262,6 +263,7 @@ def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body]) -> N
     assert np.all(drops.pose[gone, -1, 2] < -0.01)
 
 
+@pytest.mark.slow
 def test_objects_compile_once(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
     from sts_jax.physics.simulate import _roll
 
@@ -271,6 +273,7 @@ def test_objects_compile_once(bodies: list[objects.Body], drops: physics.Traject
     assert _roll._cache_size() == before
 
 
+@pytest.mark.slow
 def test_progress_and_resampling(
     bodies: list[objects.Body], drops: physics.Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:

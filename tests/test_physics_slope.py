@@ -50,6 +50,7 @@ def test_below_the_friction_angle_it_holds() -> None:
     assert np.all(creep < 1e-3), creep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "degrees"), [(0.2, 30), (0.4, 30), (0.2, 18), (0.4, 45)])
 def test_above_it_slides_with_what_friction_leaves(friction: float, degrees: float) -> None:
     slope = np.radians(degrees)
@@ -79,6 +80,7 @@ def test_it_slides_as_in_c() -> None:
         np.testing.assert_allclose(found.pose[row, -1, :3], data.qpos[:3], atol=3e-4)  # of 30 mm
 
 
+@pytest.mark.slow
 def test_a_ball_rolls_with_five_sevenths_of_the_pull() -> None:
     radius, mass = 0.02, 0.1
     constants = dataclasses.replace(SCENARIO.contact, rolling=0.0)
@@ -122,6 +124,7 @@ def weight(bodies: list[objects.Body], slid: physics.Trajectory, row: int) -> tu
     return G * float(mass), np.asarray(com)
 
 
+@pytest.mark.slow
 def test_starts_rest_on_a_face_or_hang_just_above_and_never_in_the_wall(
     bodies: list[objects.Body], slid: physics.Trajectory
 ) -> None:
@@ -142,6 +145,7 @@ def test_starts_rest_on_a_face_or_hang_just_above_and_never_in_the_wall(
     assert 0.6 <= resting / len(slid.pose) <= 0.95
 
 
+@pytest.mark.slow
 def test_at_rest_it_is_laid_where_its_contents_decide_whether_it_tips(bodies: list[objects.Body]) -> None:
     keys = jax.random.split(jax.random.key(5), 300)
     rng = np.random.default_rng(0)
@@ -168,6 +172,7 @@ def test_at_rest_it_is_laid_where_its_contents_decide_whether_it_tips(bodies: li
             assert np.mean(widest > np.quantile(one, share)) == pytest.approx(1 - share**16, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], slid: physics.Trajectory) -> None:
     on_pad = slid.settled & (slid.outcome != physics.Outcome.FELL_OFF)
     leaning, alone = np.flatnonzero(on_pad & slid.wall[:, -1]), np.flatnonzero(on_pad & ~slid.wall[:, -1])
@@ -186,6 +191,7 @@ def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], 
     assert np.mean(carried < 0.95) > 0.5  # the wall carries the rest
 
 
+@pytest.mark.slow
 def test_pad_and_wall_together_are_all_that_pushes() -> None:
     model, like, data = scene.template(PAD, SCENARIO.contact, 0.03)
     model = copy.copy(model)
@@ -215,6 +221,7 @@ def test_pad_and_wall_together_are_all_that_pushes() -> None:
         np.testing.assert_allclose(np.ptp(box, 0), np.ptp(state.contact.pos[theirs], 0), atol=5e-4)
 
 
+@pytest.mark.slow
 def test_what_falls_beside_the_pad_gains_no_energy_at_the_wall() -> None:
     model, like, data = scene.template(PAD, SCENARIO.contact, 0.02)
     model = copy.copy(model)
@@ -234,6 +241,7 @@ def test_what_falls_beside_the_pad_gains_no_energy_at_the_wall() -> None:
     assert np.all(0.5 * np.sum(record.velocity[..., :3] ** 2, axis=-1) <= lost + 0.02)
 
 
+@pytest.mark.slow
 def test_outcomes_are_read_from_the_poses() -> None:
     first = jnp.array([0.01, -0.02, 0.05, 1, 0, 0, 0])
     turn = jnp.array([jnp.cos(0.5), 0, 0, jnp.sin(0.5)])  # 57 degrees
@@ -247,6 +255,7 @@ def test_outcomes_are_read_from_the_poses() -> None:
         assert int(SCENARIO.outcome(first, last)) == outcome
 
 
+@pytest.mark.slow
 def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
     keys = jax.random.split(jax.random.key(0), 2000)
     up = np.asarray(jax.vmap(SCENARIO.hidden)(keys).up)
@@ -264,6 +273,7 @@ def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
         physics.variant(SCENARIO, "none")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -281,6 +291,7 @@ def test_bad_fields_are_named(bodies: list[objects.Body], change: dict) -> None:
         physics.simulate(jax.random.key(0), bodies, Sensor(), dataclasses.replace(SCENARIO, **change))
 
 
+@pytest.mark.slow
 def test_what_does_not_stand_is_refused_by_name(bodies: list[objects.Body]) -> None:
     turned = dataclasses.replace(bodies[0], hulls=bodies[0].hulls[..., ::-1], shell_com=bodies[0].shell_com[::-1])
     leaning = jnp.asarray(bodies[0].hulls) + bodies[0].hulls[..., 2:] * jnp.array([1.5, 0, 0])

@@ -166,6 +166,7 @@ def test_what_cannot_be_answered_is_named(predictor, given, message):
         predictor(**given)
 
 
+@pytest.mark.slow
 def test_a_touch_that_training_never_saw_is_refused(tmp_path):
     predictor = sts.Predictor.load(train(tmp_path / "mvae", absent=("tactile",)))
     assert predictor.modalities == ("visual", "pose")
@@ -174,6 +175,7 @@ def test_a_touch_that_training_never_saw_is_refused(tmp_path):
     assert predictor(visual=measurement()["visual"]).tactile.shape == (SIDE, SIDE, 3)
 
 
+@pytest.mark.slow
 def test_a_condition_is_given_in_si_units(tmp_path):
     scale = np.array([10.0, 10.0, 0.1])
     predictor = sts.Predictor.load(train(tmp_path / "mvae", condition_scale=tuple(scale.tolist())))

@@ -119,6 +119,7 @@ def test_a_ball_sinks_as_the_springs_closed_form_says(radius, force):
     assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_more_load_never_makes_the_imprint_smaller(name):
     make, wrench = CASES[name]
@@ -273,6 +274,7 @@ def test_odd_things_under_any_load_are_balanced_or_flagged():
     assert balanced < 250
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball", "box pushed off its middle", "box pushed near its edge"])
 def test_gradients_are_the_finite_differences(name):
     make, wrench = CASES[name]

@@ -344,6 +344,7 @@ def parameters(lights, depth):
     return {"place": jnp.array([0.004, -0.003, depth]), "coupling": 0.0008, "lights": lights, "phong": tactile.Phong()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
 @pytest.mark.parametrize("depth", [0.002, -0.001], ids=["pressed", "flat"])
 def test_gradients_are_those_of_finite_differences(lights, depth):
@@ -377,6 +378,7 @@ def test_gradients_are_those_of_finite_differences(lights, depth):
             assert analytic == pytest.approx(numeric, rel=2e-3, abs=scale), jax.tree_util.keystr(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [0.002, 0.0, -0.001], ids=["pressed", "touching", "flat"])
 @pytest.mark.parametrize("coupling", [0.0, 0.001])
 @pytest.mark.parametrize(

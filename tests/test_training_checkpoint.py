@@ -157,6 +157,7 @@ def test_a_folder_without_a_manifest_can_be_sealed(folder, finished):
         training.seal(folder / "nowhere")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["before the checkpoint", "before the manifest", "before the older one goes"])
 @pytest.mark.parametrize("at", [1, 3])
 def test_a_kill_inside_a_save_loses_nothing(tmp_path, finished, monkeypatch, moment, at):
@@ -284,6 +285,7 @@ def test_blanks_of_another_kind_are_named(tmp_path):
             training.load_blank(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [b"\xff\xfe", b"[]", b"{}", b'{"step": "one"}', b'{"step"', b"7"])
 def test_a_damaged_record_is_named_and_a_torn_last_one_is_dropped(tmp_path, finished, line):
     def stop(done, total, record):

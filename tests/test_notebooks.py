@@ -1,0 +1,49 @@
+"""The notebooks of the documentation, executed in fresh kernels."""
+
+import base64
+import io
+import re
+from pathlib import Path
+
+import nbclient
+import nbformat
+import numpy as np
+import pytest
+from PIL import Image
+
+NOTEBOOKS = Path(__file__).parent.parent / "docs" / "notebooks"
+
+pytestmark = [
+    pytest.mark.slow,
+    # jupyter_client warns that its loopback connection is not encrypted, and zmq about event loops
+    pytest.mark.filterwarnings("ignore"),
+]
+
+
+def executed(name: str) -> tuple[list[np.ndarray], str]:
+    """The pictures and the printed text of a notebook that is executed now."""
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", 4)
+    nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+    pictures = []
+    for output in outputs:
+        if "image/png" in output.get("data", {}):
+            with Image.open(io.BytesIO(base64.b64decode(output.data["image/png"]))) as picture:
+                pictures.append(np.asarray(picture.convert("RGB")))
+    return pictures, "".join(output.text for output in outputs if output.output_type == "stream")
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "printed"),
+    [
+        ("press_and_light", 6, r"largest pressure: 1\.\d\d kPa, now 3\.\d\d kPa"),
+        ("fit_a_pose", 2, r"blur  1\.5 mm: 0\.[01]\d\d mm and 0\.\d\d degrees off"),
+        ("drop_train_predict", 3, r"the predicted place is \d+ mm from the true one"),
+    ],
+)
+def test_a_notebook_runs_and_shows_its_pictures(name, number, printed, monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)  # as a user compiles, see conftest.py
+    pictures, text = executed(name)
+    assert len(pictures) == number
+    assert all(picture.std() > 5 for picture in pictures)
+    assert re.search(printed, text)
