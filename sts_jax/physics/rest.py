@@ -57,7 +57,7 @@ def stable_faces(
         ValueError: a value of the body is not finite, or its hull spans no volume.
     """
     body.check()
-    com = np.asarray(_rigid(body, fill, shell_scale, up)[1], np.float64)
+    com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
     if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
         raise ValueError("hulls spans no volume: a body needs at least four points that do")
@@ -89,7 +89,7 @@ def weight(
     Returns:
         Force (N) and moment (N m).
     """
-    mass, com, _ = _rigid(body, fill, shell_scale, up)
+    mass, com, _ = _rigid(body, fill, shell_scale, np.asarray(up, np.float32))
     x, y, _ = _transform(jnp.asarray(pose), com)
     zero = jnp.zeros_like(mass)
     return G * mass * jnp.stack([zero, zero, zero + 1, y, -x, zero])
