@@ -9,7 +9,7 @@ import trimesh
 
 import sts_jax as sts
 from experiments import command, errors, freefall, inclined, perturbed, pictures, results, stages
-from sts_jax import _files, compilation, dataset, physics
+from sts_jax import _files, compilation, dataset, physics, training
 
 BOTTLES = ("bottle",)
 

@@ -57,6 +57,7 @@ def test_lists_and_tuples_of_numbers_are_taken():
     np.testing.assert_array_equal(touch(SENSOR, imprint.tolist(), window), touch(SENSOR, imprint, jnp.array(window)))
 
 
+@pytest.mark.slow
 def test_the_pose_drawn_has_no_negative_w():
     for pose in (POSE.at[3].set(-1), POSE.at[3:].set(jnp.array([-0.01, 1, 0, 0]))):
         frame = sense(SENSOR, BODY, pose, WRENCH, resolution=(16, 16))
@@ -98,6 +99,7 @@ def test_a_known_body_with_a_value_that_is_not_finite_is_an_error(field):
             call(SENSOR, bad, POSE, WRENCH) if call is sense else call(POSE, WRENCH)
 
 
+@pytest.mark.slow
 def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_sensor():
     draw = jax.jit(functools.partial(sense, resolution=(16, 16)))
     gone = draw(SENSOR, BODY, POSE.at[2].set(-1), WRENCH)

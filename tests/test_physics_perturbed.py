@@ -124,6 +124,7 @@ ROLL = jax.jit(jax.vmap(roll.roll, in_axes=(None, None, None, None, 0)))
 ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["box", "bottle"])
 def test_a_tall_prism_topples_at_g_b_over_h(shape: str) -> None:
     height, half = 0.1, 0.015

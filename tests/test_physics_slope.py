@@ -44,6 +44,7 @@ def slide(friction: float, constants: physics.Contact, frames: int, slope: float
     return jax.tree.map(np.asarray, ROLL(own, data, hull, start, jnp.asarray(gravity, jnp.float32))[1])
 
 
+@pytest.mark.slow
 def test_below_the_friction_angle_it_holds() -> None:
     found = slide(float(np.tan(SLOPE) / 0.97), physics.Inclined().contact, 10)
     creep = np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 6, :2], axis=1) / (5 * 0.05)
