@@ -149,7 +149,7 @@ def test_a_folder_without_a_manifest_can_be_sealed(folder, finished):
     for read in (training.load, train):
         with pytest.raises(ValueError, match=r"no manifest\.json.*earlier version.*training\.seal\("):
             read(folder)
-    training.seal(folder)
+    training.seal(str(folder))  # as the message words it
     same(training.load(folder).state, finished[1].state)
     with pytest.raises(ValueError, match="has a manifest"):
         training.seal(folder)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.spatial import ConvexHull, KDTree
 
-from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body, check_category
 from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
@@ -120,8 +120,10 @@ def load(
         ("mass", mass, "kilograms"),
         ("density", density, "kilograms per square metre"),
     ):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value}")
+        if value is not None and not (
+            np.asarray(value).dtype.kind in "iuf" and np.ndim(value) == 0 and np.isfinite(value) and value > 0
+        ):
+            raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
             raise ValueError(f"{path}: {name} is {value} m, the pad is {PAD} m wide: give at most that")
@@ -129,11 +131,10 @@ def load(
             raise ValueError(
                 f"{path}: {name} is {value} m, the smallest object is {SMALLEST} m long: give at least that"
             )
-    if not -1 <= category < len(CATEGORIES):
-        raise ValueError(
-            f"{path}: category is {category}; it must be from 0 to {len(CATEGORIES) - 1}, an index into "
-            "objects.CATEGORIES, or -1"
-        )
+    try:
+        check_category(category)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and faces < 4:
