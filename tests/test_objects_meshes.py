@@ -1,3 +1,4 @@
+import inspect
 import warnings
 from pathlib import Path
 
@@ -276,7 +277,7 @@ def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
 )
 def test_bad_arguments(box, arguments, message):
     with pytest.raises(ValueError, match=message):
-        objects.load(box, **arguments)
+        inspect.unwrap(objects.load)(box, **arguments)
 
 
 def test_larger_than_the_pad(tmp_path):
