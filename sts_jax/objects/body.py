@@ -50,7 +50,7 @@ class Body:
     category: Int[Array, "*n"]  # index into CATEGORIES, -1 for a loaded mesh
 
     def check(self) -> None:
-        """See that this is one body that can be drawn and simulated: on the host, never under `jit`.
+        """Raise an error unless this is one body that can be drawn and simulated. Runs on the host, not under `jit`.
 
         Raises:
             ValueError: the body has leading axes, a value that is not finite, a face of a vertex that does not exist,

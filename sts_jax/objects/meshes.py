@@ -159,7 +159,7 @@ def load(
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
-        # trimesh guesses the encoding of what is no UTF-8 with a package that is not among its requirements.
+        # For text that is not UTF-8, trimesh imports a package that is not among its requirements.
         damaged = "it is truncated or damaged: replace it" if error.name == "charset_normalizer" else "install it"
         raise ValueError(f"{path}: cannot be read as a mesh ({error}); {damaged}") from error
     except Exception as error:  # trimesh raises whatever its many readers raise
@@ -195,7 +195,7 @@ def load(
 
 
 def _check_file(path: Path) -> None:
-    """See that a file is there, readable, not empty, and, of an STL, complete."""
+    """Raise an error unless a file exists, is readable and not empty. An STL file must also be complete."""
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; give a mesh file in it, or the folder to objects.library")
     if not path.is_file():

@@ -163,7 +163,9 @@ def place(
 
 def _check_body(body: object) -> None:
     if not isinstance(body, Body):
-        raise TypeError(f"body is {body!r:.60}; it takes one Body: objects.make draws one, objects.load reads a mesh file")
+        raise TypeError(
+            f"body is {body!r:.60}; it takes one Body: objects.make draws one, objects.load reads a mesh file"
+        )
 
 
 def _index(faces: StableFaces, face: int | str) -> int:
