@@ -5,7 +5,14 @@ from collections.abc import Iterator
 
 from sts_jax.dataset import LockedError
 
-MENDABLE = (OSError, ValueError, ImportError, LockedError)  # the types of the errors that the library raises on purpose
+# The types of the errors that the library raises on purpose.
+MENDABLE = (
+    OSError,
+    ValueError,
+    ImportError,
+    FloatingPointError,
+    LockedError,
+)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf")  # writte
 
 
 def check_picture(path: Path) -> None:
-    """See that a picture can be written.
+    """Raise an error unless a picture can be written.
 
     Raises:
         OSError: its folder does not exist or is not writable, or the path is a folder.
@@ -28,7 +28,7 @@ def check_picture(path: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, or see that an existing one can be written to.
+    """Make a folder, or raise an error unless an existing one can be written to.
 
     Raises:
         OSError: it cannot be made or written to.

@@ -131,7 +131,7 @@ def _abstract(*operands: Any, **params: Any) -> list[Any]:
 def _derivative(
     primals: Sequence[ArrayLike], tangents: Sequence[Any], **params: Any
 ) -> tuple[list[Array], list[Array]]:
-    """Of second order, by the function itself: the operation is linear in its vectors only."""
+    """The second derivative, from the function itself: the operation is linear in its vectors only."""
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
 
     def of_moving(*values: Array) -> list[Array]:

@@ -33,13 +33,19 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
 
     Raises:
         OSError: the folder cannot be created.
+        ValueError: `folder` is an empty string.
     """
     if folder is None and "JAX_COMPILATION_CACHE_DIR" in os.environ:
         folder = os.environ["JAX_COMPILATION_CACHE_DIR"]
         if not folder:
             return None
+    if folder is not None and not os.fspath(folder):
+        raise ValueError("folder is empty: give a path, '.' for the current directory.")
     path = cache_folder() / processor() if folder is None else Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise type(error)(f"{path} cannot be made ({error.strerror}): give another folder for the cache.") from error
     jax.config.update("jax_compilation_cache_dir", str(path))
     # By default JAX keeps only programs that took a second; a session runs hundreds of smaller ones.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)

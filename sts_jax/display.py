@@ -111,6 +111,11 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         if isinstance(thing, Frame):
             _one("Frame", thing.depth, 2)
             image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
+        elif isinstance(thing, tuple(_KINDS.values())):
+            raise TypeError(
+                f"a .png file keeps the picture of a Frame or an image, got a {type(thing).__name__}: save it as .npz, "
+                "or draw it with sts.show(...).savefig(path)"
+            )
         else:
             image = _image(thing)
         data = io.BytesIO()
@@ -133,11 +138,14 @@ def load(path: str | os.PathLike[str]) -> Any:
 
     Raises:
         FileNotFoundError: there is no such file.
+        ValueError: the path is a folder, or has another suffix than .npz.
         TornFileError: the file is damaged, or `save` did not write it.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; sts.save writes one")
+    if path.is_dir() or path.suffix != ".npz":
+        raise ValueError(f"path is {str(path)!r}; it must be an .npz file that sts.save wrote")
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = dict(file)

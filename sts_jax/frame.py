@@ -39,7 +39,9 @@ class Frame:
     window: Float[Array, "*n 4"]  # m, (left, top, width, height) on the gel's face that the images show
 
     def __repr__(self) -> str:
-        *lead, height, width = jnp.shape(self.depth)
+        if not hasattr(self.depth, "shape") or len(self.depth.shape) < 2:  # JAX also builds trees of other leaves
+            return f"Frame(depth={self.depth!r})"
+        *lead, height, width = self.depth.shape
         size = f"{width} x {height} pixels"
         if lead or isinstance(self.depth, jax.core.Tracer) or not isinstance(self.depth, jax.Array | np.ndarray):
             return f"Frame({' x '.join(map(str, lead))}{' frames, ' if lead else ''}{size})"
@@ -94,10 +96,11 @@ def sense(
         ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
             more faces than can be drawn, all of this under `jit` too; or the sensor or the body cannot be (`check`),
             of what is known of them.
-        TypeError: an argument that is no sensor or no body.
+        TypeError: an argument is no sensor, no body or no array of numbers.
     """
     _check_kinds(sensor, body)
-    pose, wrench = jnp.asarray(pose, float), None if wrench is None else jnp.asarray(wrench, float)
+    pose = _numbers("pose", pose, "(7,), position (m), quaternion")
+    wrench = None if wrench is None else _numbers("wrench", wrench, "(6,), force (N) and moment (N m)")
     _check_shapes(body, pose, wrench, resolution)
     sensor, sound = sensor.guard()
     sound = jnp.asarray(sound)
@@ -205,6 +208,16 @@ def _check_kinds(sensor: Any, body: Any) -> None:
         body.check()
 
 
+def _numbers(name: str, value: Any, wanted: str) -> Array:
+    """The value as floating-point numbers; a tuple of arrays, such as a whole `Placement`, is none."""
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        raise TypeError(f"{name} is a {type(value).__name__}; it takes {wanted}. Unpack it with *")
+    try:
+        return jnp.asarray(value, float)
+    except (TypeError, ValueError):
+        raise TypeError(f"{name} is {value!r}; it takes {wanted}") from None
+
+
 def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:
     whole = isinstance(resolution, Sequence) and all(isinstance(n, int | np.integer) for n in resolution)
     if not whole or len(resolution) != 2 or min(resolution) < 1:
@@ -250,6 +263,10 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     """
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
+    if not isinstance(frame, Frame):
+        raise TypeError(f"frame is a {type(frame).__name__}; it takes the Frame that sense returns")
+    if not isinstance(light, jax.core.Tracer) and np.asarray(light).dtype.kind not in "iuf":
+        raise TypeError(f"light is {light!r}; it takes one number, from 0 (visual) to 1 (tactile)")
     if jnp.ndim(light):
         raise ValueError(f"light has the shape {jnp.shape(light)}; it takes one number. For several use jax.vmap")
     if not isinstance(light, jax.core.Tracer) and not 0 <= np.asarray(light) <= 1:
@@ -285,7 +302,10 @@ def touch(
             cannot be, of what is known of them.
     """
     _check_sensor(sensor)
-    imprint = jnp.asarray(imprint)
+    try:
+        imprint = jnp.asarray(imprint)
+    except (TypeError, ValueError):
+        raise TypeError(f"imprint is {imprint!r}; it takes an array (height, width) in metres") from None
     if not jnp.issubdtype(imprint.dtype, jnp.floating):
         raise ValueError(
             f"imprint has the type {imprint.dtype}; it takes floating-point numbers in metres, 0.0005 for half a "
@@ -297,7 +317,7 @@ def touch(
     sensor, sound = sensor.guard()
     rows, columns = imprint.shape
     full = optics.full_window(sensor.camera, (rows, columns))
-    window = full if window is None else jnp.asarray(window, float)
+    window = full if window is None else _numbers("window", window, "(4,), left, top, width, height (m)")
     if window.shape != (4,):
         raise ValueError(f"window has the shape {window.shape}; it takes (4,), left, top, width, height (m)")
     somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)

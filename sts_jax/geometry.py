@@ -2,8 +2,10 @@
 
 A quaternion is `[w, x, y, z]`, shape `(4,)`, unit length. A pose is a position (m), then a quaternion, shape `(7,)`. It
 maps points of the mesh frame to the sensor frame. All functions broadcast over leading axes and have finite gradients,
-also at zero and at the identity.
+also at zero and at the identity. They take lists of numbers too, and raise a ValueError for an array of another shape.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +28,7 @@ def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
 
 def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """Hamilton product: the rotation `b`, then the rotation `a`."""
+    a, b = _checked("a", a, 4), _checked("b", b, 4)
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
     return jnp.stack(
@@ -41,17 +44,20 @@ def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Arr
 
 def quat_inverse(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """Inverse of a unit quaternion: its conjugate."""
+    q = _checked("q", q, 4)
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """The same rotation, unit, with `w >= 0`."""
+    q = _checked("q", q, 4)
     q = normalize(q)
     return jnp.where(q[..., :1] < 0, -q, q)
 
 
 def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     """Rotation matrix of a unit quaternion."""
+    q = _checked("q", q, 4)
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [
         jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -67,7 +73,7 @@ def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
     The nearest rotation R has the largest `sum(R * matrix)`. Its quaternion is the eigenvector of the largest
     eigenvalue of Davenport's K (Markley and Mortari 2000, "Quaternion attitude estimation using vector observations").
     """
-    m = matrix
+    m = _checked("matrix", matrix, 3, 3)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     z = jnp.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], axis=-1)
     corner = m + m.swapaxes(-1, -2) - jnp.tensordot(trace, jnp.eye(3), 0)
@@ -98,12 +104,14 @@ def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> t
 
 def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
     """Quaternion of the rotation by `|v|` radians about `v`; differentiable at zero."""
+    v = _checked("v", v, 3)
     half = 0.5 * norm(v)[..., None]
     return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
 
 
 def quat_to_rotvec(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
     """Rotation vector (rad) of a unit quaternion: the axis times the angle, which is at most pi."""
+    q = _checked("q", q, 4)
     q = quat_canonical(q)
     sine = norm(q[..., 1:])[..., None]
     small = sine < 1e-6
@@ -118,6 +126,9 @@ def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:
 
 def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
     """Points of the mesh frame in the sensor frame."""
+    pose, points = _checked("pose", pose, 7), _checked("points", points, 3)
+    if pose.ndim != 1:
+        raise ValueError(f"pose has the shape {pose.shape}; it must be (7,). For several poses use jax.vmap")
     # Component by component: as a product of matrices it is several times slower on a CPU, and rounded on some GPUs.
     x, y, z = (points[..., k] for k in range(3))
     rows = zip(quat_to_matrix(pose[3:]), pose[:3], strict=True)
@@ -126,6 +137,7 @@ def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Ar
 
 def pose_to_matrix(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 4 4"]:
     """Homogeneous 4x4 matrix of a pose."""
+    pose = _checked("pose", pose, 7)
     top = jnp.concatenate([quat_to_matrix(pose[..., 3:]), pose[..., :3, None]], axis=-1)
     bottom = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), (*pose.shape[:-1], 1, 4))
     return jnp.concatenate([top, bottom.astype(top.dtype)], axis=-2)
@@ -133,11 +145,13 @@ def pose_to_matrix(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 4 4"]:
 
 def pose_from_matrix(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 7"]:
     """Pose of a homogeneous 4x4 matrix, with `w >= 0`."""
+    matrix = _checked("matrix", matrix, 4, 4)
     return jnp.concatenate([matrix[..., :3, 3], quat_from_matrix(matrix[..., :3, :3])], axis=-1)
 
 
 def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
     """Composition of two poses: the pose `b`, then the pose `a`. Its matrix is the product of theirs."""
+    a, b = _checked("a", a, 7), _checked("b", b, 7)
     quat = quat_multiply(a[..., 3:], b[..., 3:])
     turned = jnp.einsum("...ij,...j->...i", quat_to_matrix(a[..., 3:]), b[..., :3], precision="highest")
     return jnp.concatenate([turned + a[..., :3], quat_canonical(quat)], axis=-1)
@@ -145,6 +159,23 @@ def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Arr
 
 def pose_inverse(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
     """The pose that maps the sensor frame into the mesh frame."""
+    pose = _checked("pose", pose, 7)
     quat = quat_inverse(pose[..., 3:])
     position = -jnp.einsum("...ij,...j->...i", quat_to_matrix(quat), pose[..., :3], precision="highest")
     return jnp.concatenate([position, quat_canonical(quat)], axis=-1)
+
+
+def _checked(name: str, value: Any, *tail: int) -> Array:
+    """The value as an array whose last axes have the given sizes."""
+    if not hasattr(value, "shape"):
+        try:
+            value = jnp.asarray(value, float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name} is {value!r}; it must be an array of {_shape(tail)} numbers") from error
+    if value.shape[max(value.ndim - len(tail), 0) :] != tail:
+        raise ValueError(f"{name} has the shape {value.shape}; it must be {_shape(tail)}")
+    return value
+
+
+def _shape(tail: tuple[int, ...]) -> str:
+    return f"(..., {', '.join(map(str, tail))})"

@@ -1,6 +1,7 @@
 """A small collection from objects to shards: resumable, reproducible, split by object."""
 
 import dataclasses
+import inspect
 import json
 import shutil
 
@@ -241,7 +242,7 @@ def test_a_split_that_is_none_is_refused(copied, change, message):
         ("sensor.json", None, r"sensor\.json is missing"),
         ("sensor.json", b'{"gel"', r"sensor\.json cannot be read as JSON"),
         ("sensor.json", b"{}", r"npz was made with another sensor\.json"),
-        ("split.json", b"\xff", r"split\.json cannot be read as JSON"),
+        ("split.json", b"\xff", r"split\.json cannot be read as JSON .*delete .*split\.json and start the collection"),
         ("split.json", b"7", r"split\.json must have the parts train, validation, test, got a int"),
         ("collection.json", None, r"collection\.json is missing: .* is not a collected dataset"),
         ("collection.json", b"\xff", r"collection\.json cannot be read as JSON"),
@@ -281,6 +282,17 @@ def test_an_older_dataset_must_be_collected_again(copied):
             ValueError, match=r"is a dataset of format 1, and this version reads format 2: delete .* and"
         ):
             use(copied)
+
+
+@pytest.mark.parametrize("given", [[99], [-1], [0.5], [True, False], 0, "a"])
+def test_trajectories_that_do_not_exist_are_named(folder, given):
+    with pytest.raises(ValueError, match=r"trajectories (has the type|holds)"):
+        inspect.unwrap(type(dataset.load(folder)).pairs)(dataset.load(folder), given)
+
+
+def test_a_file_in_the_place_of_a_dataset_is_named(folder):
+    with pytest.raises(NotADirectoryError, match=r"collection\.json is a file: give the folder"):
+        dataset.load(folder / "collection.json")
 
 
 def test_the_identity_of_a_dataset_is_that_of_its_files(folder, copied):

@@ -78,6 +78,10 @@ def test_a_file_of_another_format_is_refused(tmp_path):
         sts.load(tmp_path / "x.npz")
     with pytest.raises(FileNotFoundError, match="no such file"):
         sts.load(tmp_path / "none.npz")
+    for path in (tmp_path, tmp_path / "x.png"):
+        path.touch()
+        with pytest.raises(ValueError, match=r"must be an \.npz file that sts\.save wrote"):
+            sts.load(path)
 
 
 @pytest.mark.parametrize(
@@ -116,6 +120,12 @@ def test_a_body_is_seen_from_outside():
     [
         ("a.npz", np.zeros((2, 2, 3)), TypeError, "keeps one of Frame, Body, Trajectory, got ndarray"),
         ("a.png", 3.0, TypeError, "got float"),
+        (
+            "a.png",
+            BODY,
+            TypeError,
+            r"a \.png file keeps the picture of a Frame or an image, got a Body: save it as \.npz",
+        ),
         ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
         ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),
         ("a.png", np.full((2, 2, 3), np.nan), ValueError, "must be uint8, or floats"),

@@ -91,6 +91,23 @@ def test_what_is_no_sensor_or_body_is_named():
             call(None, jnp.zeros((4, 4)), 0.5)
 
 
+def test_what_is_no_array_of_numbers_is_named():
+    cases = [
+        (
+            lambda: sense(SENSOR, BODY, sts.physics.rest.Placement(POSE, WRENCH)),
+            r"pose is a Placement; .* Unpack it with \*",
+        ),
+        (lambda: sense(SENSOR, BODY, None), r"pose is None; it takes \(7,\)"),
+        (lambda: sense(SENSOR, BODY, POSE, "heavy"), r"wrench is 'heavy'; it takes \(6,\)"),
+        (lambda: touch(SENSOR, "imprint.png"), r"imprint is 'imprint\.png'; it takes an array"),
+        (lambda: touch(SENSOR, jnp.zeros((4, 4)), "all"), r"window is 'all'; it takes \(4,\)"),
+        (lambda: expose(SENSOR, jnp.zeros((4, 4, 3)), 0.5), "frame is a .*; it takes the Frame"),
+    ]
+    for call, message in cases:
+        with pytest.raises(TypeError, match=message):
+            call()
+
+
 @pytest.mark.parametrize("field", ["vertices", "normals", "colors"])
 def test_a_known_body_with_a_value_that_is_not_finite_is_an_error(field):
     bad = dataclasses.replace(BODY, **{field: getattr(BODY, field).at[7, 1].set(jnp.nan)})

@@ -1,5 +1,7 @@
 """Rotations and poses against SciPy's and against 4x4 matrices; gradients against differences."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,3 +102,38 @@ def test_the_gradient_through_a_matrix_and_back_is_that_of_differences(vector):
 
     got = jax.jacrev(round_trip)(jnp.array(vector))  # the round trip is the identity
     np.testing.assert_allclose(got, np.eye(3), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("pose_from_matrix", (jnp.eye(3),), r"matrix has the shape \(3, 3\); it must be \(..., 4, 4\)"),
+        ("quat_from_matrix", (jnp.eye(2),), r"matrix has the shape \(2, 2\); it must be \(..., 3, 3\)"),
+        ("quat_from_rotvec", (jnp.zeros(4),), r"v has the shape \(4,\); it must be \(..., 3\)"),
+        ("quat_canonical", (jnp.ones(3),), r"q has the shape \(3,\); it must be \(..., 4\)"),
+        (
+            "transform",
+            (
+                jnp.zeros((2, 7)),
+                jnp.zeros(3),
+            ),
+            r"pose has the shape \(2, 7\); .* jax\.vmap",
+        ),
+        (
+            "transform",
+            (
+                jnp.zeros(7),
+                [0, 0],
+            ),
+            r"points has the shape \(2,\); it must be \(..., 3\)",
+        ),
+        ("pose_inverse", ("upright",), r"pose is 'upright'; it must be an array of \(..., 7\) numbers"),
+    ],
+)
+def test_an_array_of_another_shape_is_named(name, given, message):
+    with pytest.raises(ValueError, match=message):
+        inspect.unwrap(getattr(geometry, name))(*given)
+
+
+def test_lists_of_numbers_are_taken():
+    np.testing.assert_allclose(inspect.unwrap(geometry.transform)([1, 2, 3, 0, 0, 0, 1], [1, 0, 0]), [0, 2, 3])

@@ -1,3 +1,4 @@
+import inspect
 import warnings
 from pathlib import Path
 
@@ -268,11 +269,15 @@ def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
         ({"scale": 0.001}, r"longest side is 0\.1 mm, and the smallest object is 5 mm long.*longest_side, or scale"),
         ({"category": 99}, "category is 99; it must be from 0 to 7"),
         ({"category": -2}, "category is -2; it must be from 0 to 7"),
+        ({"category": "mouse"}, r"category is 'mouse'; .*CATEGORIES\.index\('mouse'\)"),
+        ({"category": 1.5}, "category is 1.5; it must be from 0 to 7"),
+        ({"mass": True}, "mass must be a positive number of kilograms, got True"),
+        ({"longest_side": "10 cm"}, "longest_side must be a positive number of metres, got '10 cm'"),
     ],
 )
 def test_bad_arguments(box, arguments, message):
     with pytest.raises(ValueError, match=message):
-        objects.load(box, **arguments)
+        inspect.unwrap(objects.load)(box, **arguments)
 
 
 def test_larger_than_the_pad(tmp_path):

@@ -1,6 +1,7 @@
 """Bodies at rest: C MuJoCo leaves them there and carries them with the same wrench, and the gel balances them."""
 
 import dataclasses
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -139,3 +140,16 @@ def test_bodies_that_cannot_be_placed_are_named(bodies):
         physics.place(dataclasses.replace(bodies[0], hulls=jnp.zeros((1, 64, 3))), sts.Sensor())
     with pytest.raises(ValueError, match="vertices has 1 values that are not finite"):
         physics.place(dataclasses.replace(bodies[0], vertices=bodies[0].vertices.at[3, 1].set(jnp.nan)), sts.Sensor())
+
+
+def test_arguments_of_place_of_another_kind_are_named(bodies):
+    sensor, place = sts.Sensor(), inspect.unwrap(physics.place)
+    for given, message in (
+        (("mug.obj", sensor), r"body is 'mug\.obj'; it takes one Body: .* objects\.load reads a mesh file"),
+        ((sensor, bodies[0]), r"body is Sensor\(.*; it takes one Body"),
+        ((bodies[0], None), "sensor is None; it takes a Sensor"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            place(*given)
+    with pytest.raises(TypeError, match=r"body is traced.* outside jit"):
+        jax.eval_shape(lambda body: inspect.unwrap(physics.rest.stable_faces)(body), bodies[0])

@@ -378,6 +378,7 @@ def test_fields_of_another_kind_are_named(field: str, value: object, wanted: str
         ({"body": "bottle.obj"}, r"body 0 is 'bottle\.obj'; it takes a Body .*objects\.load"),
         ({"sensor": None}, "sensor is None; it takes a Sensor"),
         ({"scenario": "freefall"}, r"scenario is 'freefall'; it takes Freefall\(\)"),
+        ({"scenario": physics.Freefall}, r"scenario is <class .*Freefall'>; it takes Freefall\(\)"),
         ({"num": 1.5}, "num is 1.5; it takes a whole number"),
         ({"chunk": 0}, "chunk is 0; it takes a whole number"),
         ({"progress": "bar"}, "progress is 'bar'; it takes True, False or a function"),

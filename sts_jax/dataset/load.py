@@ -83,7 +83,20 @@ class Dataset:
         Args:
             trajectories: Their indices.
             symmetries: Each also turned and mirrored, as the collection rendered it.
+
+        Raises:
+            ValueError: An index is no whole number or out of range.
         """
+        trajectories = np.asarray(trajectories)
+        count = len(self.trajectory["outcome"])
+        if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
+            raise ValueError(
+                f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}; it takes a list "
+                "of indices (np.flatnonzero turns a mask into one)."
+            )
+        outside = trajectories[(trajectories < 0) | (trajectories >= count)]
+        if outside.size:
+            raise ValueError(f"trajectories holds {outside[0]}; the dataset has trajectories 0 to {count - 1}.")
         last = self.trajectory["pose"].shape[1] - 1
         kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]
         row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
@@ -150,10 +163,11 @@ def load(folder: str | Path) -> Dataset:
     )
 
 
-def _read(path: Path) -> Any:
-    remedy = f"delete {path.parent} and collect again"
+def _read(path: Path, remedy: str | None = None) -> Any:
+    if path.parent.exists() and not path.parent.is_dir():
+        raise NotADirectoryError(f"{path.parent} is a file: give the folder of a collected dataset.")
     try:
-        return read_json(path, remedy)
+        return read_json(path, remedy or f"delete {path.parent} and collect again")
     except FileNotFoundError:
         raise FileNotFoundError(
             f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of one, or collect into it."
@@ -172,8 +186,8 @@ def _whole_number(collection: dict, name: str, path: Path) -> int:
 
 def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
     """Read which objects train, validate and test: each object in one part."""
-    content = _read(path)
     remedy = f"delete {path} and start the collection again, which writes it anew"
+    content = _read(path, remedy)
     if not isinstance(content, dict) or set(content) != set(SPLITS):
         parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
         raise TornFileError(f"{path} must have the parts {', '.join(SPLITS)}, got {parts}; {remedy}.")

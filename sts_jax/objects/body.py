@@ -50,7 +50,7 @@ class Body:
     category: Int[Array, "*n"]  # index into CATEGORIES, -1 for a loaded mesh
 
     def check(self) -> None:
-        """See that this is one body that can be drawn and simulated: on the host, never under `jit`.
+        """Raise an error unless this is one body that can be drawn and simulated. Runs on the host, not under `jit`.
 
         Raises:
             ValueError: the body has leading axes, a value that is not finite, a face of a vertex that does not exist,
@@ -66,17 +66,13 @@ class Body:
                 number = int((~np.isfinite(values)).sum())
                 which = f"is {values}" if values.ndim == 0 else f"has {number:,} values that are not finite"
                 raise ValueError(f"{field.name} {which}; all must be finite: repair the mesh, or leave the body out")
-        faces, category = np.asarray(self.faces), int(self.category)
+        faces = np.asarray(self.faces)
         if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
             raise ValueError(
                 f"faces has indices from {faces.min()} to {faces.max()}; there are {len(self.vertices)} vertices, "
                 f"so they must be from 0 to {len(self.vertices) - 1}"
             )
-        if not -1 <= category < len(CATEGORIES):
-            raise ValueError(
-                f"category is {category}; it must be from 0 to {len(CATEGORIES) - 1}, an index into "
-                "objects.CATEGORIES, or -1 for an object of none of them"
-            )
+        check_category(np.asarray(self.category).tolist())
 
     def __repr__(self) -> str:
         arrays = [isinstance(leaf, np.ndarray | np.generic | jax.Array) for leaf in vars(self).values()]
@@ -100,6 +96,16 @@ class Body:
         full = float(self.contents_density) * volume
         holds = f"holds {full:.3g} kg in {1e6 * volume:.3g} ml" if full > 0 else "solid"
         return f"Body({name}, {size} mm, {float(self.shell_mass):.3g} kg, {holds}, {faces:,} faces, {hull})"
+
+
+def check_category(category: object) -> None:
+    """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1 for an object of none of them."""
+    number = np.asarray(category)
+    if number.shape or number.dtype.kind not in "iu" or not -1 <= number < len(CATEGORIES):
+        raise ValueError(
+            f"category is {category!r}; it must be from 0 to {len(CATEGORIES) - 1}, an index into objects.CATEGORIES, "
+            "such as CATEGORIES.index('mouse'), or -1 for an object of none of them"
+        )
 
 
 def is_traced(tree: object) -> bool:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.spatial import ConvexHull, KDTree
 
-from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body, check_category
 from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
 
 PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
@@ -120,8 +120,10 @@ def load(
         ("mass", mass, "kilograms"),
         ("density", density, "kilograms per square metre"),
     ):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value}")
+        if value is not None and not (
+            np.asarray(value).dtype.kind in "iuf" and np.ndim(value) == 0 and np.isfinite(value) and value > 0
+        ):
+            raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
             raise ValueError(f"{path}: {name} is {value} m, the pad is {PAD} m wide: give at most that")
@@ -129,11 +131,10 @@ def load(
             raise ValueError(
                 f"{path}: {name} is {value} m, the smallest object is {SMALLEST} m long: give at least that"
             )
-    if not -1 <= category < len(CATEGORIES):
-        raise ValueError(
-            f"{path}: category is {category}; it must be from 0 to {len(CATEGORIES) - 1}, an index into "
-            "objects.CATEGORIES, or -1"
-        )
+    try:
+        check_category(category)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and faces < 4:
@@ -158,7 +159,7 @@ def load(
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
-        # trimesh guesses the encoding of what is no UTF-8 with a package that is not among its requirements.
+        # For text that is not UTF-8, trimesh imports a package that is not among its requirements.
         damaged = "it is truncated or damaged: replace it" if error.name == "charset_normalizer" else "install it"
         raise ValueError(f"{path}: cannot be read as a mesh ({error}); {damaged}") from error
     except Exception as error:  # trimesh raises whatever its many readers raise
@@ -194,7 +195,7 @@ def load(
 
 
 def _check_file(path: Path) -> None:
-    """See that a file is there, readable, not empty, and, of an STL, complete."""
+    """Raise an error unless a file exists, is readable and not empty. An STL file must also be complete."""
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder; give a mesh file in it, or the folder to objects.library")
     if not path.is_file():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sts_jax import geometry, objects
 from sts_jax.objects import Body
+from sts_jax.objects.body import is_traced
 from sts_jax.physics.scenarios import STANDING, G
 from sts_jax.sensor import Sensor
 
@@ -54,8 +55,14 @@ def stable_faces(
         The faces, none for a body that rests on nothing.
 
     Raises:
+        TypeError: `body` is no Body, or is traced.
         ValueError: a value of the body is not finite, or its hull spans no volume.
     """
+    _check_body(body)
+    if is_traced((body, fill, shell_scale, up)):
+        raise TypeError(
+            "body is traced: its faces are found on the host; call this function outside jit, vmap and grad"
+        )
     body.check()
     com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
@@ -88,8 +95,13 @@ def weight(
 
     Returns:
         Force (N) and moment (N m).
+
+    Raises:
+        TypeError: `body` is no Body.
+        ValueError: `pose` has another shape than (7,).
     """
-    mass, com, _ = _rigid(body, fill, shell_scale, np.asarray(up, np.float32))
+    _check_body(body)
+    mass, com, _ = _rigid(body, fill, shell_scale, jnp.asarray(up, jnp.float32))
     x, y, _ = _transform(jnp.asarray(pose), com)
     zero = jnp.zeros_like(mass)
     return G * mass * jnp.stack([zero, zero, zero + 1, y, -x, zero])
@@ -126,9 +138,13 @@ def place(
         Pose and wrench.
 
     Raises:
+        TypeError: an argument is no Body, no Sensor, or traced.
         ValueError: there is no such face, or the body rests on none; the centre of mass does not lie over the pad; an
             argument is out of range or not finite.
     """
+    _check_body(body)
+    if not isinstance(sensor, Sensor):
+        raise TypeError(f"sensor is {sensor!r}; it takes a Sensor, for instance sts.Sensor()")
     _check_numbers(yaw, position, fill, shell_scale, up)
     faces = stable_faces(body, fill=fill, shell_scale=shell_scale, up=up)
     above = faces.up[_index(faces, face)]
@@ -153,6 +169,13 @@ def place(
             f"and the body would fall off; |x| must be below {half[0]:g} m and |y| below {half[1]:g} m"
         )
     return Placement(pose, wrench)
+
+
+def _check_body(body: object) -> None:
+    if not isinstance(body, Body):
+        raise TypeError(
+            f"body is {body!r:.60}; it takes one Body: objects.make draws one, objects.load reads a mesh file"
+        )
 
 
 def _index(faces: StableFaces, face: int | str) -> int:

@@ -27,7 +27,7 @@ TURNED = math.pi / 4  # rad; what leans more lies, what turned more rolled
 
 
 class Outcome(enum.IntEnum):
-    """How a trajectory ended; each scenario knows some of them. Printed in words: "fell off"."""
+    """How a trajectory ended. Each scenario has some of them. Printed in words: "fell off"."""
 
     RESTS = 0
     FELL_OFF = 1

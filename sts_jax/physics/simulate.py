@@ -161,7 +161,7 @@ def _check(bodies: Sequence[Any], sensor: Any, scenario: Any, num: Any, chunk: A
         raise ValueError("no body was given; pass one Body or a sequence of them")
     if not isinstance(sensor, Sensor):
         raise TypeError(f"sensor is {sensor!r}; it takes a Sensor, for instance sts.Sensor()")
-    if not hasattr(scenario, "check"):
+    if isinstance(scenario, type) or not hasattr(scenario, "check"):
         raise TypeError(f"scenario is {scenario!r}; it takes Freefall(), Inclined() or Perturbed()")
     scenario.check()
     for i, body in enumerate(bodies):

@@ -7,6 +7,7 @@ A model's folder holds `config.json` (the model, the run and the caller's prepro
 
 import contextlib
 import logging
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,22 +124,26 @@ def read(path: Path, like: State) -> State:
             loaded = ocp.load(str(path.absolute()), abstract)
     except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
         raise ValueError(
-            f"{path} is the checkpoint of another model, or of a model saved by Predictor.save, which leaves out the "
-            f"optimiser's state that training needs ({type(error).__name__}: {_first_line(error)}); give another "
-            "folder, or delete this one and train again."
+            f"{path} cannot be read ({type(error).__name__}: {_first_line(error)}): it was damaged before its "
+            "checksums were taken, or belongs to another model, or was saved by Predictor.save, which leaves out the "
+            "optimiser's state that training needs. Give another folder, or delete this one and train again."
         ) from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
 
-def seal(folder: Path) -> None:
+def seal(folder: str | os.PathLike[str]) -> None:
     """Write the manifest of a model of sts_jax 0.1, which had none, from the files as they are now.
 
     Raises:
         FileNotFoundError: the folder has no checkpoint.
         ValueError: the folder has a manifest.
     """
+    folder = Path(folder)
     if (folder / manifest.NAME).exists():
-        raise ValueError(f"{folder} has a {manifest.NAME}: its files are verified whenever it is loaded.")
+        raise ValueError(
+            f"{folder} has a {manifest.NAME} already, and its files are verified whenever it is loaded: there is "
+            f"nothing to seal. If you changed a file on purpose, delete {manifest.NAME} first."
+        )
     steps = _steps(folder)
     if not steps:
         raise FileNotFoundError(f"{folder} has no checkpoint; give the folder of a trained model.")
