@@ -99,7 +99,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         path: `.npz` keeps all arrays of a `Frame`, a `Body` or a `Trajectory` for `load`. `.png` keeps the picture of a
             `Frame` (the visual and the tactile image side by side) or of an image `(height, width, 3)` in [0, 1], with
             8 bits a channel.
-        thing: what is kept.
+        thing: the object to write.
 
     Raises:
         TypeError: this kind of thing cannot be written to this kind of file.

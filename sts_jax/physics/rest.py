@@ -33,7 +33,7 @@ class Placement(NamedTuple):
     """Where a body lies and the force that carries it: the arguments of `sense`."""
 
     pose: Float[Array, "7"]  # m and quaternion, w >= 0: the mesh frame in the sensor frame
-    wrench: Float[Array, "6"]  # N and N m about the sensor's origin: what the pad exerts on the body
+    wrench: Float[Array, "6"]  # N and N m about the sensor's origin: from the pad on the body
 
 
 def stable_faces(
