@@ -128,19 +128,6 @@ class _Resting(NamedTuple):
     pressure: Float[Array, "r c"]  # Pa
 
 
-@jax.jit
-def _balance(
-    gel: tactile.Gel,
-    sound: Bool[Array, ""],
-    vertices: Float[Array, "v 3"],
-    faces: Int[Array, "f 3"],
-    two_sided: Bool[Array, ""],
-    pose: Float[Array, "7"],
-    wrench: Float[Array, "6"] | None,
-) -> _Resting:
-    return looped(_balanced)(gel, sound, vertices, faces, two_sided, pose, wrench)
-
-
 def _balanced(
     gel: tactile.Gel,
     sound: Bool[Array, ""],
@@ -182,6 +169,9 @@ def _balanced(
         contact.balanced & finite,
         contact.pressure,
     )
+
+
+_balance = jax.jit(looped(_balanced))
 
 
 def _placed(
