@@ -1,6 +1,7 @@
 """Files that are whole or absent, JSON that cannot change unnoticed, checksums, and a lock on a folder."""
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -26,7 +27,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     An interruption leaves either the complete new file or the previous state.
 
     Raises:
-        OSError: the disk is full or the folder is not writable. The message names the file. Any other error of
+        OSError: the file cannot be written. The message names the file and the remedy. Any other error of
             `write` passes through unchanged.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -38,12 +39,29 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error}. Free some disk space or check the permissions, then start again; "
-            "everything that was finished before is kept."
+            f"cannot write {path}: {error}. {remedy(error)}, then start again; everything that was finished before is "
+            "kept."
         ) from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+_IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
+
+
+def remedy(error: Exception) -> str:
+    """The remedy for a file that cannot be written, by the error's number; an error without one may be a full disk."""
+    number = getattr(error, "errno", None)
+    if number in _FULL:
+        return "Free some disk space"
+    if number in _FORBIDDEN:
+        return "Check the permissions"
+    if number in _IN_THE_WAY:
+        return "Remove the file or folder that is in the way, or choose another path"
+    return "Free some disk space or check the permissions"
 
 
 def write_bytes(path: Path, data: bytes) -> None:

@@ -107,7 +107,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         OSError: the file cannot be written.
     """
     path = Path(path)
-    if path.suffix == ".png":
+    if path.suffix.lower() == ".png":
         if isinstance(thing, Frame):
             _one("Frame", thing.depth, 2)
             image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
@@ -120,7 +120,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
             image = _image(thing)
         data = io.BytesIO()
         Image.fromarray(np.round(255 * image).astype(np.uint8)).save(data, "png")
-    elif path.suffix == ".npz":
+    elif path.suffix.lower() == ".npz":
         if not isinstance(thing, tuple(_KINDS.values())):
             raise TypeError(f"an .npz file keeps one of {', '.join(_KINDS)}, got {type(thing).__name__}")
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
@@ -144,7 +144,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; sts.save writes one")
-    if path.is_dir() or path.suffix != ".npz":
+    if path.is_dir() or path.suffix.lower() != ".npz":
         raise ValueError(f"path is {str(path)!r}; it must be an .npz file that sts.save wrote")
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:

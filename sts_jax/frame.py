@@ -94,8 +94,8 @@ def sense(
 
     Raises:
         ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
-            more faces than can be drawn, all of this under `jit` too; or the sensor or the body cannot be (`check`),
-            of what is known of them.
+            more faces than can be drawn, all of this under `jit` too; or `check` of the sensor or the body
+            raises an error. Traced values are not checked.
         TypeError: an argument is no sensor, no body or no array of numbers.
     """
     _check_kinds(sensor, body)
@@ -248,8 +248,8 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         Image, sRGB in [0, 1]; the streams themselves at 0 and 1.
 
     Raises:
-        ValueError: `light` is outside [0, 1] or not one number; or the sensor cannot be, of what is known of it. Of a
-            traced one that cannot be, the default's exposure counts.
+        ValueError: `light` is outside [0, 1] or not one number; or `Sensor.check` raises an error. Traced values
+            are not checked; where a traced sensor is out of range, the default's exposure counts.
     """
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
@@ -288,8 +288,8 @@ def touch(
         constants.
 
     Raises:
-        ValueError: the imprint is no image or has whole numbers, the window has no area or is not finite, or the sensor
-            cannot be, of what is known of them.
+        ValueError: the imprint is no image or has whole numbers, the window has no area or is not finite, or
+            `Sensor.check` raises an error. Traced values are not checked.
     """
     _check_sensor(sensor)
     try:

@@ -41,6 +41,14 @@ def test_a_png_holds_both_streams_side_by_side(tmp_path):
     np.testing.assert_allclose(got, np.concatenate([FRAME.visual, FRAME.tactile], 1), atol=0.51 / 255)
 
 
+def test_suffixes_may_be_in_capitals(tmp_path):
+    sts.save(tmp_path / "frame.PNG", FRAME)
+    with Image.open(tmp_path / "frame.PNG") as picture:
+        assert (picture.format, picture.size) == ("PNG", (12, 4))
+    sts.save(tmp_path / "frame.NPZ", FRAME)
+    same(sts.load(tmp_path / "frame.NPZ"), FRAME)
+
+
 @pytest.mark.parametrize("thing", [FRAME, BODY], ids=["frame", "body"])
 def test_an_npz_gives_back_what_was_saved(tmp_path, thing):
     sts.save(tmp_path / "thing.npz", thing)

@@ -1,5 +1,6 @@
 """Files that are whole or absent, JSON that cannot change unnoticed, checksums, and a lock on a folder."""
 
+import errno
 import hashlib
 import json
 import os
@@ -34,6 +35,29 @@ def test_a_full_disk_is_named_with_the_file_and_leaves_nothing(tmp_path):
     with pytest.raises(OSError, match=r"cannot write .*x\.npz: .*No space left.*Free some disk space"):
         _files.write_whole(tmp_path / "x.npz", full)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.EDQUOT, "Free some disk space, then"),
+        (errno.EACCES, "Check the permissions, then"),
+        (errno.EISDIR, "Remove the file or folder that is in the way, or choose another path, then"),
+        (errno.EIO, "Free some disk space or check the permissions, then"),
+    ],
+)
+def test_the_remedy_fits_the_error(tmp_path, number, remedy):
+    def fails(temporary: Path) -> None:
+        raise OSError(number, os.strerror(number))
+
+    with pytest.raises(OSError, match=rf"\. {remedy} start again"):
+        _files.write_whole(tmp_path / "x.npz", fails)
+
+
+def test_a_folder_in_the_way_is_named(tmp_path):
+    (tmp_path / "x.npz").mkdir()
+    with pytest.raises(OSError, match=r"cannot write .*x\.npz: .*Remove the file or folder that is in the way"):
+        _files.write_bytes(tmp_path / "x.npz", b"")
 
 
 def test_a_fault_of_the_writer_itself_passes_unchanged(tmp_path):

@@ -361,6 +361,12 @@ def test_too_many_faces(tmp_path, monkeypatch):
         objects.load(tmp_path / "fine.stl")
 
 
+@pytest.mark.parametrize("faces", [10.5, 3, True, "100"])
+def test_a_number_of_faces_that_cannot_be_is_named(tmp_path, faces):
+    with pytest.raises(ValueError, match=rf"faces must be a whole number, at least 4, got {faces!r}"):
+        inspect.unwrap(objects.load)(tmp_path / "none.stl", faces=faces)
+
+
 def test_public_textured_mesh():
     # miniworld's potion bottle (Farama Foundation): made by nobody here, and its OBJ names a material nobody has.
     folder = public_meshes()

@@ -1,9 +1,12 @@
+import re
+
 import jax
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
 from sts_jax import objects
+from sts_jax._keys import check_key
 
 KEYS = [3, 17, 400]
 SOLID = ("scissors", "fork", "spoon")
@@ -143,3 +146,16 @@ def test_it_stands_or_lies_as_made(bodies, category):
             com = np.asarray(objects.rigid(body, fill, 1.0)[1], float)
             around = np.sort(np.arctan2(*(foot - com[:2]).T))
             assert np.diff(np.append(around, around[0] + 2 * np.pi)).max() < np.pi  # the balance is over the foot
+
+
+@pytest.mark.parametrize("key", [0, None, np.zeros(2, np.int64), [0, 1]])
+def test_a_key_that_is_none_is_named_with_the_remedy(key):
+    with pytest.raises(TypeError, match=rf"key is {re.escape(repr(key))}; it takes a JAX key: jax\.random\.key\(0\)"):
+        check_key(key)
+
+
+def test_keys_in_an_array_are_refused_and_those_of_the_older_kind_are_taken():
+    with pytest.raises(TypeError, match=r"key has shape \(2,\); it takes one key"):
+        check_key(jax.random.split(jax.random.key(0)))
+    old, new = objects.make(jax.random.PRNGKey(3), "bottle"), objects.make(jax.random.key(3), "bottle")
+    np.testing.assert_array_equal(old.vertices, new.vertices)

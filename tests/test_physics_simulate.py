@@ -379,15 +379,16 @@ def test_fields_of_another_kind_are_named(field: str, value: object, wanted: str
         ({"sensor": None}, "sensor is None; it takes a Sensor"),
         ({"scenario": "freefall"}, r"scenario is 'freefall'; it takes Freefall\(\)"),
         ({"scenario": physics.Freefall}, r"scenario is <class .*Freefall'>; it takes Freefall\(\)"),
+        ({"key": 0}, r"key is 0; it takes a JAX key: jax\.random\.key\(0\)"),
         ({"num": 1.5}, "num is 1.5; it takes a whole number"),
         ({"chunk": 0}, "chunk is 0; it takes a whole number"),
         ({"progress": "bar"}, "progress is 'bar'; it takes True, False or a function"),
     ],
 )
 def test_arguments_of_another_kind_are_named(bodies: list[objects.Body], changes: dict, match: str) -> None:
-    given = {"body": bodies[0], "sensor": Sensor(), "scenario": SCENARIO, "num": 1}
+    given = {"key": jax.random.key(0), "body": bodies[0], "sensor": Sensor(), "scenario": SCENARIO, "num": 1}
     with pytest.raises((TypeError, ValueError), match=match):
-        inspect.unwrap(physics.simulate)(jax.random.key(0), **given | changes)
+        inspect.unwrap(physics.simulate)(**given | changes)
 
 
 def test_outcomes_are_words_and_a_trajectory_is_summed_up_in_a_line(drops: physics.Trajectory) -> None:

@@ -109,8 +109,9 @@ def load(
         IsADirectoryError: the path is a folder.
         PermissionError: the file is not readable.
         ValueError: the file is empty, truncated or no mesh, has no faces, NaN, too many faces, no extent in some
-            direction, is larger than the pad or smaller than 5 mm; `mass`, `density`, `category`, a size or direction
-            is not what it should be; not closed and `strict`; it cannot be decimated so far, or decomposed.
+            direction, is larger than the pad or smaller than 5 mm, is not closed and `strict` is set, or cannot be
+            decimated to `faces` or decomposed. `mass`, `density`, `category`, `faces`, a size or a
+            direction is out of range.
     """
     path = Path(path)
     for name, value, unit in (
@@ -137,8 +138,8 @@ def load(
         raise ValueError(f"{path}: {error}") from None
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
-    if faces is not None and faces < 4:
-        raise ValueError(f"{path}: faces must be at least 4, got {faces}")
+    if faces is not None and (isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4):
+        raise ValueError(f"{path}: faces must be a whole number, at least 4, got {faces!r}")
     if isinstance(up, str):
         if up not in AXES or front is not None:
             raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers where front is given, got {up!r}")

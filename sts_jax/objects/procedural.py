@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from scipy.interpolate import PchipInterpolator
 
+from sts_jax._keys import check_key
 from sts_jax.objects.body import CATEGORIES, Body
 from sts_jax.objects.solids import CONTENTS, WALL, assemble, linear
 
@@ -49,8 +50,10 @@ def make(key: PRNGKeyArray, category: str) -> Body:
         The body, of the smallest face class, longest side 50 to 130 mm, +z up as it usually stands or lies.
 
     Raises:
+        TypeError: `key` is no JAX key.
         ValueError: unknown category.
     """
+    check_key(key)
     if category not in CATEGORIES:
         raise ValueError(f"unknown category {category!r}: take one of {', '.join(CATEGORIES)}")
     seed = np.asarray(jax.random.key_data(key)).ravel()

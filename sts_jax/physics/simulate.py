@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax import objects
+from sts_jax._keys import check_key
 from sts_jax.objects.body import Body, is_traced
 from sts_jax.physics import contact, scene
 from sts_jax.physics.contact import Hull
@@ -317,9 +318,10 @@ def simulate(
         BodyError: a ValueError: a body that cannot start as the scenario asks, has bad values, or a trajectory of which
             fails in every attempt.
         ValueError: another argument out of range, named.
-        TypeError: an argument that is no body, sensor or scenario.
+        TypeError: an argument that is no key, body, sensor or scenario.
     """
     bodies = list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
+    check_key(key)
     _check(bodies, sensor, scenario, num, chunk)
     count = len(bodies) * num
     given = None if hidden is None else _check_hidden(hidden, count)

@@ -19,6 +19,7 @@ from flax import nnx
 from jaxtyping import Array, Int
 from orbax.checkpoint import v1 as ocp
 
+from sts_jax import _files
 from sts_jax.training import manifest
 
 
@@ -63,8 +64,7 @@ def save(folder: Path, state: TrainState | Weights) -> None:
         except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
             left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
-                f"cannot write {path}: {_first_line(error)}. Free some disk space or check the permissions, then start "
-                f"again; {left}."
+                f"cannot write {path}: {_first_line(error)}. {_files.remedy(error)}, then start again; {left}."
             ) from None
         manifest.write(folder, step)
         kept = step

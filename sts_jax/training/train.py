@@ -344,8 +344,7 @@ def _append(log: Path, record: dict[str, float]) -> None:
             file.write(json.dumps(record) + "\n")
     except OSError as error:
         raise OSError(
-            f"cannot write {log}: {error}. Free some disk space or check the permissions, then start again; the last "
-            "checkpoint is kept."
+            f"cannot write {log}: {error}. {_files.remedy(error)}, then start again; the last checkpoint is kept."
         ) from error
 
 
