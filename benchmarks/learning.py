@@ -56,8 +56,9 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
     inputs = {name: x for name, x in data.items() if name not in absent}
     batch = training.Arrays(inputs, data, masks).take(np.arange(size))
     config = training.TrainConfig(batch_size=size)
-    graphdef, state = training.initial(config, model, 100)
-    run = jax.jit(lambda s, b: training.step(graphdef, config, 100, s, b, absent=absent), donate_argnums=0)
+    learner = training.learner(model, absent=absent)
+    graphdef, state = training.initial(config, learner, 100)
+    run = jax.jit(lambda s, b: training.step(learner, graphdef, config, 100, s, b), donate_argnums=0)
     compiled = run.lower(state, batch).compile()
 
     def call() -> None:

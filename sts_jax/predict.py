@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,12 +14,15 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
-from sts_jax import _files, mvae, training
+from sts_jax import _files, mvae, statespace, training
 
 MODALITIES = ("visual", "tactile", "pose")
 _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
 _FARTHEST = 10.0  # m, of a position: beyond it the numbers are no metres
 _LARGEST_CONDITION = 100.0  # in units of the condition's usual size
+_POSES = 64  # samples of a state-space model's final pose, among which the predicted one is chosen
+_DRAWN = 16  # of them are drawn where no number of samples is asked for: the mean image is theirs
+_TURN = 0.02  # m, by which one radian counts in the choice of the pose
 
 
 class Prediction(NamedTuple):
@@ -31,6 +34,8 @@ class Prediction(NamedTuple):
     mean: Float[Array, "*n latent"]  # of the fused posterior
     log_var: Float[Array, "*n latent"]
     samples: "Prediction | None" = None  # the same with a leading axis of samples, each from its own latent
+    # Of each outcome, in the order of the scenario's `outcomes`; None for a model of the paper's kind
+    outcome_probability: Float[Array, "*n outcomes"] | None = None
 
     def __repr__(self) -> str:
         shapes = (
@@ -71,13 +76,7 @@ def predict(
     lead = shape
     for name, value in inputs.items():
         lead = value.shape[: -1 if name == "pose" else -3]
-    flat, counts = {}, {}
-    for name, value in inputs.items():
-        value = preprocessing.encode_pose(value) if name == "pose" else value
-        flat[name] = value.reshape(-1, *value.shape[len(lead) :])
-        counts[name] = present.get(name, jnp.ones(lead, bool)).reshape(-1)
-    if "tactile" in flat:
-        counts["tactile"] &= preprocessing.touched(flat["tactile"], blank)
+    flat, counts = _flat(preprocessing, inputs, present, lead, blank)
     if flat:
         posterior = mvae.infer(graphdef, state, flat, present=counts)
     else:
@@ -106,6 +105,81 @@ def predict(
     return result
 
 
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
+def predict_samples(
+    graphdef: nnx.GraphDef,
+    state: nnx.State,
+    preprocessing: training.Preprocessing,
+    empty: dict[str, Float[Array, "h w 3"]],
+    inputs: dict[str, Float[Array, "..."]],
+    present: dict[str, Bool[Array, "*n"]],
+    condition: Float[Array, "..."] | None = None,
+    key: PRNGKeyArray | None = None,
+    num_samples: int = 0,
+    shape: tuple[int, ...] = (),
+) -> Prediction:
+    """The prediction of a state-space model: images are means over samples, the pose is the most central sample.
+
+    Without a number of samples the prediction rests on 16 with a key of its own, and is the same at every call.
+    Arguments as of `predict`; `empty` has both images of the untouched sensor.
+    """
+    lead = shape
+    for name, value in inputs.items():
+        lead = value.shape[: -1 if name == "pose" else -3]
+    flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
+    if not flat:  # the belief is then the prior
+        flat = {"pose": jnp.zeros((math.prod(shape), statespace.CODE))}
+        counts = {"pose": jnp.zeros(math.prod(shape), bool)}
+    if condition is not None:
+        condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
+    drawn = num_samples or _DRAWN
+    key = jax.random.key(0) if key is None else key
+    found = statespace.sample(graphdef, state, key, flat, counts, empty, condition, num=max(_POSES, drawn), drawn=drawn)
+    poses = preprocessing.decode_pose(found.pose)
+    images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in found.images.items()}
+    mean, log_var = (x.reshape(*lead, -1) for x in found.belief)
+    result = Prediction(
+        visual=images["visual"].mean(0),
+        tactile=images["tactile"].mean(0),
+        pose=_central(poses).reshape(*lead, 7),
+        mean=mean,
+        log_var=log_var,
+        outcome_probability=found.outcome.reshape(*lead, -1),
+    )
+    if num_samples:
+        own = poses[:drawn].reshape(drawn, *lead, 7)
+        samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=own)
+        result = result._replace(samples=samples)
+    return result
+
+
+def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
+    """Of each item's poses, the one with the least mean distance from the others."""
+    apart = jnp.linalg.norm(poses[:, None, :, :3] - poses[None, :, :, :3], axis=-1)
+    cosine = jnp.abs(jnp.einsum("inq,jnq->ijn", poses[..., 3:], poses[..., 3:]))
+    turned = 2 * jnp.arccos(jnp.clip(cosine, 0, 1))
+    best = jnp.argmin(jnp.mean(apart + _TURN * turned, axis=1), axis=0)
+    return jnp.take_along_axis(poses, best[None, :, None], axis=0)[0]
+
+
+def _flat(
+    preprocessing: training.Preprocessing,
+    inputs: dict[str, Array],
+    present: dict[str, Array],
+    lead: tuple[int, ...],
+    blank: Float[Array, "h w 3"],
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Inputs as the networks see them and which items of them count, with one leading axis."""
+    flat, counts = {}, {}
+    for name, value in inputs.items():
+        value = preprocessing.encode_pose(value) if name == "pose" else value
+        flat[name] = value.reshape(-1, *value.shape[len(lead) :])
+        counts[name] = present.get(name, jnp.ones(lead, bool)).reshape(-1)
+    if "tactile" in flat:
+        counts["tactile"] &= preprocessing.touched(flat["tactile"], blank)
+    return flat, counts
+
+
 class Predictor:
     """A trained model as a function: `predictor(visual=image)` gives a `Prediction`.
 
@@ -131,7 +205,16 @@ class Predictor:
         self.preprocessing = preprocessing
         self.name = name
         self._images = blank
-        self._blank = jnp.asarray(blank[1].astype(np.float32) / 255)
+        visual, tactile = (jnp.asarray(image.astype(np.float32) / 255) for image in blank)
+        if isinstance(model.config, mvae.Config):
+            self._names, self._inputs = model.config.names, model.config.names
+            self._predict: Callable[..., Prediction] = functools.partial(
+                predict, model.graphdef, model.state, preprocessing, tactile
+            )
+        else:
+            self._names, self._inputs = MODALITIES, model.config.inputs
+            empty = {"visual": visual, "tactile": tactile}
+            self._predict = functools.partial(predict_samples, model.graphdef, model.state, preprocessing, empty)
 
     @classmethod
     def load(
@@ -196,8 +279,8 @@ class Predictor:
         config, view = self.model.config, self.preprocessing
         return (
             f"Predictor({self.name!r}: takes {', '.join(self.modalities) or 'nothing'}; predicts "
-            f"{', '.join(config.names)}; resolution={view.resolution}, crop={view.crop}, condition={config.condition}, "
-            f"latent={config.latent}, steps={self.model.step})"
+            f"{', '.join(self._names)}; resolution={view.resolution}, crop={view.crop}, condition={config.condition}, "
+            f"steps={self.model.step})"
         )
 
     def __call__(
@@ -254,17 +337,7 @@ class Predictor:
         if plausible is not None:
             valid = plausible if valid is None else valid & plausible
         num_samples = _checked_samples(num_samples, key)
-        result = predict(
-            self.model.graphdef,
-            self.model.state,
-            self.preprocessing,
-            self._blank,
-            arrays,
-            masks,
-            condition,
-            key if num_samples else None,
-            num_samples,
-        )
+        result = self._predict(arrays, masks, condition, key if num_samples else None, num_samples)
         return result if valid is None else _flagged(result, valid)
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
@@ -284,20 +357,18 @@ class Predictor:
         if min(shape, default=1) < 1:
             raise ValueError(f"shape is {shape}; each size must be at least 1.")
         condition, plausible = self._checked_condition(condition, shape)
-        result = predict(
-            self.model.graphdef, self.model.state, self.preprocessing, self._blank, {}, {}, condition, shape=shape
-        )
+        result = self._predict({}, {}, condition, shape=shape)
         return result if plausible is None else _flagged(result, plausible)
 
     @property
     def modalities(self) -> tuple[str, ...]:
         """The modalities that this model can be given: those it has and was given in training."""
-        return tuple(name for name in self.model.config.names if name not in self.preprocessing.absent)
+        return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
         """The value as float32, if type and shape are right; a traced one stays traced."""
-        if name not in self.model.config.names:
-            raise ValueError(f"{self.name} has no {name}: it was trained on {', '.join(self.model.config.names)}.")
+        if name not in (*self._inputs, *self.preprocessing.absent):
+            raise ValueError(f"{self.name} takes no {name}: it was trained on {', '.join(self._inputs)}.")
         if name in self.preprocessing.absent:
             raise ValueError(
                 f"{self.name} cannot use {name}: no first moment it was trained on had any (in freefall nothing "
@@ -449,4 +520,5 @@ def _flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
         mean=numbers(prediction.mean),
         log_var=numbers(prediction.log_var),
         samples=None if prediction.samples is None else _flagged(prediction.samples, valid),
+        outcome_probability=jax.tree.map(numbers, prediction.outcome_probability),
     )

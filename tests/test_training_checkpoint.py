@@ -44,7 +44,7 @@ def folder(finished, tmp_path):
 @pytest.fixture(scope="module")
 def state():
     """A state as it is before the first step."""
-    return training.initial(CONFIG, SMALL, 4)[1]
+    return training.initial(CONFIG, training.learner(SMALL), 4)[1]
 
 
 def same(a, b):
@@ -136,7 +136,7 @@ def test_a_torn_checkpoint_gives_one_short_message(folder, capfd, caplog):
 
 
 def test_a_checkpoint_of_another_model_gives_one_short_message(folder, state, capfd):
-    wider = training.initial(CONFIG, mvae.Config(SMALL.modalities, latent=4, hidden=9), 4)[1]
+    wider = training.initial(CONFIG, training.learner(mvae.Config(SMALL.modalities, latent=4, hidden=9)), 4)[1]
     with pytest.raises(ValueError, match=r"00000004 cannot be read .* belongs to another model") as caught:
         training.restore(folder, wider)
     assert caught.value.__suppress_context__

@@ -115,9 +115,11 @@ def test_a_torn_folder_is_named(tmp_path, torn):
 
 
 def test_a_state_keeps_its_structure_and_dtypes():
-    graphdef, state = training.initial(CONFIG, SMALL, 12)
+    graphdef, state = training.initial(CONFIG, training.learner(SMALL), 12)
     batch = arrays().take(np.arange(8))
-    after, _ = jax.eval_shape(lambda s, b: training.step(graphdef, CONFIG, 12, s, b), state, batch)
+    after, _ = jax.eval_shape(
+        lambda s, b: training.step(training.learner(SMALL), graphdef, CONFIG, 12, s, b), state, batch
+    )
     assert jax.tree.structure(after) == jax.tree.structure(state)
     for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
         assert (a.shape, a.dtype, a.weak_type) == (b.shape, b.dtype, getattr(b, "weak_type", False))
@@ -135,13 +137,13 @@ def test_every_sample_once_an_epoch_wherever_it_starts(samples, size):
 
 
 def test_beta_warms_up_over_its_share_of_the_steps():
-    graphdef, state = training.initial(CONFIG, SMALL, 100)
+    graphdef, state = training.initial(CONFIG, training.learner(SMALL), 100)
     batch = arrays().take(np.arange(8))
     subsets = 2 + np.mean(batch["present"]["b"])  # {a}, {a, b}, and {b} where it is present; asked for both targets
 
     @jax.jit
     def parts(state, batch):
-        return training.step(graphdef, CONFIG, 100, state, batch)[1]
+        return training.step(training.learner(SMALL), graphdef, CONFIG, 100, state, batch)[1]
 
     for step, beta in ((0, 0.0), (10, 0.4), (25, 1.0), (90, 1.0)):
         terms = parts(state._replace(step=jnp.int32(step)), batch)

@@ -3,16 +3,30 @@
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
 from sts_jax.training.moments import moments, paper_model
 from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
-from sts_jax.training.train import Arrays, Model, TrainConfig, initial, load, optimiser, order, step, train
+from sts_jax.training.train import (
+    Arrays,
+    Learner,
+    Model,
+    TrainConfig,
+    initial,
+    learner,
+    load,
+    optimiser,
+    order,
+    step,
+    train,
+)
 
 __all__ = [
     "Arrays",
+    "Learner",
     "Model",
     "Preprocessing",
     "TrainConfig",
     "TrainState",
     "Weights",
     "initial",
+    "learner",
     "load",
     "load_blank",
     "moments",

@@ -7,20 +7,22 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 
-from sts_jax import _files, mvae
+from sts_jax import _files, mvae, statespace
 from sts_jax.training import manifest
 from sts_jax.training.checkpoint import TrainState, Weights, read, restore, save, verified
 
-Batch = dict[str, Any]  # `inputs`, `targets`, `present`, `target_present`: dicts by name; `condition`: array or None
+Batch = dict[str, Any]  # dicts by name, as in `Arrays`; `condition`: array or None
+Config = mvae.Config | statespace.Config  # of the two kinds of models
+Terms = dict[str, Array]  # the parts of a loss
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,11 @@ class TrainConfig:
     batch_size: int = 64  # paper
     learning_rate: float = 1e-3  # not in the paper
     schedule: Literal["constant", "cosine"] = "constant"  # cosine ends at 0
+    warmup: int = 0  # steps over which the learning rate rises from 0
     b1: float = 0.9  # Adam
     b2: float = 0.999
     epsilon: float = 1e-8
-    # Of the encoders' parameters, in nats: Adam makes steps of full length of any gradient, however small beta makes
+    # Of an `mvae` model's encoders, in nats: Adam makes steps of full length of any gradient, however small beta makes
     # the divergence's, so that encoders collapse during the warm-up; gradients far below this one move them little.
     encoder_epsilon: float = 1.0
     clip: float | None = None  # largest global norm of the gradient
@@ -60,10 +63,11 @@ class Arrays:
     """A data set in memory, by modality, `(samples, *shape)`; images uint8, or float32 in [0, 1]."""
 
     inputs: dict[str, np.ndarray]
-    targets: dict[str, np.ndarray]
+    targets: dict[str, np.ndarray]  # of a state-space model also the codes `state` and `pose`, and `outcome`, an index
     present: dict[str, np.ndarray] = field(default_factory=dict)  # (samples,) bool; one not given counts always
     target_present: dict[str, np.ndarray] = field(default_factory=dict)
     condition: np.ndarray | None = None  # (samples, condition)
+    empty: dict[str, np.ndarray] = field(default_factory=dict)  # images of the untouched sensor, for state-space models
 
     def __post_init__(self) -> None:
         sizes = {len(x) for x in jax.tree.leaves(self._tree())}
@@ -75,12 +79,12 @@ class Arrays:
 
     def take(self, index: np.ndarray) -> Batch:
         """These samples."""
-        return jax.tree.map(lambda x: x[index], self._tree())
+        return jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
 
     def checksum(self) -> int:
         """Changes when the data do."""
         value = 0
-        for path, x in jax.tree_util.tree_leaves_with_path(self._tree()):
+        for path, x in jax.tree_util.tree_leaves_with_path(self._tree() | {"empty": self.empty}):
             value = zlib.crc32(f"{path}{x.shape}{x.dtype}".encode(), value)
             value = zlib.crc32(np.ascontiguousarray(x).data, value)
         return value
@@ -89,61 +93,128 @@ class Arrays:
         return {name: getattr(self, name) for name in ("inputs", "targets", "present", "target_present", "condition")}
 
 
-class Model(NamedTuple):
-    """A trained model, ready for `mvae.predict(model.graphdef, model.state, ...)`."""
+_KINDS: dict[type[Config], str] = {mvae.Config: "mvae", statespace.Config: "statespace"}  # the word in `config.json`
 
-    config: mvae.Config
-    graphdef: nnx.GraphDef[mvae.MVAE]
+
+class Model(NamedTuple):
+    """A trained model, ready for `mvae.predict` or `statespace.sample` with its `graphdef` and `state`."""
+
+    config: Config
+    graphdef: nnx.GraphDef[Any]
     state: nnx.State  # parameters and running batch statistics
     step: int  # gradient steps done
     settings: dict[str, Any]  # config.json: `model`, `training`, `preprocessing`, ...
 
     def __repr__(self) -> str:
-        modalities = ", ".join(f"{m.name} {m.kind} {m.shape}" for m in self.config.modalities)
         numbers = sum(x.size for x in jax.tree.leaves(self.state))
-        return (
-            f"Model({modalities}; latent={self.config.latent}, condition={self.config.condition}, "
-            f"{numbers:,} numbers, step={self.step})"
+        return f"Model({self.config!r}, {numbers:,} numbers, step={self.step})"
+
+
+class Learner(NamedTuple):
+    """How one kind of model is made, and the loss that it minimises."""
+
+    config: Config
+    init: Callable[[Array], tuple[nnx.GraphDef[Any], nnx.State, nnx.State]]
+    loss: "_Loss"
+    check: Callable[[Arrays], None]  # raises ValueError for arrays that do not fit
+
+
+class _Loss(Protocol):
+    def __call__(
+        self,
+        graphdef: nnx.GraphDef[Any],
+        params: nnx.State,
+        stats: nnx.State,
+        key: PRNGKeyArray,
+        batch: Batch,
+        beta: Array,
+    ) -> tuple[Array, tuple[nnx.State, Terms]]: ...
+
+
+def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
+    """The learner of a model.
+
+    Args:
+        model: its configuration.
+        targets: of an `mvae` model, see `mvae.loss`, `asked`.
+        absent: of an `mvae` model, see `mvae.loss`.
+    """
+
+    def paper_loss(
+        graphdef: nnx.GraphDef[Any], params: nnx.State, stats: nnx.State, key: PRNGKeyArray, batch: Batch, beta: Array
+    ) -> tuple[Array, tuple[nnx.State, Terms]]:
+        own = {name: value for name, value in batch.items() if name != "empty"}
+        total, (stats, terms) = mvae.loss(graphdef, params, stats, key, **own, beta=beta, asked=targets, absent=absent)
+        return total, (stats, {"loss": terms.loss, "kl": terms.kl, **terms.reconstruction})
+
+    def state_loss(
+        graphdef: nnx.GraphDef[Any], params: nnx.State, stats: nnx.State, key: PRNGKeyArray, batch: Batch, beta: Array
+    ) -> tuple[Array, tuple[nnx.State, Terms]]:
+        own = {name: value for name, value in batch.items() if name != "target_present"}
+        total, terms = statespace.loss(graphdef, params, key, **own, beta=beta)
+        return total, (stats, {"loss": total, **terms})
+
+    if isinstance(model, mvae.Config):
+        return Learner(
+            model,
+            lambda key: mvae.init(key, model),
+            paper_loss,
+            lambda arrays: _check_paper(model, arrays, absent),
         )
+    return Learner(
+        model, lambda key: statespace.init(key, model), state_loss, lambda arrays: _check_state(model, arrays)
+    )
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
-    """Adam as configured, with an epsilon of its own for each of the parameters' `encoders` and `decoders`."""
+    """Adam as configured, with an epsilon of its own for the parameters of an `mvae` model's `encoders`."""
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
-        rate = optax.cosine_decay_schedule(config.learning_rate, total)
-    rates = {"encoders": config.encoder_epsilon, "decoders": config.epsilon}
-    parts = {name: optax.adam(rate, b1=config.b1, b2=config.b2, eps=epsilon) for name, epsilon in rates.items()}
-    adam = optax.partition(parts, lambda params: jax.tree_util.tree_map_with_path(lambda path, _: path[0].key, params))
-    return adam if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adam)
+        rate = optax.cosine_decay_schedule(config.learning_rate, total - config.warmup)
+    if config.warmup:
+        rise = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
+        rest = rate if callable(rate) else optax.constant_schedule(rate)
+        rate = optax.join_schedules([rise, rest], [config.warmup])
+
+    def adam(epsilon: float) -> optax.GradientTransformation:
+        return optax.adam(rate, b1=config.b1, b2=config.b2, eps=epsilon)
+
+    parts = {"encoders": adam(config.encoder_epsilon), "others": adam(config.epsilon)}
+    adams = optax.partition(parts, _kinds)
+    return adams if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adams)
 
 
-def initial(config: TrainConfig, model: mvae.Config, total: int) -> tuple[nnx.GraphDef[mvae.MVAE], TrainState]:
+def _kinds(params: nnx.State) -> Any:
+    """`encoders` for the encoders of an `mvae` model, `others` for all other parameters."""
+    paper = "decoders" in params
+    return jax.tree_util.tree_map_with_path(
+        lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params
+    )
+
+
+def initial(config: TrainConfig, learner: Learner, total: int) -> tuple[nnx.GraphDef[Any], TrainState]:
     """A new model and its state, a function of `config.seed`."""
-    graphdef, params, stats = mvae.init(jax.random.key(config.seed), model)
+    graphdef, params, stats = learner.init(jax.random.key(config.seed))
     return graphdef, TrainState(params, stats, optimiser(config, total).init(params), jnp.zeros((), jnp.int32))
 
 
 def step(
-    graphdef: nnx.GraphDef[mvae.MVAE],
+    learner: Learner,
+    graphdef: nnx.GraphDef[Any],
     config: TrainConfig,
     total: int,
     state: TrainState,
     batch: Batch,
-    *,
-    targets: Literal["all", "own"] = "all",
-    absent: tuple[str, ...] = (),
-) -> tuple[TrainState, mvae.Terms]:
+) -> tuple[TrainState, Terms]:
     """One gradient step; the state keeps its structure and dtypes.
 
     Args:
+        learner: the loss.
         graphdef: definition of the model.
         config: how it is trained.
         total: steps of the whole run; beta and the learning rate follow from it.
         state: the state before.
         batch: `Arrays.take`; uint8 becomes float32 in [0, 1] here.
-        targets: `mvae.loss`, `asked`.
-        absent: `mvae.loss`.
 
     Returns:
         The state after, and the parts of the loss before.
@@ -154,8 +225,8 @@ def step(
     warmup = max(config.beta_warmup * total, 1)
     beta = jnp.minimum(state.step.astype(jnp.float32) / warmup, 1)
 
-    def objective(params: nnx.State) -> tuple[Array, tuple[nnx.State, mvae.Terms]]:
-        return mvae.loss(graphdef, params, state.stats, noise, **batch, beta=beta, asked=targets, absent=absent)
+    def objective(params: nnx.State) -> tuple[Array, tuple[nnx.State, Terms]]:
+        return learner.loss(graphdef, params, state.stats, noise, batch, beta)
 
     gradient, (stats, terms) = jax.grad(objective, has_aux=True)(state.params)
     update, rest = optimiser(config, total).update(gradient, state.optimiser, state.params)
@@ -179,7 +250,7 @@ def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> It
 
 def train(
     config: TrainConfig,
-    model: mvae.Config,
+    model: Config,
     arrays: Arrays,
     *,
     workdir: str | os.PathLike[str],
@@ -199,8 +270,8 @@ def train(
         model: what.
         arrays: the training set.
         workdir: the model's folder: `config.json`, `metrics.jsonl`, `checkpoints/`, `manifest.json`.
-        absent: modalities present in no sample; they may be missing from `arrays.inputs`.
-        targets: `all` or `own`, see `mvae.loss`.
+        absent: of an `mvae` model: modalities present in no sample; they may be missing from `arrays.inputs`.
+        targets: of an `mvae` model: `all` or `own`, see `mvae.loss`.
         preprocessing: plain values for `config.json`: how images and vectors were made.
         progress: called after every step with the steps done, their total, and the latest record of
             `metrics.jsonl` (empty before the first).
@@ -217,8 +288,10 @@ def train(
     """
     workdir = Path(workdir)
     total = config.total(len(arrays))
-    _check(model, arrays, absent)
+    task = learner(model, targets=targets, absent=absent)
+    task.check(arrays)
     settings = {
+        "kind": _KINDS[type(model)],
         "model": model.to_json(),
         "training": asdict(config),
         "targets": targets,
@@ -232,17 +305,14 @@ def train(
     finished = there is not None and there.step == total
     with contextlib.nullcontext() if finished else _files.lock(workdir):
         _files.claim(workdir / "config.json", settings)
-        graphdef, state = initial(config, model, total)
+        graphdef, state = initial(config, task, total)
         state = restore(workdir, state) or state
         start = int(state.step)
         if start < total:
             log = workdir / "metrics.jsonl"
             record = _truncate(log, start)
-            compiled = jax.jit(
-                lambda state, batch: step(graphdef, config, total, state, batch, targets=targets, absent=absent),
-                donate_argnums=0,
-            )
-            recent: list[mvae.Terms] = []
+            compiled = jax.jit(lambda state, batch: step(task, graphdef, config, total, state, batch), donate_argnums=0)
+            recent: list[Terms] = []
             for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
                 state, terms = compiled(state, arrays.take(index))
                 recent.append(jax.block_until_ready(terms))
@@ -300,16 +370,21 @@ def _load(workdir: Path) -> Model:
     if checkpoint is None:
         raise FileNotFoundError(f"{workdir}: has no checkpoint; run its training to the first one")
     try:
-        model = mvae.Config.from_json(settings["model"])
-        like = jax.eval_shape(lambda: Weights(*mvae.init(jax.random.key(0), model)[1:], jnp.zeros((), jnp.int32)))
+        kind = settings.get("kind", "mvae")  # version 0.1 had no other
+        model = {name: config for config, name in _KINDS.items()}[kind].from_json(settings["model"])
+        like = jax.eval_shape(lambda: Weights(*learner(model).init(jax.random.key(0))[1:], jnp.zeros((), jnp.int32)))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}); load it with the "
             f"version that trained it, or delete {workdir} and train again"
         ) from error
     weights = read(checkpoint, like)
-    graphdef = nnx.graphdef(nnx.eval_shape(lambda: mvae.MVAE(model)))
+    graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))
     return Model(model, graphdef, nnx.merge_state(weights.params, weights.stats), int(weights.step), settings)
+
+
+def _module(model: Config) -> nnx.Module:
+    return mvae.MVAE(model) if isinstance(model, mvae.Config) else statespace.Model(model, nnx.Rngs(0))
 
 
 def _truncate(log: Path, start: int) -> dict[str, float]:
@@ -348,12 +423,33 @@ def _append(log: Path, record: dict[str, float]) -> None:
         ) from error
 
 
-def _record(done: int, recent: list[mvae.Terms]) -> dict[str, float]:
-    mean = jax.tree.map(lambda *x: float(np.mean(x)), *recent)
-    return {"step": done, "loss": mean.loss, "kl": mean.kl, **mean.reconstruction}
+def _record(done: int, recent: list[Terms]) -> dict[str, float]:
+    return {"step": done, **jax.tree.map(lambda *x: float(np.mean(x)), *recent)}
 
 
-def _check(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
+def _check_state(model: statespace.Config, arrays: Arrays) -> None:
+    size, small = (model.input_size,) * 2, (model.image_size,) * 2
+    codes, images = {name: (statespace.CODE,) for name in ("state", "pose")}, statespace.IMAGES
+    expected = {
+        "inputs": {name: (statespace.CODE,) if name == "pose" else (*size, 3) for name in model.inputs},
+        "targets": {**{name: (*small, 3) for name in images}, **codes, "outcome": ()},
+    }
+    for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
+        found = {name: x.shape[1:] for name, x in values.items()}
+        if found != expected[kind]:
+            raise ValueError(f"{kind} have samples of {found}; the model takes {expected[kind]}")
+    if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
+        raise ValueError(f"empty needs `visual` and `tactile` of shape {(*size, 3)}, from dataset.empty_frame")
+    _check_condition(model.condition, arrays)
+
+
+def _check_condition(expected: int, arrays: Arrays) -> None:
+    width = 0 if arrays.condition is None else arrays.condition.shape[1]
+    if width != expected:
+        raise ValueError(f"condition of width {width}; the model takes {expected}")
+
+
+def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
     for name in absent:
         if np.any(arrays.present.get(name, False)):
             raise ValueError(f"{name} is declared absent, and {int(np.sum(arrays.present[name]))} samples have it")
@@ -370,6 +466,4 @@ def _check(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
                 raise ValueError(
                     f"{modality.name}: arrays of {values[modality.name].shape[1:]}, the model takes {modality.shape}"
                 )
-    width = 0 if arrays.condition is None else arrays.condition.shape[1]
-    if width != model.condition:
-        raise ValueError(f"condition of width {width}; the model takes {model.condition}")
+    _check_condition(model.condition, arrays)

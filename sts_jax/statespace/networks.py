@@ -1,0 +1,293 @@
+"""Encoders, transition and decoder as Flax NNX modules.
+
+The latent is the present state: a pose code (`statespace.poses`) and a look, which is everything else that is seen or
+felt of an object. An encoder per image gives a Gaussian over both. The transition maps a belief about the present
+state to a density of the final pose. The decoder draws both streams of an object of a look in a pose.
+
+Convolutions have stride 1, which XLA's CPU back end is quick at: pixels are folded into channels to make an image
+smaller, and channels unfolded into pixels to make it larger.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from sts_jax.mvae import Gaussian
+from sts_jax.statespace import poses, window
+
+IMAGES = ("visual", "tactile")
+INPUTS = (*IMAGES, "pose")
+_LOG_VAR_LIMIT = 8.0  # of an encoder
+_FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
+_NEAREST = 0.2  # of the camera's distance; what is nearer to the pinhole is drawn as if it were there
+_SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """The make-up of a model; plain values, so that `dataclasses.asdict` of it is JSON."""
+
+    inputs: tuple[str, ...] = ("visual", "pose")  # some of INPUTS
+    outcomes: int = 2  # of the scenario
+    condition: int = 0  # numbers in the scenario's condition; the first two are a vector of the pad's plane
+    input_size: int = 128  # pixels, side of the images that are given
+    image_size: int = 64  # pixels, side of the images that are predicted
+    camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
+    view: float = 0.15  # m, side of the square on the gel's face that an image shows
+    position_scale: float = 0.05  # m, see `training.Preprocessing`
+    look: int = 64  # numbers that describe the look
+    components: int = 6  # Gaussians of the final pose, of each outcome
+    window: int = 32  # pixels, side of the magnified part of an image
+    encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window
+    decoder: tuple[int, ...] = (128, 64, 32, 16)  # channels at 1/8, 1/4, 1/2 and all of the canvas
+    hidden: int = 384  # width of fully connected layers
+    canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
+    canvas_side: float = 0.18  # m, its side on the gel's face
+    tactile_weight: float = 4.0  # of the tactile image's nats in the loss
+    state_weight: float = 16.0  # of the squared error of the first pose, as each image's expert has it
+    pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
+    outcome_weight: float = 8.0  # of the outcome's nats
+    first_weight: float = 0.5  # of the nats of the first moment's images
+    look_weight: float = 0.3  # of the look's divergence: below 1, samples are sharper
+    drawn: float = 0.375  # share of a batch whose last moment is drawn; every sample trains the rest
+    drawn_first: float = 0.09375  # share whose first moment is drawn
+
+    def __post_init__(self) -> None:
+        if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
+            raise ValueError(f"inputs is {self.inputs}; it takes at least one of {INPUTS}, in this order")
+        if not set(self.inputs) & set(IMAGES):
+            raise ValueError(f"inputs is {self.inputs}; the look needs an image: add 'visual' or 'tactile'")
+        for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
+            if getattr(self, name) % part or getattr(self, name) < part:
+                raise ValueError(f"{name} is {getattr(self, name)} pixels; it takes a multiple of {part}")
+        if len(self.encoder) != 3 or len(self.decoder) != 4:
+            raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths; give 3 and 4")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain dictionaries and lists."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> "Config":
+        """The inverse of `to_json`, also after a trip through a JSON file."""
+        plain: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
+        return cls(**plain)
+
+
+class FinalPose(NamedTuple):
+    """The density of the final pose: a mixture of Gaussians over its code, in the frame of a heading."""
+
+    outcome: Float[Array, "n outcomes"]  # log probability of each outcome
+    weight: Float[Array, "n outcomes k"]  # log weight of each component of an outcome
+    mean: Float[Array, "n outcomes k 12"]
+    log_var: Float[Array, "n outcomes k 12"]
+    heading: Float[Array, "n 2"]  # of the frame, see `poses.heading`
+
+
+class _Residual(nnx.Module):
+    """`x + layer(swish(norm(x)))`, the layer a 3x3 convolution."""
+
+    def __init__(self, channels: int, rngs: nnx.Rngs) -> None:
+        self.norm = nnx.LayerNorm(channels, rngs=rngs)
+        self.layer = nnx.Conv(channels, channels, (3, 3), rngs=rngs)
+
+    def __call__(self, x: Array) -> Array:
+        return x + self.layer(jax.nn.swish(self.norm(x)))
+
+
+class _ResidualDense(nnx.Module):
+    """The same with two fully connected layers."""
+
+    def __init__(self, width: int, rngs: nnx.Rngs) -> None:
+        self.norm = nnx.LayerNorm(width, rngs=rngs)
+        self.first = nnx.Linear(width, width, rngs=rngs)
+        self.second = nnx.Linear(width, width, kernel_init=_SMALL, rngs=rngs)
+
+    def __call__(self, x: Array) -> Array:
+        return x + self.second(jax.nn.swish(self.first(jax.nn.swish(self.norm(x)))))
+
+
+def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h/2 w/2 4*c"]:
+    n, h, w, c = x.shape
+    return x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
+
+
+def _unfold(x: Float[Array, "n h w 4*c"]) -> Float[Array, "n 2*h 2*w c"]:
+    n, h, w, c = x.shape
+    return x.reshape(n, h, w, 2, 2, c // 4).transpose(0, 1, 3, 2, 4, 5).reshape(n, 2 * h, 2 * w, c // 4)
+
+
+class Encoder(nnx.Module):
+    """One image's expert: a Gaussian over pose code and look."""
+
+    def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
+        self.config = config
+        half, quarter, eighth = config.encoder
+        self.first = nnx.Conv(12, half, (3, 3), rngs=rngs)
+        self.halves = nnx.List([_Residual(half, rngs) for _ in range(2)])
+        self.to_quarter = nnx.Linear(4 * half, quarter, rngs=rngs)
+        self.quarters = nnx.List([_Residual(quarter, rngs) for _ in range(2)])
+        self.to_eighth = nnx.Linear(4 * quarter, eighth, rngs=rngs)
+        self.eighth = _Residual(eighth, rngs)
+        self.place = nnx.Linear(7, 64, rngs=rngs)
+        self.dense = nnx.Linear((config.window // 8) ** 2 * eighth + 64, config.hidden, rngs=rngs)
+        self.residual = _ResidualDense(config.hidden, rngs)
+        self.norm = nnx.LayerNorm(config.hidden, rngs=rngs)
+        self.last = nnx.Linear(config.hidden, 2 * (poses.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
+
+    def __call__(self, change: Float[Array, "n size size 3"]) -> Gaussian:
+        """The expert of images less that of the empty sensor."""
+        config = self.config
+        place = window.locate(jax.lax.stop_gradient(change))
+        x = self.first(_fold(3 * window.cut(change, place, config.window)))
+        for layer in self.halves:
+            x = layer(x)
+        x = self.to_quarter(_fold(x))
+        for layer in self.quarters:
+            x = layer(x)
+        x = jax.nn.swish(self.eighth(self.to_eighth(_fold(x))))
+        # Everything is estimated in the frame of the silhouette, and turned into the sensor's at the end.
+        centre = poses.turn_back(place.angle, (place.centre - 0.5) * config.view / config.position_scale)
+        side = place.side[:, None]
+        features = jnp.concatenate([centre, 0.25 * centre / side, jnp.log(side), place.angle], axis=-1)
+        x = jnp.concatenate([x.reshape(len(x), -1), jax.nn.swish(self.place(features))], axis=-1)
+        x = self.last(jax.nn.swish(self.norm(self.residual(self.dense(x)))))
+        mean, log_var = jnp.split(x, 2, axis=-1)
+        log_var = _LOG_VAR_LIMIT * jnp.tanh(log_var / _LOG_VAR_LIMIT)
+        mean = mean.at[:, :2].add(centre)  # an object is where it is seen
+        pose, look = jnp.split(mean, [poses.CODE], axis=-1)
+        doubt = poses.turn_variance(place.angle, jnp.exp(log_var[:, : poses.CODE]))
+        return Gaussian(
+            jnp.concatenate([poses.turn_code(place.angle, pose), look], axis=-1),
+            jnp.concatenate([jnp.log(doubt), log_var[:, poses.CODE :]], axis=-1),
+        )
+
+
+class Transition(nnx.Module):
+    """From a belief about the present state, and the condition, to the density of the final pose."""
+
+    def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
+        self.config = config
+        self.first = nnx.Linear(2 * poses.CODE + config.look + 4 + 2 * config.condition, config.hidden, rngs=rngs)
+        self.layers = nnx.List([_ResidualDense(config.hidden, rngs) for _ in range(3)])
+        self.norm = nnx.LayerNorm(config.hidden, rngs=rngs)
+        self.outcome = nnx.Linear(config.hidden, config.outcomes, kernel_init=_SMALL, rngs=rngs)
+        components = config.outcomes * config.components * (1 + 2 * poses.CODE)
+        self.mixture = nnx.Linear(config.hidden, components, kernel_init=_SMALL, rngs=rngs)
+
+    def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
+        """The density, from the means and variances of the fused posterior.
+
+        Args:
+            belief: over pose code and look.
+            condition: each number divided by its usual size; None where the model has none.
+        """
+        config = self.config
+        pose, look = jnp.split(belief.mean, [poses.CODE], axis=-1)
+        doubt = jnp.clip(belief.log_var[:, : poses.CODE], -_LOG_VAR_LIMIT, 2) / 4
+        heading = poses.heading(pose)
+        own = poses.turn_code_back(heading, pose)
+        features = [own, doubt, look, heading, pose[:, :2]]
+        if condition is not None:
+            features += [condition, poses.turn_back(heading, condition[:, :2]), condition[:, 2:]]
+        x = self.first(jnp.concatenate(features, axis=-1))
+        for layer in self.layers:
+            x = layer(x)
+        x = jax.nn.swish(self.norm(x))
+        parts = self.mixture(x).reshape(len(x), config.outcomes, config.components, -1)
+        middle, reach = _FINAL_LOG_VAR
+        return FinalPose(
+            outcome=jax.nn.log_softmax(self.outcome(x)),
+            weight=jax.nn.log_softmax(parts[..., 0]),
+            mean=own[:, None, None] + parts[..., 1 : 1 + poses.CODE],
+            log_var=middle + reach * jnp.tanh(parts[..., 1 + poses.CODE :] / reach),
+            heading=heading,
+        )
+
+
+class Decoder(nnx.Module):
+    """Both streams of an object of a look in a pose, over the images of the empty sensor.
+
+    A picture of the object is drawn on a canvas that follows its heading, and is then placed in the view where the
+    camera sees the object's origin. Colours come from a further layer in the view: light does not turn with the object.
+    """
+
+    def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
+        self.config = config
+        eighth, quarter, half, full = config.decoder
+        self.first = nnx.Linear(config.look + poses.CODE + 4, 512, rngs=rngs)
+        self.residual = _ResidualDense(512, rngs)
+        self.core = nnx.Linear(512, (config.canvas // 8) ** 2 * (eighth // 2), rngs=rngs)
+        self.widen = nnx.Linear(eighth // 2, eighth, rngs=rngs)
+        self.layers = nnx.List([_Residual(width, rngs) for width in (eighth, quarter, half)])
+        pairs = ((eighth, quarter), (quarter, half), (half, full))
+        self.enlarge = nnx.List([nnx.Linear(a, 4 * b, rngs=rngs) for a, b in pairs])
+        self.canvas = nnx.Linear(full, 12, rngs=rngs)
+        self.light = nnx.Linear(4, 12, kernel_init=_SMALL, rngs=rngs)
+        self.view = nnx.Conv(12, 12, (3, 3), rngs=rngs)
+        self.last = nnx.Conv(12, 7, (3, 3), kernel_init=_SMALL, rngs=rngs)
+
+    def __call__(
+        self,
+        pose: Float[Array, "n 12"],
+        look: Float[Array, "n look"],
+        empty: dict[str, Float[Array, "size size 3"]],
+    ) -> dict[str, Float[Array, "n size size 3"]]:
+        """Images in [0, 1]; `empty` has both of the untouched sensor."""
+        config = self.config
+        heading = poses.heading(pose)
+        place = jnp.concatenate([heading, pose[:, :2]], axis=-1)
+        x = jnp.concatenate([poses.turn_code_back(heading, pose), place, look], axis=-1)
+        x = self.core(jax.nn.swish(self.residual(self.first(x))))
+        x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
+        for layer, enlarge in zip(self.layers, self.enlarge, strict=True):
+            x = _unfold(enlarge(layer(x)))
+        x = window.sample(self.canvas(jax.nn.swish(x)), _on_canvas(config, pose, heading))
+        x = x.reshape(len(x), config.image_size, config.image_size, -1)
+        x = x * (1 + self.light(place)[:, None, None])
+        x = x + self.view(jax.nn.swish(x))
+        x = self.last(jax.nn.swish(x))
+        covered = jax.nn.sigmoid(x[..., 3:4] - 3)  # at first, hardly at all
+        visual = covered * jax.nn.sigmoid(x[..., :3]) + (1 - covered) * empty["visual"]
+        grey = jnp.clip(empty["tactile"], 0.01, 0.99)
+        tactile = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + x[..., 4:])
+        return {"visual": visual, "tactile": tactile}
+
+
+def _on_canvas(
+    config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"]
+) -> Float[Array, "n size*size 2"]:
+    """Where on the canvas each pixel of the view lies: column and row, whole numbers at pixel centres."""
+    position = pose[:, :3] * config.position_scale
+    depth = jnp.maximum(config.camera_distance + position[:, 2], _NEAREST * config.camera_distance)
+    shrunk = (config.camera_distance / depth)[:, None]
+    place = ((jnp.arange(config.image_size) + 0.5) / config.image_size - 0.5) * config.view
+    pixels = jnp.stack(jnp.meshgrid(place, place), axis=-1).reshape(1, -1, 2)
+    apart = (pixels - (position[:, :2] * shrunk)[:, None]) / (shrunk * config.canvas_side)[:, None]
+    return (poses.turn_back(heading[:, None], apart) + 0.5) * config.canvas - 0.5
+
+
+class Model(nnx.Module):
+    """An encoder per image that is an input, the transition and the decoder."""
+
+    def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
+        self.config = config
+        self.encoders = nnx.Dict({name: Encoder(config, rngs) for name in config.inputs if name in IMAGES})
+        self.transition = Transition(config, rngs)
+        self.decoder = Decoder(config, rngs)
+
+
+def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
+    """A new model as `(graphdef, params, stats)`; consumes `key`. It has no running statistics: `stats` is empty."""
+
+    @jax.jit
+    def draw(key: PRNGKeyArray) -> nnx.State:
+        return nnx.state(Model(config, nnx.Rngs(key)), nnx.Param)
+
+    abstract = nnx.eval_shape(lambda: Model(config, nnx.Rngs(0)))
+    graphdef, _, stats = nnx.split(abstract, nnx.Param, ...)
+    return graphdef, draw(key), stats

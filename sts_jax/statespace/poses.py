@@ -1,0 +1,68 @@
+"""Poses as the networks see them: 12 numbers, turned into a frame that follows the object's heading.
+
+A pose code is the position divided by a scale, then the nine entries of the rotation matrix, row by row. Gravity and
+the pad's plane do not change when everything is turned about the vertical, so physics and pictures are learnt in a
+frame with the object's own heading. What is learnt for one heading then holds for all of them.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+CODE = 12  # numbers in a pose code
+LEVEL = 0.85  # an axis whose horizontal part is longer than this gives the heading
+
+
+def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
+    """The horizontal direction of one of the object's axes, as cosine and sine of its angle from x.
+
+    It is the x axis of the mesh unless that is steep, else its z axis, else the least steep of the three. An object at
+    rest on one of its faces has one of these level, so that the choice is stable there. No gradient flows through it.
+
+    Args:
+        code: pose codes; the nine numbers need not be an exact rotation.
+    """
+    columns = jax.lax.stop_gradient(code[..., 3:].reshape(*code.shape[:-1], 3, 3)[..., :2, :])
+    lengths = jnp.linalg.norm(columns, axis=-2)
+    least_steep = jnp.argmax(lengths, axis=-1)
+    axis = jnp.where(lengths[..., 0] > LEVEL, 0, jnp.where(lengths[..., 2] > LEVEL, 2, least_steep))
+    chosen = jnp.take_along_axis(columns, axis[..., None, None], axis=-1)[..., 0]
+    length = jnp.linalg.norm(chosen, axis=-1, keepdims=True)
+    # A belief that knows nothing about the rotation has no heading.
+    return jnp.where(length > 1e-3, chosen / jnp.maximum(length, 1e-3), jnp.array([1.0, 0.0]))
+
+
+def turn(angle: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """Turn vectors of the pad's plane by an angle that is given as cosine and sine."""
+    cos, sin, x, y = angle[..., 0], angle[..., 1], vector[..., 0], vector[..., 1]
+    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def turn_back(angle: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """The inverse of `turn`."""
+    return turn(angle * jnp.array([1.0, -1.0]), vector)
+
+
+def turn_code(angle: Float[Array, "*n 2"], code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+    """Pose codes after everything was turned about the vertical through the sensor's origin."""
+    position = jnp.concatenate([turn(angle, code[..., :2]), code[..., 2:3]], axis=-1)
+    rows = code[..., 3:].reshape(*code.shape[:-1], 3, 3)
+    level = turn(angle[..., None, :], jnp.swapaxes(rows[..., :2, :], -1, -2))
+    rows = jnp.concatenate([jnp.swapaxes(level, -1, -2), rows[..., 2:, :]], axis=-2)
+    return jnp.concatenate([position, rows.reshape(*code.shape[:-1], 9)], axis=-1)
+
+
+def turn_code_back(angle: Float[Array, "*n 2"], code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+    """The inverse of `turn_code`."""
+    return turn_code(angle * jnp.array([1.0, -1.0]), code)
+
+
+def turn_variance(angle: Float[Array, "*n 2"], variance: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+    """The variances of a turned pose code's components, where those of the code are independent."""
+    cos, sin = angle[..., :1] ** 2, angle[..., 1:] ** 2
+
+    def mixed(x: Float[Array, "*n k"], y: Float[Array, "*n k"]) -> list[Float[Array, "*n k"]]:
+        return [cos * x + sin * y, sin * x + cos * y]
+
+    x, y, z, first, second, third = jnp.split(variance, [1, 2, 3, 6, 9], axis=-1)
+    return jnp.concatenate([*mixed(x, y), z, *mixed(first, second), third], axis=-1)

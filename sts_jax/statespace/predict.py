@@ -1,0 +1,74 @@
+"""Predictions of a state-space model: samples of the final pose and of both streams, from any subset of the inputs."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from sts_jax.mvae import Gaussian
+from sts_jax.statespace import poses
+from sts_jax.statespace.networks import FinalPose, Model
+from sts_jax.statespace.objective import experts, fuse, reduced
+
+
+class Samples(NamedTuple):
+    """What may come of a first moment: k samples of n items."""
+
+    belief: Gaussian  # over the present pose code and the look, (n, 12 + look)
+    outcome: Float[Array, "n outcomes"]  # probability of each outcome
+    pose: Float[Array, "k n 12"]  # codes of final poses; the nine numbers are near a rotation
+    images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first poses
+
+
+def sample(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    key: PRNGKeyArray,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n c"] | None = None,
+    *,
+    num: int,
+    drawn: int,
+) -> Samples:
+    """Sample the end of each first moment.
+
+    Args:
+        graphdef: definition of the model.
+        params: its parameters.
+        key: consumed.
+        inputs: as of `objective.experts`, some of the model's inputs.
+        present: which items of each input count.
+        empty: as of `objective.experts`.
+        condition: as of `Transition`.
+        num: how many final poses.
+        drawn: of how many of them both streams are drawn, each with its own look.
+    """
+    model = nnx.merge(graphdef, params)
+    belief = fuse(experts(model, inputs, empty), present)
+    final = model.transition(belief, condition)
+    end, appearance = jax.random.split(key)
+    codes = jax.vmap(lambda key: _final_code(key, final))(jax.random.split(end, num))
+    mean, log_var = (x[:, poses.CODE :] for x in belief)
+    looks = mean + jnp.exp(0.5 * log_var) * jax.random.normal(appearance, (drawn, *mean.shape))
+    shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
+    flat = model.decoder(codes[:drawn].reshape(-1, poses.CODE), looks.reshape(-1, looks.shape[-1]), shown)
+    images = {name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in flat.items()}
+    return Samples(belief, jnp.exp(final.outcome), codes, images)
+
+
+def _final_code(key: PRNGKeyArray, final: FinalPose) -> Float[Array, "n 12"]:
+    which, noise = jax.random.split(key)
+    number = len(final.outcome)
+    joint = (final.outcome[:, :, None] + final.weight).reshape(number, -1)
+    chosen = jax.random.categorical(which, joint)
+
+    def of_chosen(x: Array) -> Array:
+        flat = x.reshape(number, -1, poses.CODE)
+        return jnp.take_along_axis(flat, chosen[:, None, None], axis=1)[:, 0]
+
+    mean, log_var = of_chosen(final.mean), of_chosen(final.log_var)
+    return poses.turn_code(final.heading, mean + jnp.exp(0.5 * log_var) * jax.random.normal(noise, mean.shape))
