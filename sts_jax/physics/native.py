@@ -26,6 +26,7 @@ STILL_SPEED = 0.001  # m/s; slower than this ...
 STILL_TURN = 0.02  # rad/s; ... and this ...
 STILL_TIME = 0.5  # s; ... for this long, under a gravity that stays as it is, will not move again
 
+FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # what is given anew for every step
 _PAD, _WALL = slice(0, 9), slice(11, 17)  # force, torque, place; force, torque
 _DEEPEST = slice(9, 11)  # whether there is any contact, and the distance of the deepest
 _SENSORS = """
@@ -105,7 +106,7 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
     """
     low = qpos[..., 2] < lowest
     gone = np.zeros(low.shape, bool)
-    w, x, y, z = qpos[low, 3:].T
+    w, x, y, z = (qpos[low, column] for column in range(3, 7))
     up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     gone[low] = (up @ points.T).max(axis=1, initial=-np.inf) + qpos[low, 2] < -GONE_DEPTH
     return np.where(gone.any(axis=1), gone.argmax(axis=1), gone.shape[1])
@@ -215,14 +216,9 @@ def roll(
         push[:, :, 1, :3] = change[which, begin:end, steps - per_frame :].reshape(len(which), -1, 3)
         xfrc[which] = 0
         control = push.reshape(*push.shape[:2], 12) if push.any() else None
-        found = batch.rollout(
-            push.shape[1],
-            control,
-            int(mujoco.mjtState.mjSTATE_XFRC_APPLIED),
-            record=("qpos", "qvel", "sensordata"),
-            ids=which,
-        )
-        rolled = _Steps(*found.values(), _gone(found["qpos"], points, lowest))
+        found = batch.rollout(push.shape[1], control, int(FORCE), record=("qpos", "qvel", "sensordata"), ids=which)
+        qpos = found["qpos"]
+        rolled = _Steps(qpos, found["qvel"], found["sensordata"], _gone(qpos, points, lowest))
         for field, new in zip(records, _record(rolled, end - begin), strict=True):
             field[which, begin:end] = new
         after = _count(rolled, _Counts(*(x[which] for x in counts)), timestep)
