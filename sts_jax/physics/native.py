@@ -106,10 +106,10 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
     """
     low = qpos[..., 2] < lowest
     gone = np.zeros(low.shape, bool)
-    w, x, y, z = (qpos[low, column] for column in range(3, 7))
+    w, x, y, z = qpos[low][:, 3:].T
     up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
-    gone[low] = (up @ points.T).max(axis=1, initial=-np.inf) + qpos[low, 2] < -GONE_DEPTH
-    return np.where(gone.any(axis=1), gone.argmax(axis=1), gone.shape[1])
+    gone[low] = (up @ points.T).max(axis=1, initial=-np.inf) + qpos[low][:, 2] < -GONE_DEPTH
+    return np.where(gone.any(axis=1), gone.argmax(axis=1), qpos.shape[1])
 
 
 def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:

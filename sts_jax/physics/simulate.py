@@ -31,6 +31,7 @@ from sts_jax.sensor import Sensor
 # step: what turns fast and hits with a corner, at 3 m/s, is 3 mm deep before they push.
 SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before giving up
+RIGIDS = 8  # draws of which mass properties are computed at once
 COMPILED = 64  # bodies whose model C MuJoCo keeps
 CONTENTS = 16  # of each body, by which a start may be chosen
 WORKERS = 2  # chunks under way at once in MJX: XLA runs these small steps on one CPU core each
@@ -139,14 +140,15 @@ _rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
 
 
 @contextlib.contextmanager
-def _reported(progress: Any, count: int) -> Iterator[Callable[[int], object]]:
+def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[int], object]]:
     """The function to call with the number of trajectories done: the caller's, a bar's, or one that does nothing."""
     if callable(progress):
         yield progress
         return
     if not isinstance(progress, bool):
         raise TypeError(f"progress is {progress!r}; it takes True, False or a function of the number done")
-    with tqdm(total=count, desc="simulate: compiling", unit=" trajectories", disable=not progress) as bar:
+    first = "simulate: compiling" if engine == "mjx" else "simulate"
+    with tqdm(total=count, desc=first, unit=" trajectories", disable=not progress) as bar:
 
         def show(done: int) -> None:
             bar.set_description("simulate", refresh=False)
@@ -275,10 +277,15 @@ class _Rigid(NamedTuple):
 
 def _rigids(bodies: Sequence[Body], which: np.ndarray, hidden: Hidden) -> _Rigid:
     """Mass properties and friction of each draw; `which`, the index of its body, never falls."""
+    values = jax.tree.map(np.asarray, hidden)
     found = []
-    for index, body in enumerate(bodies):
-        own = jax.tree.map(lambda x, mine=which == index: x[mine], hidden)
-        found.append((*_rigid(body, own.fill, own.shell_scale, own.up), own.friction))
+    for index in np.unique(which).tolist():
+        mine = np.flatnonzero(which == index)
+        for rows in np.split(mine, range(RIGIDS, len(mine), RIGIDS)):
+            # Always as many at once: another number rounds differently, and compiles anew.
+            own = jax.tree.map(lambda x, rows=np.resize(rows, RIGIDS): x[rows], values)
+            rigid = _rigid(bodies[index], own.fill, own.shell_scale, own.up)
+            found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])
     return _Rigid(*(np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True)))
 
 
@@ -427,7 +434,7 @@ def simulate(
     attempt = np.zeros(count, np.int32)
     pending = np.arange(count)
     rows: dict[int, tuple[State | native.Ends, Record]] = {}
-    with _reported(progress, count) as report:
+    with _reported(progress, count, engine) as report:
         while len(pending):
             starts, drawn = _draw(key, which, nth, attempt, shapes, scenario=scenario, pad=pad)
             drawn = drawn if given is None else given
