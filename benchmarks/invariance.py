@@ -5,11 +5,12 @@
     python -m benchmarks.invariance --only jerked-bottles
 
 A box and a bottle released 20 mm above the pad in any orientation (which face is down), and bottles on the jerked pad
-(the scenario's outcomes). The sides: `simulate` as it ships; half its step; the mirror image (start, jerk and object);
-C MuJoCo, which finds the contacts itself; and C MuJoCo with every vertex a contact. Of a mesh that stands on a face C
+(the scenario's outcomes). The sides: `simulate` in MJX ("ours"); half its step; the mirror image (start, jerk and
+object); `simulate` in C MuJoCo, its half step and its mirror image; C MuJoCo by itself, which finds the contacts of the
+mesh; and C MuJoCo with every vertex a contact. Of a mesh that stands on a face C
 keeps four contacts, so that a round base is a square to it, narrower by up to 30 %, and rocks and walks more; where
 each vertex of the hull is a point of its own, and the mesh stays for the rims, it has the contacts that ours has. So
-has a fifth side of the jerked bottles, a pad on slides that is really driven, where gravity stays as it is.
+has a last side of the jerked bottles, a pad on slides that is really driven, where gravity stays as it is.
 
 All sides have the same starts and hidden values, so that the interval of a difference is that of paired shares
 (Agresti and Min 2005: 95 %, half a count added to each cell).
@@ -137,6 +138,7 @@ def roll(
     bodies: Sequence[objects.Body] | None = None,
     scenario: physics.Scenario | None = None,
     seed: int = 0,
+    engine: physics.Engine = "mjx",
 ) -> physics.Trajectory:
     """`num` runs of a case, a `Trajectory` of NumPy arrays; its own bodies and scenario unless others are given."""
     items = list(case.bodies if bodies is None else bodies)
@@ -149,6 +151,7 @@ def roll(
             case.scenario if scenario is None else scenario,
             each,
             progress=lambda n: bar.update(n - bar.n),
+            engine=engine,
         )
     return jax.tree.map(np.asarray, traj)
 
@@ -241,18 +244,21 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
     """The labels of every run on each side; the first side is ours."""
-    ours = roll(case, num)
-    half = roll(case, num, scenario=halved(case.scenario))
-    flipped = roll(case, num, scenario=case.mirrored, bodies=[objects.mirror(body) for body in case.bodies])
+    other_hand = [objects.mirror(body) for body in case.bodies]
+    rolled: dict[str, physics.Trajectory] = {}
+    sides_of: dict[str, physics.Engine] = {"ours": "mjx", "simulate in C": "mujoco"}
+    for name, engine in sides_of.items():
+        rolled[name] = roll(case, num, engine=engine)
+        rolled[f"{name}, half step"] = roll(case, num, scenario=halved(case.scenario), engine=engine)
+        rolled[f"{name}, mirrored"] = roll(case, num, scenario=case.mirrored, bodies=other_hand, engine=engine)
+    ours = rolled["ours"]
     first = ours.pose[:, 0]
     print(
         f"{case.name}: {len(first)} runs a side; unsettled {100 * np.mean(~ours.settled):.1f} %, drawn again "
-        f"{', '.join(str(int(t.resampled.sum())) for t in (ours, half, flipped))} (ours, half, mirrored)"
+        f"{', '.join(f'{int(traj.resampled.sum())} ({name})' for name, traj in rolled.items())}"
     )
     found = {
-        "ours": named(case, first, ours.pose[:, -1]),
-        "half step": named(case, half.pose[:, 0], half.pose[:, -1]),
-        "mirrored": named(case, flipped.pose[:, 0], flipped.pose[:, -1]),
+        **{name: named(case, traj.pose[:, 0], traj.pose[:, -1]) for name, traj in rolled.items()},
         "C MuJoCo": named(case, first, last_in_c(case, ours)),
         "C, every vertex": named(case, first, last_in_c(case, ours, every_vertex=True)),
     }

@@ -1,12 +1,14 @@
-"""Physics: steps per second beside C MuJoCo, frames per second with both streams, and compilation.
+"""Physics: steps per second beside C MuJoCo, falls per second of both engines, frames per second, and compilation.
 
     python -m benchmarks.physics                   # about 2 minutes
+    python -m benchmarks.physics --engines 4       # about 2 minutes on two cores
     python -m benchmarks.physics --pipeline 64     # about a minute on two cores; 16384 is for a GPU
     python -m benchmarks.physics --scaling         # about 10 minutes on two cores; writes benchmarks/results/physics/
     python -m benchmarks.physics --compile         # about 8 minutes on two cores
 
 The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in both engines, C MuJoCo's
-batch (`mujoco.rollout`) on all cores, measured in turn. `--pipeline` drops a bottle so many times and draws every frame
+batch (`mujoco.rollout`) on all cores, measured in turn. `--engines` simulates falls of Freefall's default, so many of
+each of 16 objects, in both engines of `simulate`: falls per second, all costs but compilation. `--pipeline` drops a bottle so many times and draws every frame
 of it, vision and touch, 64x64, uint8, fetched from the device: seconds and frames per second of either and of both,
 all costs but compilation (a frame is one world at one time). `--scaling` steps 1 to 4,096 worlds at once (65,536 on a
 GPU). `--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in
@@ -26,7 +28,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -111,7 +113,7 @@ def speed(num: int) -> None:
 def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
     """Print steps per second of both engines, `num` drops of each object."""
     sensor, scenario = Sensor(), physics.Freefall()
-    simulate = functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num)
+    simulate = functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, engine="mjx")
     traj, steps = simulate(), scenario.frames * scenario.steps
     models, states = in_c(items, traj, scenario.contact)
     batches = [(np.array(m, object), s) for m, s in grouped(models, states)]
@@ -128,6 +130,22 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
     print(f"    simulate (MJX)   {ours:10,.0f} steps/s, {WORKERS} threads, all costs but compilation")
     print(f"    C MuJoCo         {theirs:10,.0f} steps/s, rollout on {os.cpu_count()} threads")
     print(f"    ratio            {ratio:10.4f} (1/{1 / ratio:.1f}), median of pairs")
+
+
+def engines(num: int) -> None:
+    """Print falls per second of both engines of `simulate`, `num` falls of each of 16 objects."""
+    items, sensor, scenario = bodies(objects.CATEGORIES, 16), Sensor(), physics.Freefall()
+    calls = [
+        functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, engine=engine)
+        for engine in get_args(physics.Engine)
+    ]
+    seconds = in_turn(*calls, repeats=3)
+    count = len(items) * num
+    print(f"{count} falls of {scenario.frames} frames, eight classes, {os.cpu_count()} cores")
+    for engine, median in zip(get_args(physics.Engine), np.median(seconds, axis=0), strict=True):
+        print(f"    simulate, engine {engine!r:9s} {count / median:8.1f} falls/s")
+    ratio = float(np.median(seconds[:, 0] / seconds[:, 1]))
+    print(f"    ratio                      {ratio:8.1f}, median of pairs")
 
 
 def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
@@ -246,13 +264,13 @@ def first_call(name: str, count: int) -> None:
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]
     begin = time.perf_counter()
-    physics.simulate(jax.random.key(0), items[0], sensor, scenario)
+    physics.simulate(jax.random.key(0), items[0], sensor, scenario, engine="mjx")
     first = time.perf_counter() - begin
     begin = time.perf_counter()
-    physics.simulate(jax.random.key(0), items[0], sensor, scenario)
+    physics.simulate(jax.random.key(0), items[0], sensor, scenario, engine="mjx")
     again = time.perf_counter() - begin
     jax.clear_caches()
-    physics.simulate(jax.random.key(0), items, sensor, scenario)
+    physics.simulate(jax.random.key(0), items, sensor, scenario, engine="mjx")
     compiled: dict[str, Any] = {"_roll": _roll, "_draw": _draw, "_rigid": _rigid, "_gravity": _gravity}
     programs = {name: function._cache_size() for name, function in compiled.items()}
     print(json.dumps({"seconds": first - again, "objects": len(items), "programs": programs}))
@@ -275,6 +293,7 @@ def compilation(count: int = 100) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
+    parser.add_argument("--engines", type=int, metavar="FALLS", help="falls per second of both engines")
     parser.add_argument("--pipeline", type=int, metavar="WORLDS", help="frames per second of so many drops, drawn")
     parser.add_argument("--scaling", action="store_true", help="steps per second against the number of worlds")
     parser.add_argument("--compile", action="store_true", help="seconds and number of compilations")
@@ -287,6 +306,8 @@ if __name__ == "__main__":
         compilation(arguments.count)
     elif arguments.scaling:
         scaling()
+    elif arguments.engines is not None:
+        engines(arguments.engines)
     elif arguments.pipeline is not None:
         pipeline(arguments.pipeline)
     else:

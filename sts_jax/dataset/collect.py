@@ -57,6 +57,7 @@ class Collection:
     crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
     objects_per_shard: int = 40
     seed: int = 0
+    engine: physics.Engine = "mujoco"  # of the physics, see `physics.simulate`; trajectories differ between engines
 
     @property
     def num_trajectories(self) -> int:
@@ -351,6 +352,7 @@ def _make_shard(
                 collection.scenario,
                 collection.num_per_object,
                 progress=_report(progress, before, collection.num_trajectories, "trajectories"),
+                engine=collection.engine,
             )
             break
         except physics.BodyError as error:  # one bad object does not stop a collection

@@ -17,7 +17,7 @@ from array_record.python.array_record_module import ArrayRecordReader, ArrayReco
 from sts_jax import physics
 from sts_jax._files import TornFileError, sha256, write_bytes, write_whole
 
-FORMAT = 2  # of a dataset's files; one more whenever older files can no longer be read
+FORMAT = 3  # of a dataset's files; one more whenever older files can no longer be read
 ARRAYS = {  # the names that a shard's .npz holds beside its identity
     *(f"trajectory/{name}" for name in physics.Trajectory._fields if name != "hidden"),
     *(f"hidden/{name}" for name in physics.Hidden._fields),

@@ -1,4 +1,4 @@
-"""Physics: objects fall, slide and topple on the pad in MJX (`simulate`), or lie there at rest (`place`)."""
+"""Physics: objects fall, slide and topple on the pad in MuJoCo (`simulate`), or lie there at rest (`place`)."""
 
 from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
 from sts_jax.physics.scenarios import (
@@ -13,11 +13,12 @@ from sts_jax.physics.scenarios import (
     variant,
 )
 from sts_jax.physics.scene import Contact
-from sts_jax.physics.simulate import BodyError, Trajectory, refusal, simulate
+from sts_jax.physics.simulate import BodyError, Engine, Trajectory, refusal, simulate
 
 __all__ = [
     "BodyError",
     "Contact",
+    "Engine",
     "Freefall",
     "Hidden",
     "Inclined",

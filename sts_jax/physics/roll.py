@@ -40,11 +40,11 @@ class State(NamedTuple):
 class Record(NamedTuple):
     """What is kept of one frame."""
 
-    pose: Float[Array, "7"]  # m and quaternion, w >= 0
-    velocity: Float[Array, "6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
-    wrench: Float[Array, "6"]  # N, N m about the sensor's origin
-    contact: Bool[Array, ""]  # the pad pushes in the last step
-    wall: Bool[Array, ""]  # the wall does
+    pose: Float[Array | np.ndarray, "*n 7"]  # m and quaternion, w >= 0
+    velocity: Float[Array | np.ndarray, "*n 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
+    wrench: Float[Array | np.ndarray, "*n 6"]  # N, N m about the sensor's origin
+    contact: Bool[Array | np.ndarray, "*n"]  # the pad pushes in the last step
+    wall: Bool[Array | np.ndarray, "*n"]  # the wall does
 
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:

@@ -1,13 +1,14 @@
-"""`simulate`: bodies, draws and chunks on the host, MJX underneath."""
+"""`simulate`: bodies, draws and chunks on the host, MJX or C MuJoCo underneath."""
 
 import concurrent.futures
 import contextlib
 import copy
 import functools
 import math
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from tqdm import tqdm
 from sts_jax import objects
 from sts_jax._keys import check_key
 from sts_jax.objects.body import Body, is_traced
-from sts_jax.physics import contact, scene
+from sts_jax.physics import contact, native, scene
 from sts_jax.physics.contact import Hull
 from sts_jax.physics.rest import UPRIGHT
 from sts_jax.physics.roll import SLOW_TIME, Record, State, initial, roll
@@ -31,8 +32,12 @@ from sts_jax.sensor import Sensor
 # step: what turns fast and hits with a corner, at 3 m/s, is 3 mm deep before they push.
 SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before giving up
+RIGIDS = 8  # draws of which mass properties are computed at once
+COMPILED = 64  # bodies whose model C MuJoCo keeps
 CONTENTS = 16  # of each body, by which a start may be chosen
-WORKERS = 2  # chunks under way at once: XLA runs these small steps on one CPU core each
+WORKERS = 2  # chunks under way at once in MJX: XLA runs these small steps on one CPU core each
+
+Engine = Literal["mjx", "mujoco"]
 
 
 class BodyError(ValueError):
@@ -136,14 +141,15 @@ _rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
 
 
 @contextlib.contextmanager
-def _reported(progress: Any, count: int) -> Iterator[Callable[[int], object]]:
+def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[int], object]]:
     """The function to call with the number of trajectories done: the caller's, a bar's, or one that does nothing."""
     if callable(progress):
         yield progress
         return
     if not isinstance(progress, bool):
         raise TypeError(f"progress is {progress!r}; it takes True, False or a function of the number done")
-    with tqdm(total=count, desc="simulate: compiling", unit=" trajectories", disable=not progress) as bar:
+    first = "simulate: compiling" if engine == "mjx" else "simulate"
+    with tqdm(total=count, desc=first, unit=" trajectories", disable=not progress) as bar:
 
         def show(done: int) -> None:
             bar.set_description("simulate", refresh=False)
@@ -261,24 +267,108 @@ def _check_hidden(hidden: Hidden, count: int) -> Hidden:
     return Hidden(**jax.tree.map(jnp.asarray, arrays))
 
 
+class _Rigid(NamedTuple):
+    """What is rigid of each draw, float64."""
+
+    mass: Float[np.ndarray, "n"]  # kg
+    com: Float[np.ndarray, "n 3"]  # m, mesh frame
+    inertia: Float[np.ndarray, "n 3 3"]  # kg m^2 about `com`
+    friction: Float[np.ndarray, "n"]
+
+
+def _rigids(bodies: Sequence[Body], which: np.ndarray, hidden: Hidden) -> _Rigid:
+    """Mass properties and friction of each draw; `which`, the index of its body, never falls."""
+    values = jax.tree.map(np.asarray, hidden)
+    found = []
+    for index in np.unique(which).tolist():
+        mine = np.flatnonzero(which == index)
+        for rows in np.split(mine, range(RIGIDS, len(mine), RIGIDS)):
+            # Always as many at once: another number rounds differently, and compiles anew.
+            own = jax.tree.map(lambda x, rows=np.resize(rows, RIGIDS): x[rows], values)
+            rigid = _rigid(bodies[index], own.fill, own.shell_scale, own.up)
+            found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])
+    return _Rigid(*(np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True)))
+
+
+def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: _Rigid, row: int) -> None:
+    try:
+        scene.set_rigid(model, data, *(x[row] for x in rigid))
+    except ValueError as error:
+        raise BodyError(body, str(error)) from error
+
+
 def _draws(
     bodies: Sequence[Body], which: np.ndarray, hidden: Hidden, pad: tuple[float, float], constants: Contact, wall: float
 ) -> dict[str, np.ndarray]:
-    """The model's fields of each draw: MuJoCo derives them from mass, centre of mass, inertia and friction."""
+    """The fields of MJX's model of each draw: MuJoCo derives them from mass, centre of mass, inertia and friction."""
     original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
     data = mujoco.MjData(model)
+    rigid = _rigids(bodies, which, hidden)
     fields = []
-    for index, body in enumerate(bodies):
-        own = jax.tree.map(lambda x, mine=which == index: x[mine], hidden)
-        rigid = [np.asarray(x, np.float64) for x in (*_rigid(body, own.fill, own.shell_scale, own.up), own.friction)]
-        for mass, com, inertia, friction in zip(*rigid, strict=True):
-            try:
-                scene.set_rigid(model, data, mass, com, inertia, friction)
-            except ValueError as error:
-                raise BodyError(index, str(error)) from error
-            fields.append(scene.drawn(model, like))
+    for row, body in enumerate(which.tolist()):
+        _set_rigid(model, data, body, rigid, row)
+        fields.append(scene.drawn(model, like))
     return {name: np.stack([f[name] for f in fields]) for name in fields[0]}
+
+
+# The end and the records of the trajectories with some indices.
+_Run = Callable[[np.ndarray], tuple[State | native.Ends, Record]]
+
+
+class _Set(NamedTuple):
+    """Everything about a set of trajectories that no draw changes."""
+
+    bodies: list[Body]
+    which: Int[np.ndarray, "n"]  # index of the body of each
+    hulls: list[Hull]
+    scenario: Scenario
+    pad: tuple[float, float]  # m
+    time: Float[Array, "f s"]  # s, at which each step begins
+
+
+def _in_mjx(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _Run:
+    bodies, which, hulls, scenario, pad, time = trajectories
+    _, model, data = scene.template(pad, scenario.contact, scenario.wall)
+    fields = _draws(bodies, which, hidden, pad, scenario.contact, scenario.wall)
+
+    def run(indices: np.ndarray) -> tuple[State, Record]:
+        padded = np.pad(indices, (0, chunk - len(indices)), "edge")
+        start = jax.tree.map(lambda x: x[padded], starts)
+        worlds = _Worlds(
+            fields={name: x[padded] for name, x in fields.items()},
+            hull=jax.tree.map(lambda *x: np.stack(x), *(hulls[which[i]] for i in padded)),
+            start=start,
+            gravity=_gravity(start.condition, time, scenario=scenario),
+        )
+        return jax.tree.map(lambda x: np.asarray(x)[: len(indices)], _roll(worlds, model, data))
+
+    return run
+
+
+def _in_c(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _Run:
+    """As `_in_mjx`; the trajectories of one call are of one body."""
+    bodies, which, _, scenario, pad, time = trajectories
+    rigid = _rigids(bodies, which, hidden)
+    starts = jax.tree.map(np.asarray, starts)
+
+    @functools.lru_cache(maxsize=COMPILED)
+    def compiled(body: int) -> mujoco.MjModel:
+        return native.compile_body(np.asarray(bodies[body].hulls), pad, scenario.contact, scenario.wall)
+
+    def run(indices: np.ndarray) -> tuple[native.Ends, Record]:
+        body = int(which[indices[0]])
+        models = []
+        data = mujoco.MjData(compiled(body))
+        for i in indices.tolist():
+            models.append(copy.copy(compiled(body)))
+            _set_rigid(models[-1], data, body, rigid, i)
+        start = jax.tree.map(lambda x: x[indices], starts)
+        padded = np.pad(start.condition, ((0, chunk - len(indices)), (0, 0)))  # one size: `_gravity` compiles once
+        gravity = np.asarray(_gravity(padded, time, scenario=scenario), np.float64)[: len(indices)]
+        return native.roll(models, np.unique(np.asarray(bodies[body].hulls).reshape(-1, 3), axis=0), start, gravity)
+
+    return run
 
 
 def simulate(
@@ -291,6 +381,7 @@ def simulate(
     hidden: Hidden | None = None,
     progress: bool | Callable[[int], object] = False,
     chunk: int = 32,
+    engine: Engine | None = None,
 ) -> Trajectory:
     """Simulates `num` trajectories of each body: random start, hidden values, contact with the pad.
 
@@ -305,11 +396,13 @@ def simulate(
         num: trajectories of each body.
         hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major: rolls the starts of `key` with these instead
             of drawn ones; where `resampled` is not 0 the start is another one.
-        progress: True shows a bar on standard error, or in a notebook: the first call compiles for tens of seconds
-            before its first chunk is done. A function is called with the number of trajectories done so far, after
-            each chunk.
-        chunk: trajectories that MJX steps at once; another number compiles anew and rounds
-            differently. Larger ones suit a GPU.
+        progress: True shows a bar on standard error, or in a notebook: MJX compiles for tens of seconds before the
+            first chunk is done. A function is called with the number of trajectories done so far, after each chunk.
+        chunk: trajectories that MJX steps at once; another number compiles anew and rounds differently. Larger ones
+            suit a GPU. C MuJoCo takes at most so many, of one body, in one thread; its results do not depend on it.
+        engine: "mujoco" is C MuJoCo, on all CPU cores, several times as fast there and with nothing to compile; "mjx"
+            runs on the device of JAX. None takes the faster one of the machine: "mujoco" where
+            `jax.default_backend()` is "cpu". Both have the same starts and hidden values for a key.
 
     Returns:
         bodies * num trajectories, body-major.
@@ -323,40 +416,35 @@ def simulate(
     bodies = list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
     check_key(key)
     _check(bodies, sensor, scenario, num, chunk)
+    if engine not in (None, *get_args(Engine)):
+        raise ValueError(f"engine is {engine!r}; it takes {', '.join(map(repr, get_args(Engine)))} or None")
     count = len(bodies) * num
     given = None if hidden is None else _check_hidden(hidden, count)
     pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
     hulls = _hulls(bodies)
-    sizes = np.array([b.hulls.size for b in bodies])
     shapes = _shapes(bodies, scenario)
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
-    _, model, data = scene.template(pad, scenario.contact, scenario.wall)
     frame = np.arange(scenario.frames)[:, None] / scenario.rate
     time = jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep)  # of each step
-
-    def run(starts: Start, fields: dict[str, np.ndarray], indices: np.ndarray) -> tuple[State, Record]:
-        padded = np.pad(indices, (0, chunk - len(indices)), "edge")
-        start = jax.tree.map(lambda x: x[padded], starts)
-        worlds = _Worlds(
-            fields={name: x[padded] for name, x in fields.items()},
-            hull=jax.tree.map(lambda *x: np.stack(x), *(hulls[which[i]] for i in padded)),
-            start=start,
-            gravity=_gravity(start.condition, time, scenario=scenario),
-        )
-        return jax.tree.map(lambda x: np.asarray(x)[: len(indices)], _roll(worlds, model, data))
+    trajectories = _Set(bodies, which, hulls, scenario, pad, time)
+    if engine is None:
+        engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    prepare, workers = (_in_mjx, WORKERS) if engine == "mjx" else (_in_c, os.cpu_count() or 1)
+    # Those of one call: of one size in MJX, of one body in C.
+    alike = np.array([b.hulls.size for b in bodies])[which] if engine == "mjx" else which
 
     attempt = np.zeros(count, np.int32)
     pending = np.arange(count)
-    rows: dict[int, tuple[State, Record]] = {}
-    with _reported(progress, count) as report:
+    rows: dict[int, tuple[State | native.Ends, Record]] = {}
+    with _reported(progress, count, engine) as report:
         while len(pending):
             starts, drawn = _draw(key, which, nth, attempt, shapes, scenario=scenario, pad=pad)
             drawn = drawn if given is None else given
-            fields = _draws(bodies, which, drawn, pad, scenario.contact, scenario.wall)
-            by_size = [pending[sizes[which[pending]] == size] for size in np.unique(sizes)]
-            chunks = [c for part in by_size for c in np.split(part, range(chunk, len(part), chunk)) if len(c)]
-            with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
-                results = pool.map(functools.partial(run, starts, fields), chunks)
+            parts = [pending[alike[pending] == kind] for kind in np.unique(alike[pending])]
+            size = chunk if engine == "mjx" else min(chunk, -(-len(pending) // workers))
+            chunks = [c for part in parts for c in np.split(part, range(size, len(part), size))]
+            with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+                results = pool.map(prepare(trajectories, starts, drawn, chunk), chunks)
                 for indices, result in zip(chunks, results, strict=True):
                     for row, i in enumerate(indices.tolist()):
                         rows[i] = jax.tree.map(lambda x, row=row: x[row], result)
@@ -373,7 +461,7 @@ def simulate(
                     "is its hull too thin or its mass out of scale?",
                 )
 
-    last, records = jax.tree.map(lambda *x: jnp.stack(x), *(rows[i] for i in range(count)))
+    last, records = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
     frozen_or_slow = last.gone | (last.slow * scenario.contact.timestep >= SLOW_TIME)
     return Trajectory(
         time=jnp.tile(jnp.arange(scenario.frames) / scenario.rate, (count, 1)),

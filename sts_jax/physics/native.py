@@ -1,0 +1,251 @@
+"""Trajectories in C MuJoCo, the engine of a CPU: what `roll` promises, for some trajectories of one body at once.
+
+Every vertex of the hull is a contact point of its own, as in `contact`. Of a mesh that stands on a face MuJoCo keeps
+four contacts, so that a round base would be a square to it. The mesh itself stays for the rims of pad and wall, where
+no vertex is.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import mujoco.batch
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from sts_jax.physics import scene
+from sts_jax.physics.roll import GONE_DEPTH, PARTED_TIME, SLOW_SPEED, SLOW_TURN, Record
+from sts_jax.physics.scenarios import Start
+
+POINT = 1e-6  # m, radius of a vertex that is a contact
+MESH_GAP = 0.0001  # m; the mesh pushes only where it is this deep, deeper than vertices at rest
+BLOCK = 8  # frames that are rolled before worlds that have ended are dropped
+STILL_SPEED = 0.001  # m/s; slower than this ...
+STILL_TURN = 0.02  # rad/s; ... and this ...
+STILL_TIME = 0.5  # s; ... for this long, under a gravity that stays as it is, will not move again
+
+FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # what is given anew for every step
+_PAD, _WALL = slice(0, 9), slice(11, 17)  # force, torque, place; force, torque
+_DEEPEST = slice(9, 11)  # whether there is any contact, and the distance of the deepest
+_SENSORS = """
+<sensor>
+  <contact geom1="pad" subtree2="object" reduce="netforce" data="force torque pos"/>
+  <contact body1="world" subtree2="object" reduce="mindist" data="found dist"/>
+  {wall}
+</sensor>
+</mujoco>
+"""
+_WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="force torque"/>'
+
+
+class Ends(NamedTuple):
+    """What trajectories have come to; the fields are those of `roll.State`."""
+
+    gone: Bool[np.ndarray, "n"]
+    slow: Int[np.ndarray, "n"]
+    touches: Int[np.ndarray, "n"]
+    sunk: Float[np.ndarray, "n"]
+    finite: Bool[np.ndarray, "n"]
+
+
+class _Counts(NamedTuple):
+    """What is handed on from step to step, beside MuJoCo's own state."""
+
+    gone: Bool[np.ndarray, "n"]
+    slow: Int[np.ndarray, "n"]
+    still: Int[np.ndarray, "n"]  # consecutive steps below the speeds of what will not move again
+    apart: Int[np.ndarray, "n"]
+    touches: Int[np.ndarray, "n"]
+    sunk: Float[np.ndarray, "n"]
+
+
+class _Steps(NamedTuple):
+    """Every step of some worlds."""
+
+    qpos: Float[np.ndarray, "n t 7"]
+    qvel: Float[np.ndarray, "n t 6"]
+    sensors: Float[np.ndarray, "n t k"]
+    gone: Int[np.ndarray, "n"]  # the step after which a world is gone, t for none
+
+    @property
+    def moving(self) -> Bool[np.ndarray, "n t"]:
+        """The steps that count: all until the world is gone."""
+        return np.arange(self.qpos.shape[1]) <= self.gone[:, None]
+
+
+def compile_body(
+    parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
+) -> mujoco.MjModel:
+    """The scene with the contacts and the sensors that `roll` needs; arguments as for `scene.compile_scene`."""
+    sensors = _SENSORS.format(wall=_WALL_SENSOR if wall else "")
+    spec = mujoco.MjSpec.from_string(scene.scene_xml(parts, pad, contact, wall).replace("</mujoco>", sensors))
+    owner = spec.body("object")
+    friction = owner.geoms[0].friction
+    for mesh in owner.geoms:
+        mesh.gap = MESH_GAP
+    for point in np.unique(parts.reshape(-1, 3), axis=0):
+        owner.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[POINT, 0, 0], pos=point, friction=friction)
+    return spec.compile()
+
+
+def _run(before: Int[np.ndarray, "n"], holds: Bool[np.ndarray, "n t"]) -> Int[np.ndarray, "n t"]:
+    """How many steps in a row a condition has held after each step, given how many before the first."""
+    step = np.arange(holds.shape[1])
+    return step - np.maximum.accumulate(np.where(holds, -1 - before[:, None], step), axis=1)
+
+
+def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lowest: float) -> Int[np.ndarray, "n"]:
+    """The first step after which the whole object is GONE_DEPTH below the gel's face, t for none.
+
+    Args:
+        qpos: after each step.
+        points: of the hull.
+        lowest: m, of the origin in the mesh frame, above which an object cannot be gone.
+    """
+    low = qpos[..., 2] < lowest
+    gone = np.zeros(low.shape, bool)
+    w, x, y, z = qpos[low][:, 3:].T
+    up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    gone[low] = (up @ points.T).max(axis=1, initial=-np.inf) + qpos[low][:, 2] < -GONE_DEPTH
+    return np.where(gone.any(axis=1), gone.argmax(axis=1), qpos.shape[1])
+
+
+def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
+    """The counts after some steps."""
+    speed, turn = (np.linalg.norm(steps.qvel[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
+    sensors, moving = steps.sensors, steps.moving
+    touched = (np.any(sensors[..., _PAD], axis=-1) | np.any(sensors[..., _WALL], axis=-1)) & moving
+    apart = _run(counts.apart, ~touched)
+    before = np.concatenate([counts.apart[:, None], apart[:, :-1]], axis=1)
+    begun = touched & (before >= round(PARTED_TIME / timestep))
+    deepest = np.where((sensors[..., _DEEPEST][..., 0] > 0) & moving, -sensors[..., _DEEPEST][..., 1], 0)
+    return _Counts(
+        gone=counts.gone | (steps.gone < speed.shape[1]),
+        slow=_run(counts.slow, (speed < SLOW_SPEED) & (turn < SLOW_TURN))[:, -1],
+        still=_run(counts.still, (speed < STILL_SPEED) & (turn < STILL_TURN))[:, -1],
+        apart=apart[:, -1],
+        touches=counts.touches + begun.sum(axis=1),
+        sunk=np.maximum(counts.sunk, deepest.max(axis=1)),
+    )
+
+
+def _record(steps: _Steps, frames: int) -> Record:
+    """The last step of each frame's interval, and the mean wrench of the unbroken contact that it ends with."""
+    worlds, count = steps.gone.shape[0], steps.qpos.shape[1] // frames
+    ends = np.arange(frames) * count + count - 1
+    last = np.minimum(ends, steps.gone[:, None])[..., None]
+    over = (ends > steps.gone[:, None])[..., None]
+    qpos = np.take_along_axis(steps.qpos, last, axis=1)
+    qvel = np.where(over, 0, np.take_along_axis(steps.qvel, last, axis=1))
+
+    force, torque, place = np.split(steps.sensors[..., _PAD], 3, axis=-1)
+    wrench = np.concatenate([force, torque + np.cross(place, force)], axis=-1).reshape(worlds * frames, count, 6)
+    pushed = np.any(wrench != 0, axis=-1)
+    loaded = _run(np.zeros(len(pushed), int), pushed)[:, -1]
+    ending = np.arange(count) >= count - loaded[:, None]
+    mean = np.sum(wrench, axis=1, where=ending[..., None]) / np.maximum(loaded, 1)[:, None]
+    wall = np.any(steps.sensors[:, ends, _WALL], axis=-1)
+    quat = qpos[..., 3:] / np.linalg.norm(qpos[..., 3:], axis=-1, keepdims=True)
+    quat = np.where(quat[..., :1] < 0, -quat, quat)
+    turn = Rotation.from_quat(quat.reshape(-1, 4), scalar_first=True).apply(qvel[..., 3:].reshape(-1, 3))
+    return Record(
+        pose=np.concatenate([qpos[..., :3], quat], axis=-1),
+        velocity=np.concatenate([qvel[..., :3], turn.reshape(worlds, frames, 3)], axis=-1),
+        wrench=np.where(over, 0, mean.reshape(worlds, frames, 6)),
+        contact=(loaded > 0).reshape(worlds, frames) & ~over[..., 0],
+        wall=wall & ~over[..., 0],
+    )
+
+
+def roll(
+    models: Sequence[mujoco.MjModel],
+    points: Float[np.ndarray, "h 3"],
+    start: Start,
+    gravity: Float[np.ndarray, "n f s 3"],
+    *,
+    freeze: bool = True,
+) -> tuple[Ends, Record]:
+    """Trajectories of one body from its starts to the last frame; each depends on its own model and start alone.
+
+    The gravity of the last step is the models'; where it is another one, the difference is a force on the object's
+    centre of mass.
+
+    Args:
+        models: of each trajectory, copies of one `compile_body`; their gravity is overwritten.
+        points: m, of the hull, mesh frame.
+        start: n of them.
+        gravity: m/s^2, sensor frame, for every step of every frame's interval.
+        freeze: what is STILL is not rolled on: it stays where it is, and its velocity becomes 0.
+
+    Returns:
+        How each ended, and one record per trajectory and frame.
+    """
+    count, frames, steps, _ = gravity.shape
+    timestep = models[0].opt.timestep
+    mass = np.array([model.body("object").mass[0] for model in models])
+    change = mass[:, None, None, None] * (gravity - gravity[:, -1:, -1:])
+    changing = np.any(change, axis=(2, 3))
+    calm = np.where(changing.any(axis=1), frames - changing[:, ::-1].argmax(axis=1), 0)  # first frame that is
+    for model, pull in zip(models, gravity[:, -1, -1], strict=True):
+        model.opt.gravity[:] = pull
+    radius = np.linalg.norm(points, axis=1).max()
+    outside = ConvexHull(points).equations[:, 3].max() > 0
+    lowest = -GONE_DEPTH + (radius if outside else 0.0)
+
+    batch = mujoco.batch.Batch(models[0], count, nthread=1)
+    batch.set_models(models)
+    batch.qpos = start.pose
+    xfrc = batch.bind("xfrc_applied")
+    none = np.zeros(count, int)
+    counts = _Counts(none > 0, none, none, none + 2**20, none, np.zeros(count))
+    pose = np.asarray(start.pose, np.float64)
+    pose[pose[:, 3] < 0, 3:] *= -1
+    shapes = {"pose": 7, "velocity": 6, "wrench": 6}
+    records = Record(
+        **{name: np.zeros((count, frames, width)) for name, width in shapes.items()},
+        contact=np.zeros((count, frames), bool),
+        wall=np.zeros((count, frames), bool),
+    )
+    records.pose[:] = pose[:, None]
+
+    def advance(which: np.ndarray, begin: int, end: int, per_frame: int) -> _Counts:
+        """Roll some worlds through frames, the last `per_frame` steps of each interval, and keep their records."""
+        push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
+        push[:, :, 1, :3] = change[which, begin:end, steps - per_frame :].reshape(len(which), -1, 3)
+        xfrc[which] = 0
+        control = push.reshape(*push.shape[:2], 12) if push.any() else None
+        found = batch.rollout(push.shape[1], control, int(FORCE), record=("qpos", "qvel", "sensordata"), ids=which)
+        qpos = found["qpos"]
+        rolled = _Steps(qpos, found["qvel"], found["sensordata"], _gone(qpos, points, lowest))
+        for field, new in zip(records, _record(rolled, end - begin), strict=True):
+            field[which, begin:end] = new
+        after = _count(rolled, _Counts(*(x[which] for x in counts)), timestep)
+        whole = [x.copy() for x in counts]
+        for field, new in zip(whole, after, strict=True):
+            field[which] = new
+        return _Counts(*whole)
+
+    held = np.asarray(start.held)
+    for steps_held in np.unique(held[held < steps]):
+        counts = advance(np.flatnonzero(held == steps_held), 0, 1, steps - int(steps_held))
+    active = np.arange(count)
+    for begin in range(1, frames, BLOCK):
+        end = min(begin + BLOCK, frames)
+        counts = advance(active, begin, end, steps)
+        calm_steps = np.minimum(counts.still, (end - calm) * steps)
+        still = (calm_steps * timestep >= STILL_TIME) & freeze & ~counts.gone
+        ended = active[(counts.gone | still)[active]]
+        records.pose[ended, end:] = records.pose[ended, end - 1 : end]
+        kept = active[still[active]]
+        for field in (records.wrench, records.contact, records.wall):
+            field[kept, end:] = field[kept, end - 1 : end]
+        counts = counts._replace(slow=np.where(still, counts.slow + (frames - end) * steps, counts.slow))
+        active = np.setdiff1d(active, ended)
+        if not len(active):
+            break
+    failed = batch.warning[..., 1].any(axis=1) | (batch.status != 0)
+    finite = ~failed & np.isfinite(records.pose).all(axis=(1, 2)) & np.isfinite(records.velocity).all(axis=(1, 2))
+    ends = Ends(counts.gone, counts.slow, counts.touches, counts.sunk, finite)
+    return ends, Record(*(x if x.dtype == bool else x.astype(np.float32) for x in records))

@@ -1,0 +1,193 @@
+"""C MuJoCo as the engine of `simulate`: against a plain loop over `mj_step`, and what both engines promise."""
+
+import dataclasses
+import functools
+import inspect
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from sts_jax import objects, physics
+from sts_jax.physics import native, roll, scene
+from sts_jax.physics.scenarios import G, Start
+from sts_jax.sensor import Sensor
+
+PAD = (0.15, 0.15)
+BODIES = [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "watch"])]
+FIELDS = ("pose", "velocity", "wrench", "contact", "wall", "settled", "touches", "sunk")
+simulate = functools.partial(physics.simulate, jax.random.key(3), sensor=Sensor(), engine="mujoco")
+
+
+def contact_wrenches(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np.ndarray]:
+    """Force and moment about the origin that pad and wall exert on the object, from MuJoCo's own contact forces."""
+    found = {"pad": np.zeros(6), "wall": np.zeros(6)}
+    for index in range(data.ncon):
+        contact, own = data.contact[index], np.zeros(6)
+        mujoco.mj_contactForce(model, data, index, own)
+        axes = contact.frame.reshape(3, 3)
+        names = [model.geom(geom).name for geom in contact.geom]
+        side = next(name for name in names if name in found)
+        sign = 1 if names[0] == side else -1  # the force is that of the first geom on the second
+        force, torque = sign * axes.T @ own[:3], sign * axes.T @ own[3:]
+        found[side] += [*force, *(torque + np.cross(contact.pos, force))]
+    return found
+
+
+def plain_loop(model: mujoco.MjModel, points: np.ndarray, pose: np.ndarray, gravity: np.ndarray, held: int) -> dict:
+    """One trajectory, step by step as `roll.step` defines it, with gravity as MuJoCo's own gravity."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = pose
+    timestep = model.opt.timestep
+    slow = touches = 0
+    apart, gone = 2**20, False
+    frames: dict[str, list] = {name: [] for name in ("pose", "velocity", "wrench", "contact", "wall")}
+    for interval in gravity:
+        impulse, loaded, wall = np.zeros(6), 0, False
+        for pull in interval:
+            if held or gone:
+                held, impulse, loaded, wall = max(held - 1, 0), np.zeros(6), 0, False
+                data.qvel[:] = 0
+                continue
+            model.opt.gravity[:] = pull
+            mujoco.mj_step1(model, data)
+            mujoco.mj_step2(model, data)
+            # Contact forces are those of the step; mj_step2 moves the state only.
+            pushes = contact_wrenches(model, data)
+            contact, wall = bool(pushes["pad"].any()), bool(pushes["wall"].any())
+            impulse, loaded = (impulse + pushes["pad"], loaded + 1) if contact else (np.zeros(6), 0)
+            touches += (contact or wall) and apart * timestep >= roll.PARTED_TIME - 1e-9
+            apart = 0 if contact or wall else apart + 1
+            is_slow = np.linalg.norm(data.qvel[:3]) < roll.SLOW_SPEED and np.linalg.norm(data.qvel[3:]) < roll.SLOW_TURN
+            slow = slow + 1 if is_slow else 0
+            matrix = np.empty(9)
+            mujoco.mju_quat2Mat(matrix, data.qpos[3:])
+            gone = (points @ matrix[6:] + data.qpos[2]).max() < -roll.GONE_DEPTH
+        turn = np.empty(3)
+        mujoco.mju_rotVecQuat(turn, data.qvel[3:], data.qpos[3:])
+        frames["pose"].append([*data.qpos[:3], *np.where(data.qpos[3] < 0, -1, 1) * data.qpos[3:]])
+        frames["velocity"].append([*data.qvel[:3], *turn])
+        frames["wrench"].append(impulse / max(loaded, 1))
+        frames["contact"].append(loaded > 0)
+        frames["wall"].append(wall)
+    found = {name: np.array(rows) for name, rows in frames.items()}
+    return {**found, "slow": slow, "touches": touches, "gone": gone}
+
+
+CASES = {
+    "lands and rests": (physics.Freefall(), [0.01, 0.0, 0.06, 0.96, 0.2, 0.1, 0.17], 32),
+    "falls off": (physics.Freefall(), [0.1, 0.01, 0.06, 0.5, 0.5, 0.5, 0.5], 32),
+    "is jerked": (physics.Perturbed(frames=30), [0.0, 0.0, 0.0455, 1, 0, 0, 0], 0),
+    "slides to the wall": (physics.Inclined(friction=(0.2, 0.2), frames=30), [0.01, 0.02, 0.05, 0.7, 0.1, 0.7, 0], 48),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_a_plain_loop_of_steps(name: str) -> None:
+    scenario, pose, held = CASES[name]
+    body = BODIES[0]
+    pose = np.array([*pose[:3], *(np.array(pose[3:]) / np.linalg.norm(pose[3:]))])
+    condition = jnp.array([9.0, -3.0, 0.08])[: len(scenario.condition_scale)]
+    times = (
+        np.arange(scenario.frames)[:, None] / scenario.rate
+        - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep
+    )
+    gravity = np.asarray(jax.vmap(jax.vmap(lambda t: scenario.gravity(t, condition)))(times), np.float64)
+    hulls = np.asarray(body.hulls)
+    model = native.compile_body(hulls, PAD, scenario.contact, scenario.wall)
+    mass, com, inertia = (np.asarray(x, np.float64) for x in objects.rigid(body, 0.4, 1.0))
+    scene.set_rigid(model, mujoco.MjData(model), float(mass), com, inertia, scenario.friction[0])
+    points = np.unique(hulls.reshape(-1, 3), axis=0)
+    start = Start(pose[None], np.array([held]), np.asarray(condition)[None])
+    ends, record = native.roll([model], points, start, gravity[None], freeze=False)
+    truth = plain_loop(model, points, pose, gravity, held)
+    assert truth["gone"] == (name == "falls off")
+    assert truth["wall"].any() == (name == "slides to the wall")
+    assert truth["contact"].any()
+    np.testing.assert_array_equal(record.contact[0], truth["contact"])
+    np.testing.assert_array_equal(record.wall[0], truth["wall"])
+    np.testing.assert_allclose(record.pose[0], truth["pose"], atol=1e-6)
+    np.testing.assert_allclose(record.velocity[0], truth["velocity"], atol=1e-5)
+    np.testing.assert_allclose(record.wrench[0], truth["wrench"], atol=1e-5, rtol=1e-5)
+    assert (ends.touches[0], ends.gone[0]) == (truth["touches"], truth["gone"])
+    assert truth["gone"] or ends.slow[0] == truth["slow"]
+    assert ends.finite[0]
+
+
+@pytest.fixture(scope="module")
+def drops() -> physics.Trajectory:
+    return jax.tree.map(np.asarray, simulate(BODIES, scenario=physics.Freefall(), num=6))
+
+
+def test_results_depend_on_no_chunk_no_thread_and_no_other_body(
+    drops: physics.Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = simulate(BODIES[0], scenario=physics.Freefall(), num=3, chunk=1)
+    monkeypatch.setattr("os.cpu_count", lambda: 5)
+    other = simulate(BODIES[:2], scenario=physics.Freefall(), num=6, chunk=4)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(alone, name), getattr(drops, name)[:3])
+        np.testing.assert_array_equal(getattr(other, name), getattr(drops, name)[:12])
+
+
+@pytest.mark.parametrize("scenario", [physics.Freefall(), physics.Inclined(), physics.Perturbed()])
+def test_what_has_settled_ends_where_it_would_have_ended_and_keeps_its_wrench(
+    scenario: physics.Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bodies = BODIES[:1] if scenario.must_stand else BODIES
+    num = 18 // len(bodies)
+    frozen = jax.tree.map(np.asarray, simulate(bodies, scenario=scenario, num=num))
+    monkeypatch.setattr(native, "roll", functools.partial(native.roll, freeze=False))
+    rolled = jax.tree.map(np.asarray, simulate(bodies, scenario=scenario, num=num))
+    on_pad = frozen.outcome != physics.Outcome.FELL_OFF
+    stopped = on_pad & ~frozen.velocity[:, -1].any(axis=1)
+    assert stopped.sum() >= 9
+    for name in ("outcome", "settled", "touches", "condition"):
+        np.testing.assert_array_equal(getattr(frozen, name), getattr(rolled, name))
+    for name in FIELDS:  # what moves is not touched
+        np.testing.assert_array_equal(getattr(frozen, name)[~stopped], getattr(rolled, name)[~stopped])
+    np.testing.assert_allclose(frozen.pose[stopped, -1, :3], rolled.pose[stopped, -1, :3], atol=1e-3)
+    assert frozen.contact[stopped, -1].all()
+    alone = stopped & ~frozen.wall[:, -1]  # what leans on the wall shifts its weight as it creeps
+    assert alone.sum() >= 5
+    largest = np.abs(rolled.wrench[alone, -1, :3]).max()
+    np.testing.assert_allclose(frozen.wrench[alone, -1, :3], rolled.wrench[alone, -1, :3], atol=0.02 * largest)
+
+
+def test_a_pad_that_coasts_slowly_is_not_taken_for_the_end_of_a_jerk(monkeypatch: pytest.MonkeyPatch) -> None:
+    # For a second the pull is too weak to move anything; then it topples the bottle.
+    class Late(physics.Perturbed):
+        def gravity(self, time: jax.Array, condition: jax.Array) -> jax.Array:
+            return jnp.array([0.0, 0.0, -G]) + jnp.array([6.0, 0.0, 0.0]) * (time > 1.0)
+
+    traj = simulate(BODIES[0], scenario=Late(), num=2)
+    before, after = 28, -1
+    assert np.abs(traj.velocity[:, before]).max() < 1e-3
+    assert np.linalg.norm(traj.pose[:, after, :3] - traj.pose[:, before, :3], axis=-1).min() > 0.01
+
+
+def test_compound_bodies_land_on_their_parts() -> None:
+    body = BODIES[0]
+    left, right = np.asarray(body.hulls[0]), np.asarray(body.hulls[0]) + np.float32([0.05, 0, 0])
+    parts = dataclasses.replace(body, hulls=jnp.asarray(np.stack([left, *[right] * 7])))
+    assert parts.hulls.shape[0] in objects.PART_CLASSES
+    traj = simulate(parts, scenario=physics.Perturbed(acceleration=(0.0, 0.0), frames=10), num=2)
+    np.testing.assert_array_equal(traj.outcome, physics.Outcome.STANDS)
+    lowest = left[:, 2].min() + np.asarray(traj.pose[:, -1, 2])
+    np.testing.assert_allclose(lowest, 0, atol=5e-5)
+
+
+def test_it_is_the_engine_of_a_cpu_and_another_name_is_refused(drops: physics.Trajectory) -> None:
+    if jax.default_backend() == "cpu":
+        found = physics.simulate(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), 1)
+        np.testing.assert_array_equal(found.pose, drops.pose[:1])
+    with pytest.raises(ValueError, match="engine is 'bullet'; it takes 'mjx', 'mujoco' or None"):
+        inspect.unwrap(physics.simulate)(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), engine="bullet")
+
+
+def test_progress_counts_trajectories() -> None:
+    done: list[int] = []
+    simulate(BODIES[0], scenario=physics.Freefall(), num=4, chunk=1, progress=done.append)
+    assert done == [1, 2, 3, 4]
