@@ -1,7 +1,8 @@
-"""How good a prediction is: metrics per item, tables with intervals, figures."""
+"""How good a prediction is: metrics per item, tables with intervals, ceilings, figures."""
 
 from sts_jax.evaluation import figures, metrics
 from sts_jax.evaluation.report import (
+    BASELINES,
     Predicted,
     Scores,
     baselines,
@@ -9,22 +10,30 @@ from sts_jax.evaluation.report import (
     outcome_of_image,
     outcome_of_pose,
     score,
-    summarise,
-    table,
+    shares,
 )
+from sts_jax.evaluation.rerolls import CEILING, ONE_REROLL, ceiling
+from sts_jax.evaluation.tables import full_table, gain, summarise, table
 from sts_jax.evaluation.views import outside
 
 __all__ = [
+    "BASELINES",
+    "CEILING",
+    "ONE_REROLL",
     "Predicted",
     "Scores",
     "baselines",
+    "ceiling",
     "emptiness",
     "figures",
+    "full_table",
+    "gain",
     "metrics",
     "outcome_of_image",
     "outcome_of_pose",
     "outside",
     "score",
+    "shares",
     "summarise",
     "table",
 ]
