@@ -229,7 +229,7 @@ def test_the_calibration_error_of_bins_written_out_by_hand():
     expected = (4 * abs(0.94 - 0.75) + 2 * abs(0.56 - 0.5)) / 6
     assert metrics.calibration_error(confidence, right) == pytest.approx(expected)
     bins = metrics.reliability(confidence, right)
-    np.testing.assert_array_equal(np.flatnonzero(bins.count), [5, 9])
+    np.testing.assert_array_equal(np.flatnonzero(bins.items), [5, 9])
     assert bins.accuracy[9] == pytest.approx(0.75)
     # A weight of 2 is the item twice.
     twice = metrics.calibration_error(np.append(confidence, 0.91), np.append(right, True))

@@ -187,7 +187,7 @@ class Reliability(NamedTuple):
 
     confidence: np.ndarray  # (bins,) mean probability of the likeliest outcome; nan where the bin is empty
     accuracy: np.ndarray  # (bins,) share of the items in which that outcome came true
-    count: np.ndarray  # (bins,) items, weighted
+    items: np.ndarray  # (bins,) how many, weighted
 
 
 def reliability(
@@ -218,8 +218,8 @@ def calibration_error(
     Source: Guo et al. (2017), On calibration of modern neural networks.
     """
     found = reliability(confidence, right, weight, bins=bins)
-    total = float(found.count.sum())
-    gap = np.nansum(found.count * np.abs(found.accuracy - found.confidence))
+    total = float(found.items.sum())
+    gap = np.nansum(found.items * np.abs(found.accuracy - found.confidence))
     return float(gap) / total if total > 0 else float("nan")
 
 

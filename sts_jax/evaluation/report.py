@@ -1,6 +1,6 @@
 """Predictions on held-out objects, the baselines, and their errors per item."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -24,6 +24,36 @@ class Predicted(NamedTuple):
     outcome: np.ndarray | None = None  # int (n,), physics.Outcome
     samples: "Predicted | None" = None  # k draws of the whole prediction: (k, n, ...); None if it is deterministic
     outcome_probability: np.ndarray | None = None  # float (n, c), in the order of `scenario.outcomes`
+
+
+def first(predicted: Predicted, count: int) -> Predicted:
+    """The prediction for the first `count` items."""
+    return _mapped(lambda leaves, axis: leaves[0][:count] if axis == 0 else leaves[0][:, :count], [predicted])
+
+
+def joined(parts: Sequence[Predicted]) -> Predicted:
+    """One prediction for the items of several, in order; all predict the same quantities."""
+    return _mapped(np.concatenate, parts)
+
+
+def _mapped(
+    function: Callable[[Sequence[np.ndarray], int], np.ndarray], parts: Sequence[Predicted], axis: int = 0
+) -> Predicted:
+    """Apply a function of some arrays and their axis of items to every quantity of some predictions."""
+
+    def apply(leaves: Sequence[np.ndarray | None]) -> np.ndarray | None:
+        there = [leaf for leaf in leaves if leaf is not None]
+        return function(there, axis) if there else None
+
+    samples = [part.samples for part in parts if part.samples is not None]
+    return Predicted(
+        visual=apply([part.visual for part in parts]),
+        tactile=apply([part.tactile for part in parts]),
+        pose=apply([part.pose for part in parts]),
+        outcome=apply([part.outcome for part in parts]),
+        samples=_mapped(function, samples, 1) if samples else None,
+        outcome_probability=apply([part.outcome_probability for part in parts]),
+    )
 
 
 class Scores(NamedTuple):
@@ -114,7 +144,7 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     mean_pose = train.pose[:, 1].mean(0)
     mean_pose[3:] /= max(np.linalg.norm(mean_pose[3:]), 1e-6)
     majority = np.bincount(train.outcome).argmax()
-    shares = np.array([np.mean(train.outcome == outcome) for outcome in scenario.outcomes])
+    frequency = np.array([np.mean(train.outcome == outcome) for outcome in scenario.outcomes])
     rests = train.outcome != int(physics.Outcome.FELL_OFF)
     below = test.pose[:, 0].copy()
     below[:, 2] = np.median(train.pose[rests if rests.any() else slice(None), 1, 2])
@@ -124,7 +154,7 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
             repeat(train.tactile[:, 1].mean(0) / 255),
             repeat(mean_pose),
             np.full(num, majority),
-            outcome_probability=repeat(shares),
+            outcome_probability=repeat(frequency),
         ),
         COPY: Predicted(
             test.visual[:, 0] / 255,

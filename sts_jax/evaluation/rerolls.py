@@ -66,19 +66,19 @@ def ceiling(
     if not off <= _SAME:
         raise RuntimeError(f"a re-roll began {off:.3g} from its item's first pose: simulate draws its starts otherwise")
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
-    visual, tactile = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench)
+    drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench)
 
     def samples(leaf: np.ndarray) -> np.ndarray:
         return np.moveaxis(leaf.reshape(len(test.object), times, *leaf.shape[1:]), 1, 0)
 
-    ends = Predicted(*(samples(leaf) for leaf in (visual, tactile, pose, np.asarray(traj.outcome))))
-    probability = shares(samples(np.asarray(traj.outcome)), scenario.outcomes)
+    visual, tactile, pose, outcome = (samples(leaf) for leaf in (*drawn, pose, np.asarray(traj.outcome)))
+    probability = shares(outcome, scenario.outcomes)
     return Predicted(
-        visual=ends.visual.mean(0, dtype=np.float32) / 255,
-        tactile=ends.tactile.mean(0, dtype=np.float32) / 255,
-        pose=metrics.centre(ends.pose),
-        outcome=np.array([int(outcome) for outcome in scenario.outcomes])[probability.argmax(1)],
-        samples=ends,
+        visual=visual.mean(0, dtype=np.float32) / 255,
+        tactile=tactile.mean(0, dtype=np.float32) / 255,
+        pose=metrics.centre(pose),
+        outcome=np.array([int(each) for each in scenario.outcomes])[probability.argmax(1)],
+        samples=Predicted(visual, tactile, pose, outcome),
         outcome_probability=probability,
     )
 
