@@ -101,7 +101,7 @@ def _flat(made: Ceilings) -> dict[str, np.ndarray]:
 
 def _restored(arrays: dict[str, np.ndarray]) -> Ceilings:
     scores = {}
-    for name in (evaluation.CEILING, evaluation.ONE_REROLL):
+    for name in evaluation.CEILINGS:
         own = {key.removeprefix(f"{name}/"): leaf for key, leaf in arrays.items() if key.startswith(f"{name}/")}
         fields: dict = dict.fromkeys(evaluation.Scores._fields) | {
             key: leaf for key, leaf in own.items() if "/" not in key

@@ -3,6 +3,9 @@
 from sts_jax.evaluation import figures, metrics
 from sts_jax.evaluation.report import (
     BASELINES,
+    CEILING,
+    CEILINGS,
+    ONE_REROLL,
     Predicted,
     Scores,
     baselines,
@@ -14,13 +17,14 @@ from sts_jax.evaluation.report import (
     score,
     shares,
 )
-from sts_jax.evaluation.rerolls import CEILING, ONE_REROLL, ceiling
+from sts_jax.evaluation.rerolls import ceiling
 from sts_jax.evaluation.tables import full_table, gain, summarise, table
 from sts_jax.evaluation.views import outside
 
 __all__ = [
     "BASELINES",
     "CEILING",
+    "CEILINGS",
     "ONE_REROLL",
     "Predicted",
     "Scores",

@@ -59,7 +59,7 @@ def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, titl
                 axis.set_title(heads[column], fontsize=10)
         label = stream
         if row % len(streams) == 0:
-            label += f"\n#{test.trajectory[item]}, {physics.Outcome(int(test.outcome[item]))}"
+            label = f"#{test.trajectory[item]}: {physics.Outcome(int(test.outcome[item]))}\n{stream}"
         axes[row, 0].set_ylabel(label, fontsize=9)
         if stream == streams[0] and test.condition.shape[1]:
             height, width = test.visual.shape[2:4]
@@ -126,7 +126,7 @@ def ends(
         sampled: Last poses that a model drew, `(k, 7)`.
         title: Of the figure.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(9, 5.2), sharex=True, sharey=True)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 5.6), sharex=True, sharey=True)
     half = 500 * np.asarray(size)  # mm
     panels = (
         ("the simulator, with other hidden values", rerolled, _POSSIBLE),
@@ -140,7 +140,7 @@ def ends(
         axis.set_title(name, fontsize=11)
         axis.set_xlabel("x (mm)")
         axis.set_aspect("equal")
-        axis.legend(fontsize=9, loc="upper right")
+        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4)
     reach = 1.08 * max(half.max(), 1e3 * np.abs(np.concatenate([rerolled, sampled])[:, :2]).max())
     axes[0].set_xlim(-reach, reach)
     axes[0].set_ylim(reach, -reach)  # y points to the image's bottom

@@ -84,6 +84,8 @@ class Scores(NamedTuple):
 CONSTANT, COPY, NEIGHBOUR = "constant (mean training target)", "copy of the input", "nearest neighbour"
 BELOW = "rests below its start"
 BASELINES = (CONSTANT, COPY, NEIGHBOUR, BELOW)
+CEILING, ONE_REROLL = "ceiling (mean of re-rolls)", "one re-roll"
+CEILINGS = (CEILING, ONE_REROLL)
 
 
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:

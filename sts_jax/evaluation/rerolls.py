@@ -17,7 +17,6 @@ from sts_jax.physics.scenarios import Shape, Start
 from sts_jax.physics.simulate import ATTEMPTS
 from sts_jax.sensor import Sensor
 
-CEILING, ONE_REROLL = "ceiling (mean of re-rolls)", "one re-roll"
 RENDER_BATCH = 32  # frames drawn by one compiled call
 _SAME = 1e-4  # by which a first pose may differ from the start that was asked for (m; parts of a quaternion)
 

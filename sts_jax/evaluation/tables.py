@@ -8,7 +8,7 @@ import numpy as np
 from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
-from sts_jax.evaluation.report import BASELINES, CONSTANT, Scores
+from sts_jax.evaluation.report import BASELINES, CEILINGS, CONSTANT, Scores
 
 Statistic = Callable[[np.ndarray], float]  # of the items' weights
 
@@ -41,6 +41,10 @@ _ALL = (
     ("calibration error", "outcome_calibration_error", 1, 3, False),
     ("ROC area of falling off", "fell_off_auc", 1, 3, True),
 )
+_COMPARED = {
+    *(f"{stream}_skill{part}" for stream in ("visual", "tactile") for part in ("", "_object")),
+    *("position_on_pad", "energy", "axis_on_pad", "outcome_log_loss"),
+}
 # The names of the figures of a predictor. Per stream BCE and excess (nats a pixel and channel) and skill, over all
 # pixels and over the target's object pixels; position and energy score (m), angle and angle of the up axes (rad) over
 # all items and over those that stayed on the pad; the outcome.
@@ -62,9 +66,9 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
 
     Returns:
         A JSON-able dictionary: `items`, `objects`, `outcomes`, `scored` (name -> number of items), `predictors`
-        (name -> figure -> value, low, high), and `differences` (name -> baseline -> figure -> value, low, high; of
-        predictors of all items), where a positive difference of skill and a negative difference of an error speak for
-        the predictor.
+        (name -> figure -> value, low, high), and `differences` of the others from the baselines (name -> baseline ->
+        figure -> value, low, high), where a positive difference of skill and a negative difference of an error speak
+        for the predictor.
     """
     statistics = {name: _statistics(s, scores[CONSTANT], test) for name, s in scores.items()}
     scored = {name: _count(s, len(test.object)) for name, s in scores.items()}
@@ -93,7 +97,7 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
         "differences": {
             name: {base: column(value[i] - value[j], draws[:, i] - draws[:, j]) for base, j in reference.items()}
             for i, name in enumerate(names)
-            if name not in reference and scored[name] == len(test.object)
+            if name not in (*reference, *CEILINGS)
         },
     }
 
@@ -243,11 +247,7 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
             _shown(own[figure], factor, digits, with_interval) for _, figure, factor, digits, with_interval in _ALL
         ]
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    compared = [
-        row
-        for row in _ALL
-        if "_skill" in row[1] or row[1] in ("position_on_pad", "energy", "axis_on_pad", "outcome_log_loss")
-    ]
+    compared = [row for row in _ALL if row[1] in _COMPARED]
     lines += [
         "",
         "Differences from the baselines (skill: positive is better; errors: negative is better):",
@@ -258,7 +258,8 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     for name, against in summary["differences"].items():
         for base, own in against.items():
             cells = [_shown(own[figure], factor, digits, True) for _, figure, factor, digits, _ in compared]
-            lines.append(f"| {name} | {base} | {' | '.join(cells)} |")
+            if set(cells) != {"-"}:
+                lines.append(f"| {name} | {base} | {' | '.join(cells)} |")
     return "\n".join([*lines, "", *notes, ""])
 
 
