@@ -2,7 +2,7 @@
 
     python -m benchmarks.ceiling                         # freefall, about 10 minutes on two CPU cores
     python -m benchmarks.ceiling --scenario perturbed
-    python -m benchmarks.ceiling --workdir runs/inclined --scenario inclined  # the dataset that is there
+    python -m benchmarks.ceiling --workdir runs/inclined --scenario inclined  # of this run's dataset
 
 Prints the errors of the mean of the re-rolls (the best prediction from shape, pose and condition), of a single re-roll
 (a sharp sample of the truth), and of the baselines, with the metrics and the held-out starts of the experiment. Below
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import sts_jax as sts
 from experiments import ceilings, freefall, inclined, perturbed, stages
-from sts_jax import dataset, evaluation
+from sts_jax import _files, evaluation
 
 CONFIGS = {"freefall": freefall.DEFAULT, "perturbed": perturbed.DEFAULT, "inclined": inclined.DEFAULT}
 
@@ -48,15 +48,15 @@ def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]
 
 
 def main(name: str, times: int, workdir: Path | None) -> None:
-    """Collect the default dataset of an experiment, unless it is there, and print its ceilings."""
+    """Collect the default dataset of an experiment, as far as it is not there, and print its ceilings."""
     config, sensor = CONFIGS[name], sts.Sensor()
-    with tempfile.TemporaryDirectory() as folder:
-        if workdir is None:  # the symmetric copies change nothing about the held-out list
-            collection = dataclasses.replace(config.collection, symmetries=False, num_full=0)
-            config = dataclasses.replace(config, collection=collection)
-            data = stages.collect(config, Path(folder), sensor)
-        else:
-            data = dataset.load(workdir / "dataset")
+    if workdir is None:  # the symmetric copies change nothing about the held-out list
+        collection = dataclasses.replace(config.collection, symmetries=False, num_full=0)
+        config = dataclasses.replace(config, collection=collection)
+    with tempfile.TemporaryDirectory() as temporary, _files.lock(workdir or Path(temporary)):
+        folder = workdir or Path(temporary)
+        stages.claim(config, folder)
+        data = stages.collect(config, folder, sensor)
         rows = stages.rows_of(data, config.splits[0])
         train, test = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
     with tqdm(total=times * len(test.object), desc="re-roll", unit="trajectories") as bar:
@@ -75,7 +75,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", choices=CONFIGS, default="freefall")
     parser.add_argument("--times", type=int, default=16, help="how often each start is rolled, at least 2 (16)")
-    parser.add_argument("--workdir", type=Path, help="of a run of the experiment's default preset; collects otherwise")
+    parser.add_argument("--workdir", type=Path, help="of a run with --preset default; otherwise collects anew")
     arguments = parser.parse_args()
     if arguments.times < 2:
         parser.error(f"--times must be at least 2, got {arguments.times}: ends of one start are compared")
