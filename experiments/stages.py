@@ -32,6 +32,7 @@ TITLES = {
 }
 # The main table shows the model with pose from the first five of these inputs that it can be given.
 MAIN_SUBSETS = ("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose")
+JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # whose outcome probabilities are drawn
 CHUNK = 64  # items predicted by one call
 
 
@@ -322,12 +323,12 @@ def _draw(
                 title=f"{workdir.name}, from {given}: ends of #{test.trajectory[item]}, the start with the widest "
                 f"spread among the first {len(spread)}",
             )
-    judged = {title: own for title, own in scores.items() if title in shown and own.confidence is not None}
-    judged = {title.partition(", ")[2]: own for title, own in judged.items() if title in main_rows(list(shown))}
-    if judged:
+    judged = {given: scores.get(f"{TITLES['mvae']}, from {given}") for given in JUDGED_SUBSETS}
+    known = {f"from {given}": own for given, own in judged.items() if own is not None and own.confidence is not None}
+    if known:
         drawn.append(figures / "calibration.png")
         title = f"{workdir.name}: outcome probabilities of {TITLES['mvae']}"
-        evaluation.figures.calibration(drawn[-1], judged, title=title)
+        evaluation.figures.calibration(drawn[-1], known, title=title)
     return drawn
 
 

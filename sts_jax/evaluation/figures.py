@@ -75,32 +75,41 @@ def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None
 
     Args:
         path: The PNG to write.
-        scores: By name, of predictors with outcome probabilities.
+        scores: By name, of predictors with outcome probabilities; each gives one column.
         title: Of the figure.
     """
-    figure, (above, below) = plt.subplots(2, 1, figsize=(6, 6.4), height_ratios=[2.2, 1], sharex=True)
-    above.plot([0, 1], [0, 1], color="gray", linewidth=1, linestyle="--", label="calibrated")
-    width = 0.8 / (metrics.BINS * max(len(scores), 1))
-    for number, (name, own) in enumerate(scores.items()):
-        if own.confidence is None or own.right is None:
-            continue
-        found = metrics.reliability(own.confidence, own.right)
-        error = metrics.calibration_error(own.confidence, own.right)
+    judged = {
+        name: (own.confidence, own.right)
+        for name, own in scores.items()
+        if own.confidence is not None and own.right is not None
+    }
+    width = 1 / metrics.BINS
+    edges = width * np.arange(metrics.BINS)
+    figure, axes = plt.subplots(
+        2,
+        max(len(judged), 1),
+        figsize=(max(3.6 * len(judged), 5), 5),
+        height_ratios=[2.4, 1],
+        sharex=True,
+        sharey="row",
+        squeeze=False,
+    )
+    for (above, below), (name, (confidence, right)) in zip(axes.T, judged.items(), strict=False):
+        found = metrics.reliability(confidence, right)
         there = found.items > 0
-        (line,) = above.plot(
-            found.confidence[there], found.accuracy[there], "o-", markersize=5, label=f"{name} (error {error:.3f})"
-        )
-        centres = (np.arange(metrics.BINS) + 0.5) / metrics.BINS + (number - (len(scores) - 1) / 2) * width
-        bars = below.bar(centres, found.items, width, color=line.get_color())
+        above.plot([0, 1], [0, 1], color="gray", linewidth=1, linestyle="--")
+        above.bar(edges[there], found.accuracy[there], width, align="edge", color=_POSSIBLE, alpha=0.35, edgecolor="w")
+        above.plot(found.confidence[there], found.accuracy[there], "o", color=_POSSIBLE, markersize=6)
+        above.set_title(f"{name}\ncalibration error {metrics.calibration_error(confidence, right):.3f}", fontsize=10)
+        bars = below.bar(edges, found.items, width, align="edge", color="0.6", edgecolor="w")
         below.bar_label(bars, [f"{count:.0f}" if count else "" for count in found.items], fontsize=8)
-    above.set_ylabel("share in which it came true")
-    below.set_ylabel("number of items")
-    below.set_xlabel("predicted probability of the likeliest outcome")
-    below.margins(y=0.2)
-    above.set_xlim(0, 1)
-    above.set_ylim(0, 1.02)
-    above.grid(alpha=0.3)
-    above.legend(fontsize=9, loc="upper left")
+        below.set_xlabel("predicted probability\nof the likeliest outcome")
+        above.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("share in which it came true\n(dashed: calibrated)")
+    axes[1, 0].set_ylabel("number of items")
+    axes[0, 0].set_xlim(0, 1)
+    axes[0, 0].set_ylim(0, 1.02)
+    axes[1, 0].margins(y=0.2)
     figure.suptitle(title, fontsize=11)
     _save(figure, path)
 
@@ -126,25 +135,28 @@ def ends(
         sampled: Last poses that a model drew, `(k, 7)`.
         title: Of the figure.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(9, 5.6), sharex=True, sharey=True)
+    figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)
     half = 500 * np.asarray(size)  # mm
     panels = (
-        ("the simulator, with other hidden values", rerolled, _POSSIBLE),
-        ("the model's samples", sampled, _PREDICTED),
+        (f"simulator: {len(rerolled)} draws of the hidden values", "simulated end", rerolled, _POSSIBLE),
+        (f"model: {len(sampled)} samples", "predicted end", sampled, _PREDICTED),
     )
-    for axis, (name, poses, colour) in zip(axes, panels, strict=True):
-        axis.add_patch(Rectangle(tuple(-half), *(2 * half), facecolor="0.94", edgecolor="0.4", label="pad"))
+    for axis, (head, label, poses, colour) in zip(axes, panels, strict=True):
+        axis.add_patch(Rectangle(tuple(-half), *(2 * half), facecolor="0.94", edgecolor="0.4"))
+        axis.annotate("pad", -half, (4, -4), textcoords="offset points", va="top", fontsize=9, color="0.4")
         axis.plot(*(1e3 * start[:2]), "x", color="black", markersize=10, markeredgewidth=2, label="start")
-        axis.plot(*(1e3 * truth[:2]), "*", color="tab:green", markersize=17, label="true end")
-        axis.plot(*(1e3 * poses[:, :2].T), "o", color=colour, markersize=7, alpha=0.65, label=f"{len(poses)} ends")
-        axis.set_title(name, fontsize=11)
+        axis.plot(*(1e3 * truth[:2]), "*", color="tab:green", markersize=18, label="true end")
+        axis.plot(*(1e3 * poses[:, :2].T), "o", color=colour, markersize=6, alpha=0.65, label=label)
+        axis.set_title(head, fontsize=11)
         axis.set_xlabel("x (mm)")
         axis.set_aspect("equal")
-        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4)
     reach = 1.08 * max(half.max(), 1e3 * np.abs(np.concatenate([rerolled, sampled])[:, :2]).max())
     axes[0].set_xlim(-reach, reach)
     axes[0].set_ylim(reach, -reach)  # y points to the image's bottom
     axes[0].set_ylabel("y (mm)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    model, name = axes[1].get_legend_handles_labels()
+    figure.legend([*handles, model[-1]], [*labels, name[-1]], loc="outside lower center", ncols=4, fontsize=10)
     figure.suptitle(title, fontsize=11)
     _save(figure, path)
 
@@ -172,7 +184,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
         ceiling: Skill of the best possible prediction, drawn as a line.
         title: Of the figure.
     """
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), sharey=True)
+    figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
     for axis, along, fixed, unit in (
         (axes[0], "trajectories", "minutes", "{:g} min"),
         (axes[1], "minutes", "trajectories", "{:,} trajectories"),
@@ -189,13 +201,23 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
             place = [getattr(point, along) for point in own]
             axis.errorbar(place, skill, spread, fmt="o-", capsize=3, markersize=5, linewidth=1.2, label=label)
         if ceiling is not None:
-            axis.axhline(ceiling, color="gray", linestyle="--", linewidth=1, label="ceiling (re-rolls)")
+            axis.axhline(ceiling, color="gray", linestyle="--", linewidth=1)
+            axis.annotate(
+                "ceiling (re-rolls)",
+                (0.02, ceiling),
+                (0, 3),
+                xycoords=("axes fraction", "data"),
+                textcoords="offset points",
+                fontsize=9,
+                color="0.4",
+            )
         axis.set_xscale("log")
         ticks = sorted({getattr(point, along) for point in points})
         axis.set_xticks(ticks, [f"{tick:,g}" for tick in ticks])
         axis.set_xticks([], minor=True)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=9)
+        axis.margins(y=0.12)
+        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
     axes[0].set_xlabel("training trajectories")
     axes[1].set_xlabel("training time (minutes)")
     axes[0].set_ylabel("visual skill, held-out objects")
