@@ -11,6 +11,7 @@ import sts_jax as sts
 from experiments import stages
 from experiments.progress import Bar
 from sts_jax import dataset, training
+from sts_jax.dataset.collect import SPLITS
 
 
 def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
@@ -44,7 +45,9 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
             spent["frames"].append(stamps["frames"] - stamps["trajectories"])
         last, seen = collection.scenario.frames, len(dataset.symmetries_of(collection))
         ends = collection.num_trajectories * 2 * seen
+        rerolled = min(config.num_rerolled, round(SPLITS["test"] * collection.num_trajectories)) * config.rerolls
         frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
+        rerolling = 0.0
         for stage, total, measured in (
             ("trajectories", collection.num_trajectories, num),
             ("frames", frames, 2 * len(collection.scenario.symmetries) * num),
@@ -55,9 +58,11 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
             lines.append(
                 (f"collect: {total} {stage}", seconds, f"{rate:.3g} a second, {first - again:.0f} s to compile")
             )
+            rerolling += rerolled / rate
+        lines.append((f"ceilings: {rerolled} trajectories", rerolling, "simulated and drawn at the same rates"))
 
         data = dataset.load(Path(name) / "0")
-        tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",))
+        tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",), rerolls=2)
         pairs = data.pairs(np.arange(num), symmetries=True)
         blank = dataset.empty_frame(sensor, collection)
         samples = round(stages.train_share(config.splits[0]) * collection.num_trajectories) * seen

@@ -3,14 +3,16 @@
 import dataclasses
 import itertools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
+import jax
 import numpy as np
 
 import sts_jax as sts
 from experiments import pictures, results
+from experiments.ceilings import Ceilings, ceilings
 from experiments.progress import Bar, say
 from sts_jax import _files, dataset, evaluation, training
 from sts_jax.dataset.collect import SPLITS
@@ -28,6 +30,10 @@ TITLES = {
     "vae-visual": "VAE visual only",
     "vae-tactile": "VAE tactile only",
 }
+# The main table shows the model with pose from the first five of these inputs that it can be given.
+MAIN_SUBSETS = ("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose")
+JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # whose outcome probabilities are drawn
+CHUNK = 64  # items predicted by one call
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +52,9 @@ class Config:
     # sides (paper). With several, each has its own models and table.
     splits: tuple[str, ...] = ("object",)
     num_shown: int = 8  # held-out trajectories in the figures
+    num_samples: int = 0  # of each prediction; 0 judges deterministic predictions
+    rerolls: int = 16  # of each start, for the ceilings
+    num_rerolled: int = 256  # held-out starts, the first ones, that the ceilings are computed on
 
 
 def smoke(default: Config) -> Config:
@@ -54,7 +63,7 @@ def smoke(default: Config) -> Config:
         default.collection, num_objects=16, num_per_object=2, num_full=4, objects_per_shard=8, symmetries=False, seed=0
     )
     schedule = dataclasses.replace(default.training, batch_size=8, log_every=2, checkpoint_every=4)
-    return dataclasses.replace(default, collection=collection, training=schedule, steps=(8, 8, 8, 8))
+    return dataclasses.replace(default, collection=collection, training=schedule, steps=(8, 8, 8, 8), rerolls=4)
 
 
 def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
@@ -187,13 +196,14 @@ def preprocessing_of(config: Config) -> training.Preprocessing:
 
 
 def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
-    """Score every model on held-out trajectories; write `metrics.json`, `table.md` and `figures/`; return the table.
+    """Score every model on held-out trajectories and return the main table.
 
-    `metrics.json` records the checksums of everything that was evaluated and written. As long as they hold, nothing
-    is done again.
+    Writes `metrics.json`, `table.md`, `table-full.md` and `figures/`. `metrics.json` records the checksums of
+    everything that was evaluated and written. As long as they hold, nothing is done again.
     """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
-    done, table = workdir / f"metrics{suffix}.json", workdir / f"table{suffix}.md"
+    done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
+    table, complete = workdir / f"table{suffix}.md", workdir / f"table-full{suffix}.md"
     inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
     for folder in (model_folder(workdir, name, config, split) for name in MODELS):
         inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
@@ -202,31 +212,38 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         return table.read_text()
     if done.exists() or table.exists():
         say(f"evaluate: again, because {reason}")
-    rows_in = rows_of(data, split)
+    scenario, rows_in = config.collection.scenario, rows_of(data, split)
     train_pairs = data.pairs(rows_in["train"], symmetries=True)
     validation, test = data.pairs(rows_in["validation"]), data.pairs(rows_in["test"])
     blank = training.load_blank(model_folder(workdir, "mvae", config, split))[0] / 255
-    rows = evaluation.baselines(config.collection.scenario, train_pairs, test)
+    possible = ceilings(
+        workdir,
+        suffix,
+        config.collection,
+        sensor,
+        data,
+        test,
+        times=config.rerolls,
+        num=config.num_rerolled,
+    )
+    scores = dict(possible.scores)
+    for title, row in evaluation.baselines(scenario, train_pairs, test).items():
+        scores[title] = evaluation.score(row, test, outcomes=scenario.outcomes)
+    shown: dict[str, evaluation.Predicted] = {}  # the first predictions of each model, for the figures
     with Bar() as bar:
         jobs = list(queries(config, workdir, split))
         for number, (title, predictor, names) in enumerate(jobs):
             bar("evaluate", number, len(jobs), title)
-            rows[title] = predict(config.collection.scenario, predictor, names, validation, test, blank)
-        scores = {title: evaluation.score(row, test) for title, row in rows.items()}
+            row = predict(scenario, predictor, names, validation, test, blank, num_samples=config.num_samples)
+            scores[title] = evaluation.score(row, test, outcomes=scenario.outcomes)
+            shown[title] = evaluation.first(row, config.num_shown)
         summary = evaluation.summarise(scores, test)
         bar("evaluate", len(jobs), len(jobs), "intervals done")
 
-    figures = workdir / f"figures{suffix}"
-    shown = {"MVAE from vision": rows[f"{TITLES['mvae']}, from visual"]}
-    if f"{TITLES['mvae']}, from all inputs" in rows:
-        shown["MVAE from all"] = rows[f"{TITLES['mvae']}, from all inputs"]
-    title = f"{workdir.name}: the first {config.num_shown} of the held-out list, by {split}"
-    if config.collection.scenario.condition_scale:
-        title += "; red: where to, and how hard, the jerk drives it"
-    drawn = [figures / "predictions.png", figures / "training.png"]
-    evaluation.figures.predictions(drawn[0], test, shown, num=config.num_shown, title=title)
+    drawn = _draw(config, workdir, figures, sensor, test, scores, shown, possible)
     logs = {TITLES[name]: _read_log(model_folder(workdir, name, config, split)) for name in MODELS}
-    evaluation.figures.training_curves(drawn[1], logs)
+    drawn.append(figures / "training.png")
+    evaluation.figures.training_curves(drawn[-1], logs)
     if split == config.splits[0] and len(data.full_trajectories()):
         drawn.append(figures / "strip.png")
         pictures.draw_strip(drawn[-1], config.collection, sensor, data)
@@ -236,12 +253,83 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         "Gradient steps: "
         + ", ".join(f"{name} {count}" for name, count in steps.items())
         + f"; batch {config.training.batch_size}.",
+        f"Ceiling: {config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
+        "values, and a model from touch can exceed it.",
     ]
+    notes += _gains(scores, test)
     title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
-    text = evaluation.table(summary, title=title, notes=notes)
+    text = evaluation.table(summary, title=title, rows=main_rows(list(shown)), notes=notes)
     _files.write_bytes(table, text.encode())
-    results.write(done, {"split": split, **summary}, inputs, [table, *drawn])
+    _files.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
+    results.write(done, {"split": split, **summary}, inputs, [table, complete, *drawn])
     return text
+
+
+def main_rows(titles: Sequence[str]) -> list[str]:
+    """The rows of the main table, ten at most: the ceiling, the baselines, and the model with pose from five subsets.
+
+    Args:
+        titles: Of the models' rows, in the order of `queries`.
+    """
+    first = [f"{TITLES['mvae']}, from {given}" for given in MAIN_SUBSETS]
+    return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in first if title in titles][:5]]
+
+
+def _gains(scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
+    """A line on the share of the outcome's log loss from vision that touch removes, if both were predicted."""
+    before, after = (f"{TITLES['mvae']}, from {given}" for given in ("visual", "visual and tactile"))
+    if before not in scores or after not in scores:
+        return []
+    found = evaluation.gain(scores[before], scores[after], test)
+    if found is None:
+        return []
+    value, low, high = (found[key] for key in ("value", "low", "high"))
+    return [f"Touch removes {value:.3f} [{low:.3f}, {high:.3f}] of the outcome's log loss from vision."]
+
+
+def _draw(
+    config: Config,
+    workdir: Path,
+    figures: Path,
+    sensor: sts.Sensor,
+    test: dataset.Pairs,
+    scores: Mapping[str, evaluation.Scores],
+    shown: Mapping[str, evaluation.Predicted],
+    possible: Ceilings,
+) -> list[Path]:
+    """Draw the predictions of two queries and, of predicted distributions, their calibration and some ends."""
+    drawn = []
+    for given, name in (("visual", "predictions"), ("all inputs", "predictions-all")):
+        query = f"{TITLES['mvae']}, from {given}"
+        if query not in shown:
+            continue
+        title = f"{workdir.name}, from {given}: the first {config.num_shown} of the held-out list"
+        if config.collection.scenario.condition_scale:
+            title += "\nred: where to, and how hard, the jerk drives it"
+        drawn.append(figures / f"{name}.png")
+        evaluation.figures.predictions(drawn[-1], test, shown[query], num=config.num_shown, title=title)
+        samples, rerolled = shown[query].samples, possible.pose[:, : config.num_shown]
+        if samples is not None and samples.pose is not None:
+            spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
+            item = int(spread.argmax())
+            drawn.append(figures / f"{name.replace('predictions', 'ends')}.png")
+            evaluation.figures.ends(
+                drawn[-1],
+                (float(sensor.gel.size[0]), float(sensor.gel.size[1])),
+                test.pose[item, 0],
+                test.pose[item, 1],
+                rerolled[:, item],
+                samples.pose[:, item],
+                title=f"{workdir.name}, from {given}: ends of #{test.trajectory[item]}, the start with the widest "
+                f"spread among the first {len(spread)}",
+            )
+    judged = {given: scores.get(f"{TITLES['mvae']}, from {given}") for given in JUDGED_SUBSETS}
+    known = {f"from {given}": own for given, own in judged.items() if own is not None and own.confidence is not None}
+    if known:
+        drawn.append(figures / "calibration.png")
+        title = f"{workdir.name}: outcome probabilities of {TITLES['mvae']}"
+        evaluation.figures.calibration(drawn[-1], known, title=title)
+    return drawn
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
@@ -267,37 +355,66 @@ def predict(
     validation: dataset.Pairs,
     test: dataset.Pairs,
     blank: np.ndarray,
+    *,
+    num_samples: int = 0,
 ) -> evaluation.Predicted:
-    """What a model says of the held-out trajectories.
+    """The prediction of a model for the held-out trajectories.
 
-    Its outcome is that of its pose. Of a model without one it is whether its image is empty, where `scenario` asks for
-    no more than whether the object fell off; else it is left open.
+    The outcome is that of the pose; with samples, its probabilities are the shares of the samples' outcomes. The
+    outcome of a model without a pose is read from whether its image is empty, in scenarios that only ask whether the
+    object fell off; in other scenarios it has none.
     """
 
-    def run(pairs: dataset.Pairs) -> evaluation.Predicted:
-        condition = pairs.condition if pairs.condition.shape[1] else None
-        out = (
-            predictor(
-                visual=pairs.visual[:, 0] / 255 if "visual" in names else None,
-                tactile=pairs.tactile[:, 0] / 255 if "tactile" in names else None,
-                pose=pairs.pose[:, 0] if "pose" in names else None,
-                condition=condition,
-            )
-            if names
-            else predictor.prior((len(pairs.object),), condition=condition)
-        )
-        return evaluation.Predicted(
-            *(None if leaf is None else np.asarray(leaf) for leaf in (out.visual, out.tactile, out.pose))
-        )
+    def run(pairs: dataset.Pairs, num_samples: int) -> evaluation.Predicted:
+        """Predict in calls of equal size, which bounds the memory; the last call repeats an item to be as long."""
+        count = len(pairs.object)
+        size, parts = min(count, CHUNK), []
+        for number, start in enumerate(range(0, count, size)):
+            rows = np.minimum(np.arange(start, start + size), count - 1)
+            parts.append(_asked(predictor, names, pairs, rows, num_samples, number))
+        return evaluation.first(evaluation.joined(parts), count)
 
-    out, outcome = run(test), None
+    out = run(test, num_samples)
     if out.pose is not None:
-        outcome = evaluation.outcome_of_pose(scenario, test.pose[:, 0], out.pose)
+        out = out._replace(outcome=evaluation.outcome_of_pose(scenario, test.pose[:, 0], out.pose))
     elif out.visual is not None and len(scenario.outcomes) == 2:
-        score = evaluation.emptiness(np.asarray(run(validation).visual), blank)
+        score = evaluation.emptiness(np.asarray(run(validation, 0).visual), blank)
         threshold = evaluation.metrics.best_threshold(score, validation.outcome != int(sts.physics.Outcome.FELL_OFF))
-        outcome = evaluation.outcome_of_image(out.visual, blank, threshold)
-    return out._replace(outcome=outcome)
+        out = out._replace(outcome=evaluation.outcome_of_image(out.visual, blank, threshold))
+    if out.samples is not None and out.samples.pose is not None and out.outcome_probability is None:
+        ends = np.stack([evaluation.outcome_of_pose(scenario, test.pose[:, 0], pose) for pose in out.samples.pose])
+        out = out._replace(outcome_probability=evaluation.shares(ends, scenario.outcomes))
+    return out
+
+
+def _asked(
+    predictor: sts.Predictor,
+    names: tuple[str, ...],
+    pairs: dataset.Pairs,
+    rows: np.ndarray,
+    num_samples: int,
+    seed: int,
+) -> evaluation.Predicted:
+    """The prediction for some items, from the modalities `names`; images of samples in `uint8`."""
+    condition = pairs.condition[rows] if pairs.condition.shape[1] else None
+    if names:
+        out = predictor(
+            visual=pairs.visual[rows, 0] / 255 if "visual" in names else None,
+            tactile=pairs.tactile[rows, 0] / 255 if "tactile" in names else None,
+            pose=pairs.pose[rows, 0] if "pose" in names else None,
+            condition=condition,
+            key=jax.random.key(seed) if num_samples else None,
+            num_samples=num_samples,
+        )
+    else:
+        out = predictor.prior((len(rows),), condition=condition)
+    visual, tactile, pose = (None if leaf is None else np.asarray(leaf) for leaf in (out.visual, out.tactile, out.pose))
+    samples = None
+    if out.samples is not None:
+        images = (out.samples.visual, out.samples.tactile)
+        drawn, felt = (None if leaf is None else np.round(255 * np.asarray(leaf)).astype(np.uint8) for leaf in images)
+        samples = evaluation.Predicted(drawn, felt, None if out.samples.pose is None else np.asarray(out.samples.pose))
+    return evaluation.Predicted(visual, tactile, pose, samples=samples)
 
 
 def _read_log(folder: Path) -> list[dict[str, float]]:

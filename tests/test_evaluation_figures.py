@@ -1,9 +1,12 @@
-"""What a trajectory's pictures show of a wrench: force and moment, each in its own axis, to scale."""
+"""Figures show the numbers and pictures they are given."""
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
+from test_evaluation_report import judged
 
+from sts_jax import evaluation
 from sts_jax.evaluation import figures
 
 FRAMES = 5
@@ -46,3 +49,90 @@ def test_an_animation_draws_the_moment_below_the_force(tmp_path, sign):
     assert np.ptp(blue_rows(pages[-1], 1)) > 60  # from 0 to 20 mN m
     assert 10 < np.ptp(blue_rows(pages[2], 1)) < 50  # halfway
     assert not len(blue_rows(pages[-1], 0))  # no force: the three curves lie on each other, the last one is on top
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are drawn, instead of files."""
+    found = []
+    monkeypatch.setattr(figures, "_save", lambda figure, path: found.append(figure))
+    yield found
+    for figure in found:
+        plt.close(figure)
+
+
+def test_predictions_show_input_truth_mean_and_four_samples_of_both_streams(tmp_path, drawn):
+    test, predicted = judged(k=5)
+    figures.predictions(tmp_path / "a.png", test, predicted, num=2, title="t")
+    axes = np.array(drawn[0].axes).reshape(4, 7)  # two items, each visual and tactile
+    heads = ["input", "truth", "mean of samples", "sample 1", "sample 2", "sample 3", "sample 4"]
+    assert [axis.get_title() for axis in axes[0]] == heads
+    assert [axis.get_ylabel() for axis in axes[:, 0]] == [
+        "#0: rests\nvisual",
+        "tactile",
+        "#1: fell off\nvisual",
+        "tactile",
+    ]
+
+    def picture(row, column):
+        return np.asarray(axes[row, column].images[0].get_array())
+
+    np.testing.assert_allclose(picture(2, 0), test.visual[1, 0] / 255, rtol=1e-6)
+    np.testing.assert_allclose(picture(3, 1), test.tactile[1, 1] / 255, rtol=1e-6)
+    np.testing.assert_allclose(picture(3, 2), predicted.tactile[1], rtol=1e-6)
+    np.testing.assert_allclose(picture(2, 6), predicted.samples.visual[3, 1] / 255, rtol=1e-6)
+
+
+def test_predictions_without_samples_or_touch_have_fewer_rows_and_columns(tmp_path, drawn):
+    test, predicted = judged()
+    figures.predictions(tmp_path / "a.png", test, predicted._replace(samples=None, tactile=None), num=9, title="t")
+    assert len(drawn[0].axes) == 3 * len(test.object)
+    assert drawn[0].axes[2].get_title() == "prediction"
+
+
+def test_a_calibration_figure_shows_shares_and_counts_of_each_bin(tmp_path, drawn):
+    confidence, right = np.array([0.91, 0.95, 0.93, 0.55]), np.array([True, True, False, True])
+    scores = evaluation.Scores(*[None] * 8)
+    by_name = {"deterministic": scores, "from vision": scores._replace(confidence=confidence, right=right)}
+    figures.calibration(tmp_path / "a.png", by_name, title="t")
+    above, below = drawn[0].axes
+    (points,) = [line for line in above.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(points.get_xdata(), [0.55, 0.93])
+    np.testing.assert_allclose(points.get_ydata(), [1, 2 / 3])
+    assert [text.get_text() for text in below.texts if text.get_text()] == ["1", "3"]
+
+
+def test_ends_are_drawn_in_millimetres_as_the_images_are_oriented(tmp_path, drawn):
+    start, truth = np.array([0.01, -0.02, 0.1, 1, 0, 0, 0]), np.array([0.03, 0.04, 0.02, 1, 0, 0, 0])
+    rerolled, sampled = (np.tile(truth, (k, 1)) for k in (16, 4))
+    sampled[0, 0] = 0.12  # off the pad, and in the figure
+    figures.ends(tmp_path / "a.png", (0.15, 0.15), start, truth, rerolled, sampled, title="t")
+    left, right = drawn[0].axes
+    low, high = left.get_ylim()
+    assert low > high  # y points down
+    assert right.get_xlim()[1] > 120
+    for axis, poses in ((left, rerolled), (right, sampled)):
+        first, true, ends = axis.lines
+        np.testing.assert_allclose([first.get_xdata()[0], first.get_ydata()[0]], [10, -20])
+        np.testing.assert_allclose([true.get_xdata()[0], true.get_ydata()[0]], [30, 40])
+        np.testing.assert_allclose(np.transpose([ends.get_xdata(), ends.get_ydata()]), 1e3 * poses[:, :2])
+
+
+def test_a_scaling_figure_joins_models_of_one_training_time_or_one_number_of_trajectories(tmp_path, drawn):
+    points = [
+        figures.Trained("vision", number, minutes, number * minutes / 1e4, 0.0, 1.0)
+        for number in (800, 100)
+        for minutes in (5, 2)
+    ]
+    figures.scaling(tmp_path / "a.png", points, ceiling=0.8, title="t")
+    left, right = drawn[0].axes
+
+    def lines(axis):
+        handles, labels = axis.get_legend_handles_labels()
+        return {label: handle.lines[0].get_xydata().tolist() for handle, label in zip(handles, labels, strict=True)}
+
+    assert lines(left) == {"vision, 5 min": [[100, 0.05], [800, 0.4]], "vision, 2 min": [[100, 0.02], [800, 0.16]]}
+    assert lines(right) == {
+        "vision, 800 trajectories": [[2, 0.16], [5, 0.4]],
+        "vision, 100 trajectories": [[2, 0.02], [5, 0.05]],
+    }

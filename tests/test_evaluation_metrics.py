@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from sts_jax.evaluation import metrics
 
@@ -94,3 +95,176 @@ def test_bootstrap_over_objects_has_the_standard_error_of_the_mean_over_objects(
     assert np.std(draws) == pytest.approx(np.std(level) / math.sqrt(50), rel=0.1)
     low, high = metrics.interval(draws)
     assert low < values.mean() < high
+
+
+def test_image_errors_do_not_depend_on_how_many_items_there_are():
+    rng = np.random.default_rng(3)
+    predicted, target = rng.random((2, 300, 2, 2, 3))
+    mask = rng.random((300, 2, 2)) < 0.5
+    together = metrics.image_error(predicted, target, mask)
+    alone = [metrics.image_error(*(x[i : i + 1] for x in (predicted, target, mask))) for i in range(300)]
+    for name in together._fields:
+        np.testing.assert_array_equal(
+            getattr(together, name), np.concatenate([getattr(error, name) for error in alone])
+        )
+
+
+def test_the_best_sample_is_chosen_for_each_item_by_its_excess():
+    one = metrics.ImageError(np.array([1.0, 2]), np.array([0.5, 0.2]), np.array([3.0, 3]))
+    other = metrics.ImageError(np.array([4.0, 5]), np.array([0.1, 0.9]), np.array([3.0, 3]))
+    best = metrics.best_of([one, other])
+    np.testing.assert_array_equal(best.bce, [4, 2])
+    np.testing.assert_array_equal(best.excess, [0.1, 0.2])
+    np.testing.assert_array_equal(best.pixels, [3, 3])
+
+
+def test_gradient_energy_is_the_sum_over_neighbours():
+    image = np.random.default_rng(4).random((2, 3, 4, 3))
+    for i in range(2):
+        total = 0.0
+        for row in range(3):
+            for column in range(4):
+                if row:
+                    total += ((image[i, row, column] - image[i, row - 1, column]) ** 2).sum()
+                if column:
+                    total += ((image[i, row, column] - image[i, row, column - 1]) ** 2).sum()
+        assert metrics.gradient_energy(image)[i] == pytest.approx(total)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.7, 3.0])
+@pytest.mark.parametrize("number", [2, 16])
+def test_the_energy_score_of_gaussian_samples_is_unbiased(offset, number):
+    # The closed form in one dimension is the continuous ranked probability score of a standard Gaussian.
+    rng = np.random.default_rng(5)
+    items = 40_000
+    found = metrics.energy_score(rng.normal(size=(number, items, 1)), np.full((items, 1), offset))
+    density = math.exp(-(offset**2) / 2) / math.sqrt(2 * math.pi)
+    closed = offset * math.erf(offset / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi)
+    assert found.mean() == pytest.approx(closed, abs=5 * found.std() / math.sqrt(items))
+
+
+def test_the_energy_score_of_a_calibrated_prediction_in_space_has_its_closed_form():
+    rng = np.random.default_rng(6)
+    sigma, items = 0.01, 20_000
+    samples, target = sigma * rng.normal(size=(16, items, 3)), sigma * rng.normal(size=(items, 3))
+    found = metrics.energy_score(samples, target)
+    closed = 2 * sigma / math.sqrt(math.pi)  # half the mean distance of two draws
+    assert found.mean() == pytest.approx(closed, abs=5 * found.std() / math.sqrt(items))
+    assert metrics.energy_score(1.5 * samples, target).mean() > found.mean()
+    assert metrics.energy_score(0.6 * samples, target).mean() > found.mean()
+
+
+def test_the_energy_score_of_one_sample_is_its_distance():
+    samples, target = np.array([[[3.0, 4, 0]]]), np.zeros((1, 3))
+    assert metrics.energy_score(samples, target) == pytest.approx(5)
+
+
+def draws(kind, rng, shape):
+    """Positions from distributions that a covariance does not describe."""
+    if kind == "gaussian":
+        return rng.normal(size=(*shape, 3)) * [1, 5, 0.2]
+    if kind == "skewed":
+        return rng.exponential(size=(*shape, 3)) ** 2
+    side = rng.random(shape) < 0.3
+    return rng.normal(size=(*shape, 3)) + 20 * side[..., None]
+
+
+@pytest.mark.parametrize("number", [2, 5, 16])
+@pytest.mark.parametrize("kind", ["gaussian", "skewed", "bimodal"])
+def test_calibrated_samples_cover_exactly_nine_tenths(kind, number):
+    rng = np.random.default_rng(7)
+    items = 20_000
+    scale, shift = rng.uniform(0.1, 10, (items, 1)), rng.normal(size=(items, 3))  # every item has its own
+    samples, target = (shift + scale * draws(kind, rng, shape) for shape in ((number, items), (items,)))
+    covered = metrics.coverage(samples, target)
+    assert covered.mean() == pytest.approx(0.9, abs=5 * covered.std() / math.sqrt(items))
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "skewed", "bimodal"])
+def test_coverage_shows_samples_that_are_too_narrow_too_wide_or_elsewhere(kind):
+    rng = np.random.default_rng(8)
+    samples, target = draws(kind, rng, (16, 4000)), draws(kind, rng, (4000,))
+    middle = samples.mean((0, 1))
+    assert metrics.coverage(middle + 0.5 * (samples - middle), target).mean() < 0.8
+    assert metrics.coverage(middle + 3 * (samples - middle), target).mean() > 0.93
+    assert metrics.coverage(samples + 100, target).mean() == 0
+
+
+def test_coverage_of_certain_and_right_predictions_is_that_of_the_region():
+    same = np.ones((16, 3, 3))
+    np.testing.assert_allclose(metrics.coverage(same, same[0]), 0.9)
+    np.testing.assert_allclose(metrics.coverage(same, 2 * same[0]), 0)
+
+
+def test_the_centre_is_nearer_to_the_samples_than_any_of_its_neighbours_and_no_outlier_moves_it():
+    rng = np.random.default_rng(9)
+    samples = np.zeros((15, 1, 7))
+    samples[..., :3] = 0.01 * rng.normal(size=(15, 1, 3))
+    samples[0, 0, :3] = [5, 0, 0]
+    half = rng.uniform(-0.2, 0.2, 15)
+    half[3] = 0.01
+    samples[..., 3], samples[..., 6] = np.cos(half)[:, None], np.sin(half)[:, None]
+    found = metrics.centre(samples)
+    assert np.linalg.norm(found[0, :3]) < 0.01
+
+    def cost(place):
+        return np.linalg.norm(samples[:, 0, :3] - place, axis=-1).sum()
+
+    for step in 1e-3 * np.concatenate([np.eye(3), -np.eye(3)]):
+        assert cost(found[0, :3]) < cost(found[0, :3] + step)
+    angles = [np.abs(half - h).sum() for h in half]  # turns about one axis
+    assert found[0, 6] == pytest.approx(math.sin(half[int(np.argmin(angles))]))
+
+
+def test_log_loss_is_minus_the_logarithm_and_never_more_than_that_of_the_floor():
+    probability = np.array([[0.2, 0.8], [1.0, 0.0], [0.5, 0.5]])
+    np.testing.assert_allclose(
+        metrics.log_loss(probability, np.array([1, 1, 0]), floor=0.01), -np.log([0.8, 0.01, 0.5])
+    )
+
+
+def test_the_calibration_error_of_bins_written_out_by_hand():
+    confidence = np.array([0.91, 0.93, 0.95, 0.97, 0.55, 0.57])
+    right = np.array([True, True, True, False, True, False])
+    expected = (4 * abs(0.94 - 0.75) + 2 * abs(0.56 - 0.5)) / 6
+    assert metrics.calibration_error(confidence, right) == pytest.approx(expected)
+    bins = metrics.reliability(confidence, right)
+    np.testing.assert_array_equal(np.flatnonzero(bins.items), [5, 9])
+    assert bins.accuracy[9] == pytest.approx(0.75)
+    # A weight of 2 is the item twice.
+    twice = metrics.calibration_error(np.append(confidence, 0.91), np.append(right, True))
+    assert metrics.calibration_error(confidence, right, np.array([2.0, 1, 1, 1, 1, 1])) == pytest.approx(twice)
+
+
+def test_calibrated_probabilities_have_a_small_calibration_error_and_overconfident_ones_a_large_one():
+    rng = np.random.default_rng(10)
+    probability = rng.dirichlet([0.5, 0.5, 0.5, 0.5], 20_000)
+    label = (probability.cumsum(1) < rng.random((20_000, 1))).sum(1)
+    confidence, right = probability.max(1), probability.argmax(1) == label
+    assert metrics.calibration_error(confidence, right) < 0.015
+    assert metrics.calibration_error(confidence**0.3, right) > 0.1
+    assert metrics.calibration_error(np.ones(3), np.ones(3, bool)) == 0
+
+
+def test_the_area_under_the_curve_counts_pairs():
+    rng = np.random.default_rng(11)
+    positive, score = rng.random(60) < 0.4, rng.integers(0, 8, 60) / 8
+    weight = rng.integers(0, 3, 60).astype(float)
+    wins = total = 0.0
+    for i in np.flatnonzero(positive):
+        for j in np.flatnonzero(~positive):
+            total += weight[i] * weight[j]
+            wins += weight[i] * weight[j] * ((score[i] > score[j]) + 0.5 * (score[i] == score[j]))
+    assert metrics.auc(positive, score, weight) == pytest.approx(wins / total)
+    statistic = stats.mannwhitneyu(score[positive], score[~positive]).statistic
+    assert metrics.auc(positive, score) == pytest.approx(statistic / (positive.sum() * (~positive).sum()))
+    assert math.isnan(metrics.auc(np.ones(4, bool), score[:4]))
+
+
+def test_the_weighted_median_is_that_of_repeated_items():
+    rng = np.random.default_rng(12)
+    for size in (1, 2, 7, 8):
+        values, weight = rng.normal(size=size), rng.integers(0, 4, size)
+        weight[0] += 1
+        assert metrics.median(values, weight.astype(float)) == pytest.approx(np.median(np.repeat(values, weight)))
+    assert math.isnan(metrics.median(values, np.zeros(8)))

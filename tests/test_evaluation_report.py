@@ -46,3 +46,106 @@ def test_image_and_condition_count_alike_whatever_their_units(unit):
     assert nearest(train, pairs([190, 190], [[0.1, 0.1, unit], [0.9, 0.9, unit]]), physics.Perturbed()) == [1, 3]
     # The image is undecided: the condition alone decides.
     assert nearest(train, pairs([100] * 4, corners), physics.Perturbed()) == [0, 1, 2, 3]
+
+
+def test_the_rule_keeps_the_start_at_the_median_height_of_what_stays():
+    train, test = (pairs([0] * size, np.zeros((size, 0))) for size in (4, 2))
+    train = train._replace(outcome=np.array([0, 1, 0, 0], np.int32))  # 1: fell off
+    train.pose[:, 1, 2] = [0.01, -0.5, 0.05, 0.02]
+    test.pose[:, 0, :3] = [[0.03, 0.04, 0.2], [-0.06, 0, 0.2]]
+    test.pose[:, 0, 3:] = [[0, 1, 0, 0], [0.6, 0, 0, 0.8]]
+    rule = evaluation.baselines(physics.Freefall(), train, test)["rests below its start"]
+    np.testing.assert_allclose(rule.pose[:, :3], [[0.03, 0.04, 0.02], [-0.06, 0, 0.02]])
+    np.testing.assert_array_equal(rule.pose[:, 3:], test.pose[:, 0, 3:])
+    assert rule.visual is rule.tactile is None
+    assert rule.outcome.tolist() == [physics.Outcome.RESTS] * 2
+    np.testing.assert_array_equal(test.pose[:, 0, 2], np.float32(0.2))  # the items are as they were
+
+
+def test_the_constants_probabilities_are_the_outcomes_shares():
+    train, test = (pairs([0] * size, np.zeros((size, 0))) for size in (4, 2))
+    train = train._replace(outcome=np.array([0, 1, 0, 0], np.int32))
+    constant = evaluation.baselines(physics.Freefall(), train, test)["constant (mean training target)"]
+    np.testing.assert_allclose(constant.outcome_probability, [[0.75, 0.25]] * 2)
+
+
+def test_shares_count_the_samples_and_one_more_spread_over_all_outcomes():
+    outcomes = physics.Perturbed.outcomes
+    drawn = np.array([[4, 1], [4, 2], [2, 1]])  # topples, topples, stands; fell off, stands, fell off
+    shares = evaluation.shares(drawn, outcomes)
+    assert [outcome.name for outcome in outcomes] == ["TOPPLES", "SLIDES", "STANDS", "FELL_OFF"]
+    np.testing.assert_allclose(shares * 4, [[2.25, 0.25, 1.25, 0.25], [0.25, 0.25, 1.25, 2.25]])
+
+
+RESTS, FELL = int(physics.Outcome.RESTS), int(physics.Outcome.FELL_OFF)
+
+
+def judged(count=6, k=5, seed=0):
+    """Items with outcomes of freefall, and a prediction of them as a distribution."""
+    rng = np.random.default_rng(seed)
+    test = pairs(rng.integers(0, 256, count), np.zeros((count, 0)))
+    test = test._replace(
+        visual=rng.integers(0, 256, test.visual.shape, np.uint8),
+        tactile=rng.integers(0, 256, test.tactile.shape, np.uint8),
+        outcome=np.array([RESTS, FELL] * (count // 2), np.int32),
+        object=np.arange(count) // 2,
+    )
+    test.pose[..., :3] = 0.02 * rng.normal(size=(count, 2, 3))
+    samples = evaluation.Predicted(
+        visual=rng.integers(0, 256, (k, count, SIDE, SIDE, 3), np.uint8),
+        tactile=rng.integers(0, 256, (k, count, SIDE, SIDE, 3), np.uint8),
+        pose=np.concatenate([0.02 * rng.normal(size=(k, count, 3)), np.tile([1.0, 0, 0, 0], (k, count, 1))], -1),
+    )
+    chance = rng.random(count)
+    return test, evaluation.Predicted(
+        visual=samples.visual.mean(0) / 255,
+        tactile=samples.tactile.mean(0) / 255,
+        pose=samples.pose[0],
+        samples=samples,
+        outcome_probability=np.stack([chance, 1 - chance], 1),
+    )
+
+
+def test_a_distribution_is_scored_by_its_samples_and_probabilities():
+    test, predicted = judged()
+    scores = evaluation.score(predicted, test, outcomes=physics.Freefall.outcomes)
+    metrics, truth = evaluation.metrics, test.visual[:, 1] / 255
+    place = predicted.samples.pose[..., :3]
+    np.testing.assert_allclose(scores.energy, metrics.energy_score(place, test.pose[:, 1, :3]))
+    np.testing.assert_allclose(scores.coverage, metrics.coverage(place, test.pose[:, 1, :3]))
+    each = [metrics.image_error(image / 255, truth).excess for image in predicted.samples.visual]
+    np.testing.assert_allclose(scores.best.excess, np.min(each, 0), rtol=1e-5)
+    assert (scores.best.excess > scores.visual.excess).any()  # a mean of samples may be better than each
+    sharp = np.mean([metrics.gradient_energy(image / 255) for image in predicted.samples.visual], 0)
+    np.testing.assert_allclose(scores.gradient, sharp, rtol=1e-5)
+    np.testing.assert_allclose(scores.gradient_target, metrics.gradient_energy(truth))
+    rests = predicted.outcome_probability[:, 0]  # Freefall.outcomes: rests, fell off
+    happened = np.where(test.outcome == RESTS, rests, 1 - rests)
+    np.testing.assert_allclose(scores.log_loss, -np.log(np.maximum(happened, 1e-3)))
+    np.testing.assert_allclose(scores.fell_off, 1 - rests)
+    likeliest = np.where(rests > 0.5, RESTS, FELL)
+    np.testing.assert_array_equal(scores.outcome, likeliest)
+    np.testing.assert_array_equal(scores.right, likeliest == test.outcome)
+
+
+def test_a_deterministic_prediction_scores_its_error_and_the_sharpness_of_its_image():
+    test, predicted = judged()
+    scores = evaluation.score(predicted._replace(samples=None, outcome_probability=None), test)
+    np.testing.assert_array_equal(scores.energy, scores.position)
+    np.testing.assert_allclose(scores.gradient, evaluation.metrics.gradient_energy(predicted.visual))
+    assert scores.coverage is scores.best is scores.log_loss is scores.confidence is None
+
+
+def test_probabilities_need_the_names_of_their_columns():
+    test, predicted = judged()
+    with pytest.raises(ValueError, match=r"shape \(6, 2\), expected \(6, 0\).*pass outcomes=scenario\.outcomes"):
+        evaluation.score(predicted, test)
+
+
+def test_predictions_in_parts_are_joined_in_order():
+    _, predicted = judged()
+    whole = evaluation.joined([evaluation.first(predicted, 4), evaluation.first(predicted, 2)])
+    np.testing.assert_array_equal(whole.pose, predicted.pose[[0, 1, 2, 3, 0, 1]])
+    np.testing.assert_array_equal(whole.samples.visual, predicted.samples.visual[:, [0, 1, 2, 3, 0, 1]])
+    np.testing.assert_array_equal(whole.outcome_probability, predicted.outcome_probability[[0, 1, 2, 3, 0, 1]])
+    assert whole.outcome is whole.samples.outcome is None

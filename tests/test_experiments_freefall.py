@@ -10,7 +10,7 @@ import pytest
 from optics_bodies import public_meshes
 
 import sts_jax as sts
-from experiments import freefall, stages
+from experiments import ceilings, freefall, stages
 from sts_jax import dataset, physics
 
 pytestmark = pytest.mark.slow
@@ -23,6 +23,7 @@ TINY = dataclasses.replace(
     steps=(2, 2, 2, 2),
     training=dataclasses.replace(freefall.SMOKE.training, batch_size=4, checkpoint_every=2),
     num_shown=2,
+    rerolls=2,
 )
 
 
@@ -35,9 +36,10 @@ def workdir(tmp_path_factory):
 
 def test_the_workdir_holds_what_is_promised(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
-    assert {"config.json", "dataset", "metrics.json", "table.md"} <= names
+    assert {"config.json", "dataset", "metrics.json", "table.md", "table-full.md"} <= names
+    assert {"ceiling.json", "ceiling.npz"} <= names
     assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS} <= names
-    assert {f"figures/{name}.png" for name in ("predictions", "training", "strip")} <= names
+    assert {f"figures/{name}.png" for name in ("predictions", "predictions-all", "training", "strip")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
     predictors = metrics["predictors"]
     assert {
@@ -49,10 +51,37 @@ def test_the_workdir_holds_what_is_promised(workdir):
         "constant (mean training target)",
         "copy of the input",
         "nearest neighbour",
+        "rests below its start",
+        "ceiling (mean of re-rolls)",
+        "one re-roll",
     } <= set(predictors)
     assert predictors["constant (mean training target)"]["visual_skill"]["value"] == 0
-    table = (workdir / "table.md").read_text()
-    assert all(name in table for name in predictors)
+    complete = (workdir / "table-full.md").read_text()
+    assert all(name in complete for name in predictors)
+    rows = [line.split(" | ")[0] for line in (workdir / "table.md").read_text().splitlines() if line[:2] == "| "]
+    assert rows[1:] == [
+        "| ceiling (mean of re-rolls)",
+        "| constant (mean training target)",
+        "| copy of the input",
+        "| nearest neighbour",
+        "| rests below its start",
+        "| MVAE with pose, from visual",
+        "| MVAE with pose, from all inputs",
+        "| MVAE with pose, from pose",
+    ]
+
+
+def test_the_ceilings_are_scored_once_and_kept(workdir, monkeypatch):
+    sensor, data = sts.Sensor(), dataset.load(workdir / "dataset")
+    test = data.pairs(stages.rows_of(data, "object")["test"])
+    monkeypatch.setattr(ceilings, "reroll", lambda *_: pytest.fail("rolled again"))
+    found = ceilings.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256)
+    metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
+    own = found.scores["ceiling (mean of re-rolls)"]
+    assert own.position.mean() == pytest.approx(metrics["position"]["value"])
+    assert own.best.bce.shape == (len(test.object),)
+    assert found.pose.shape == (2, len(test.object), 7)
+    assert found.scores["one re-roll"].log_loss is None
 
 
 def test_started_again_it_touches_nothing(workdir):

@@ -26,6 +26,8 @@ TINY = dataclasses.replace(
     steps=(2, 2),
     training=dataclasses.replace(perturbed.SMOKE.training, batch_size=4, checkpoint_every=2),
     num_shown=2,
+    num_samples=2,
+    rerolls=2,
 )
 
 
@@ -46,11 +48,23 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs")}
     assert predictors["MVAE with pose, from tactile"]["outcome_balanced_accuracy"]["value"] >= 0
     assert predictors["VAE visual only, from visual"]["outcome_balanced_accuracy"] is None
-    lines = (workdir / "table.md").read_text().splitlines()
+    rows = [line for line in (workdir / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
+    assert len(rows) == 10
+    assert not any(row.startswith("| VAE") for row in rows)
+    lines = (workdir / "table-full.md").read_text().splitlines()
     assert next(line for line in lines if line.startswith("| VAE visual only")).endswith("| - |")
-    assert {path.name for path in (workdir / "figures").glob("*.png")} == {
-        f"{name}.png" for name in ("predictions", "training", "strip")
-    }
+    expected = {"predictions", "predictions-all", "ends", "ends-all", "calibration", "training", "strip"}
+    assert {path.stem for path in (workdir / "figures").glob("*.png")} == expected
+
+
+def test_distributions_are_judged_where_samples_are_drawn(workdir):
+    predictors = json.loads((workdir / "metrics.json").read_text())["predictors"]
+    own = predictors["MVAE with pose, from visual and tactile"]
+    assert own["outcome_log_loss"]["value"] > 0
+    assert 0 <= own["coverage"]["value"] <= 1
+    assert own["visual_skill_best"] is not None
+    assert predictors["VAE visual only, from visual"]["coverage"] is None
+    assert "Touch removes " in (workdir / "table.md").read_text()
 
 
 def test_pairs_have_the_condition_turned_like_the_pose(workdir):

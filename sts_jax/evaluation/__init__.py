@@ -1,30 +1,47 @@
-"""How good a prediction is: metrics per item, tables with intervals, figures."""
+"""How good a prediction is: metrics per item, tables with intervals, ceilings, figures."""
 
 from sts_jax.evaluation import figures, metrics
 from sts_jax.evaluation.report import (
+    BASELINES,
+    CEILING,
+    CEILINGS,
+    ONE_REROLL,
     Predicted,
     Scores,
     baselines,
     emptiness,
+    first,
+    joined,
     outcome_of_image,
     outcome_of_pose,
     score,
-    summarise,
-    table,
+    shares,
 )
+from sts_jax.evaluation.rerolls import ceiling
+from sts_jax.evaluation.tables import full_table, gain, summarise, table
 from sts_jax.evaluation.views import outside
 
 __all__ = [
+    "BASELINES",
+    "CEILING",
+    "CEILINGS",
+    "ONE_REROLL",
     "Predicted",
     "Scores",
     "baselines",
+    "ceiling",
     "emptiness",
     "figures",
+    "first",
+    "full_table",
+    "gain",
+    "joined",
     "metrics",
     "outcome_of_image",
     "outcome_of_pose",
     "outside",
     "score",
+    "shares",
     "summarise",
     "table",
 ]

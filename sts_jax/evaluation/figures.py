@@ -2,24 +2,31 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import colors, font_manager
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw, ImageFont
 
 from sts_jax import physics
 from sts_jax._files import write_whole
 from sts_jax.dataset import Pairs
-from sts_jax.evaluation.report import Predicted
+from sts_jax.evaluation import metrics
+from sts_jax.evaluation.report import Predicted, Scores, in_unit
 
 SLOWER = 2  # an animation is so many times slower than what it shows
 _PANEL = 104  # pixels, height of one panel of curves below an animation
 
 
-def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, num: int, title: str) -> None:
-    """Input, target and predictions of the first `num` held-out trajectories, one row each.
+SAMPLES = 4  # of each prediction are shown
+_POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of true ends and of predicted ones
+
+
+def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, title: str) -> None:
+    """Input, truth, prediction and samples of the first `num` held-out trajectories: a row for each stream.
 
     Where there is a condition, an arrow on the input is the velocity against the pad that the jerk gives what slides
     freely: a quarter of the picture for 1 m/s.
@@ -27,32 +34,194 @@ def predictions(path: Path, test: Pairs, predicted: Mapping[str, Predicted], *, 
     Args:
         path: The PNG to write.
         test: Held-out trajectories, in the dataset's order.
-        predicted: By name; each gives one column a stream it predicts.
-        num: How many rows.
+        predicted: Of these, or of the first ones; a stream that is not predicted has no rows.
+        num: How many trajectories.
         title: Of the figure.
     """
-    num = min(num, len(test.visual))
-    columns: list[tuple[str, np.ndarray]] = [
-        ("input\nvisual", test.visual[:, 0] / 255),
-        ("target\nvisual", test.visual[:, 1] / 255),
-        *((f"{name}\nvisual", p.visual) for name, p in predicted.items() if p.visual is not None),
-        ("target\ntactile", test.tactile[:, 1] / 255),
-        *((f"{name}\ntactile", p.tactile) for name, p in predicted.items() if p.tactile is not None),
-    ]
-    figure, axes = plt.subplots(num, len(columns), figsize=(1.45 * len(columns), 1.35 * num + 0.9), squeeze=False)
-    for row in range(num):
-        for axis, (head, images) in zip(axes[row], columns, strict=True):
-            _show(axis, images[row])
+    streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
+    samples = predicted.samples or Predicted()
+    num = min(num, *(len(getattr(predicted, name)) for name in streams))
+    drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
+    heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
+    rows = len(streams) * num
+    figure, axes = plt.subplots(rows, len(heads), figsize=(1.25 * len(heads) + 0.7, 1.25 * rows + 0.8), squeeze=False)
+    for row in range(rows):
+        item, stream = row // len(streams), streams[row % len(streams)]
+        truth, drawings = getattr(test, stream)[item], getattr(samples, stream)
+        pictures = [truth[0], truth[1], getattr(predicted, stream)[item]]
+        pictures += [] if drawings is None else list(drawings[:SAMPLES, item])
+        for column, axis in enumerate(axes[row]):
+            if column < len(pictures):
+                _show(axis, in_unit(pictures[column]))
+            else:
+                axis.axis("off")
             if row == 0:
-                axis.set_title(head, fontsize=7)
-        outcome = physics.Outcome(int(test.outcome[row])).name.lower().replace("_", " ")
-        axes[row, 0].set_ylabel(f"#{test.trajectory[row]}\n{outcome}", fontsize=7)
-        if test.condition.shape[1]:
+                axis.set_title(heads[column], fontsize=10)
+        label = stream
+        if row % len(streams) == 0:
+            label = f"#{test.trajectory[item]}: {physics.Outcome(int(test.outcome[item]))}\n{stream}"
+        axes[row, 0].set_ylabel(label, fontsize=9)
+        if stream == streams[0] and test.condition.shape[1]:
             height, width = test.visual.shape[2:4]
             middle = np.array([width - 1, height - 1]) / 2
-            tip = middle - test.condition[row, :2] * test.condition[row, 2] * width / 4
+            tip = middle - test.condition[item, :2] * test.condition[item, 2] * width / 4
             axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
-    figure.suptitle(title, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    _save(figure, path)
+
+
+def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
+    """How often the likeliest outcome came true against its predicted probability, with the number of items below.
+
+    Args:
+        path: The PNG to write.
+        scores: By name, of predictors with outcome probabilities; each gives one column.
+        title: Of the figure.
+    """
+    judged = {
+        name: (own.confidence, own.right)
+        for name, own in scores.items()
+        if own.confidence is not None and own.right is not None
+    }
+    width = 1 / metrics.BINS
+    edges = width * np.arange(metrics.BINS)
+    figure, axes = plt.subplots(
+        2,
+        max(len(judged), 1),
+        figsize=(max(3.6 * len(judged), 5), 5),
+        height_ratios=[2.4, 1],
+        sharex=True,
+        sharey="row",
+        squeeze=False,
+    )
+    for (above, below), (name, (confidence, right)) in zip(axes.T, judged.items(), strict=False):
+        found = metrics.reliability(confidence, right)
+        there = found.items > 0
+        above.plot([0, 1], [0, 1], color="gray", linewidth=1, linestyle="--")
+        above.bar(edges[there], found.accuracy[there], width, align="edge", color=_POSSIBLE, alpha=0.35, edgecolor="w")
+        above.plot(found.confidence[there], found.accuracy[there], "o", color=_POSSIBLE, markersize=6)
+        above.set_title(f"{name}\ncalibration error {metrics.calibration_error(confidence, right):.3f}", fontsize=10)
+        bars = below.bar(edges, found.items, width, align="edge", color="0.6", edgecolor="w")
+        below.bar_label(bars, [f"{count:.0f}" if count else "" for count in found.items], fontsize=8)
+        below.set_xlabel("predicted probability\nof the likeliest outcome")
+        above.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("share in which it came true\n(dashed: calibrated)")
+    axes[1, 0].set_ylabel("number of items")
+    axes[0, 0].set_xlim(0, 1)
+    axes[0, 0].set_ylim(0, 1.02)
+    axes[1, 0].margins(y=0.2)
+    figure.suptitle(title, fontsize=11)
+    _save(figure, path)
+
+
+def ends(
+    path: Path,
+    size: Sequence[float],
+    start: np.ndarray,
+    truth: np.ndarray,
+    rerolled: np.ndarray,
+    sampled: np.ndarray,
+    *,
+    title: str,
+) -> None:
+    """Where one object can come to rest, beside where a model expects it: the pad from above, oriented as the images.
+
+    Args:
+        path: The PNG to write.
+        size: Of the pad along x and y (m), `(2,)`.
+        start: First pose, `(7,)`.
+        truth: Last pose, `(7,)`.
+        rerolled: Last poses with other hidden values, `(m, 7)`.
+        sampled: Last poses that a model drew, `(k, 7)`.
+        title: Of the figure.
+    """
+    figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)
+    half = 500 * np.asarray(size)  # mm
+    panels = (
+        (f"simulator: {len(rerolled)} draws of the hidden values", "simulated end", rerolled, _POSSIBLE),
+        (f"model: {len(sampled)} samples", "predicted end", sampled, _PREDICTED),
+    )
+    for axis, (head, label, poses, colour) in zip(axes, panels, strict=True):
+        axis.add_patch(Rectangle(tuple(-half), *(2 * half), facecolor="0.94", edgecolor="0.4"))
+        axis.annotate("pad", -half, (4, -4), textcoords="offset points", va="top", fontsize=9, color="0.4")
+        axis.plot(*(1e3 * start[:2]), "x", color="black", markersize=10, markeredgewidth=2, label="start")
+        axis.plot(*(1e3 * truth[:2]), "*", color="tab:green", markersize=18, label="true end")
+        axis.plot(*(1e3 * poses[:, :2].T), "o", color=colour, markersize=6, alpha=0.65, label=label)
+        axis.set_title(head, fontsize=11)
+        axis.set_xlabel("x (mm)")
+        axis.set_aspect("equal")
+    reach = 1.08 * max(half.max(), 1e3 * np.abs(np.concatenate([rerolled, sampled])[:, :2]).max())
+    axes[0].set_xlim(-reach, reach)
+    axes[0].set_ylim(reach, -reach)  # y points to the image's bottom
+    axes[0].set_ylabel("y (mm)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    model, name = axes[1].get_legend_handles_labels()
+    figure.legend([*handles, model[-1]], [*labels, name[-1]], loc="outside lower center", ncols=4, fontsize=10)
+    figure.suptitle(title, fontsize=11)
+    _save(figure, path)
+
+
+class Trained(NamedTuple):
+    """One trained model of a scaling curve."""
+
+    name: str  # of the line: the inputs, or the model
+    trajectories: int  # that it was trained on
+    minutes: float  # of training
+    skill: float
+    low: float  # of the 95 % interval
+    high: float
+
+
+def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
+    """Visual skill on held-out objects against the number of training trajectories and against training time.
+
+    The left panel joins the models of one name and training time, the right panel those of one name and number of
+    trajectories.
+
+    Args:
+        path: The PNG to write.
+        points: The trained models.
+        ceiling: Skill of the best possible prediction, drawn as a line.
+        title: Of the figure.
+    """
+    figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
+    for axis, along, fixed, unit in (
+        (axes[0], "trajectories", "minutes", "{:g} min"),
+        (axes[1], "minutes", "trajectories", "{:,} trajectories"),
+    ):
+        groups = dict.fromkeys((point.name, getattr(point, fixed)) for point in points)
+        for group in groups:
+            own = [point for point in points if (point.name, getattr(point, fixed)) == group]
+            own = sorted(own, key=lambda point: getattr(point, along))
+            if len(own) < 2 and len(groups) > 1:
+                continue
+            skill = np.array([point.skill for point in own])
+            spread = [skill - [point.low for point in own], [point.high for point in own] - skill]
+            label = f"{group[0]}, {unit.format(group[1])}"
+            place = [getattr(point, along) for point in own]
+            axis.errorbar(place, skill, spread, fmt="o-", capsize=3, markersize=5, linewidth=1.2, label=label)
+        if ceiling is not None:
+            axis.axhline(ceiling, color="gray", linestyle="--", linewidth=1)
+            axis.annotate(
+                "ceiling (re-rolls)",
+                (0.02, ceiling),
+                (0, 3),
+                xycoords=("axes fraction", "data"),
+                textcoords="offset points",
+                fontsize=9,
+                color="0.4",
+            )
+        axis.set_xscale("log")
+        ticks = sorted({getattr(point, along) for point in points})
+        axis.set_xticks(ticks, [f"{tick:,g}" for tick in ticks])
+        axis.set_xticks([], minor=True)
+        axis.grid(alpha=0.3)
+        axis.margins(y=0.12)
+        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    axes[0].set_xlabel("training trajectories")
+    axes[1].set_xlabel("training time (minutes)")
+    axes[0].set_ylabel("visual skill, held-out objects")
+    figure.suptitle(title, fontsize=11)
     _save(figure, path)
 
 

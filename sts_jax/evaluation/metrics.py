@@ -5,13 +5,18 @@ of the target itself: `BCE(x, p) = H(x) + KL(x || p)`. The excess is the KL term
 the skill is one minus its ratio to the excess of the mean training image.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 # Predicted probabilities are kept this far from 0 and 1: half a grey level, so that stored images can be predictions.
 HALF_LEVEL = 1 / 510
+FLOOR = 1e-3  # outcome probabilities below this count as this in the log loss
+BINS = 10  # of equal width in [0, 1], for the calibration of outcome probabilities
+LEVEL = 0.9  # probability of the region whose coverage is measured
+_CHUNK = 128  # items whose images are compared at once: bounds the memory
+_CLOSE = 1e-6  # m, the distance below which the geometric median's weights no longer grow
 
 
 class ImageError(NamedTuple):
@@ -30,6 +35,10 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
         target: Grey values in [0, 1], same shape.
         mask: Which pixels count, bool `(n, height, width)`; all where not given.
     """
+    if len(target) > _CHUNK:
+        cuts = [slice(start, start + _CHUNK) for start in range(0, len(target), _CHUNK)]
+        parts = [image_error(predicted[c], target[c], None if mask is None else mask[c]) for c in cuts]
+        return ImageError(*(np.concatenate(leaves) for leaves in zip(*parts, strict=True)))
     p = np.clip(predicted.astype(np.float64), HALF_LEVEL, 1 - HALF_LEVEL)
     x = target.astype(np.float64)
     weight = np.ones(x.shape[:3]) if mask is None else mask.astype(np.float64)
@@ -71,6 +80,173 @@ def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     w, x, y, z = (np.stack([predicted, target])[..., i].astype(np.float64) for i in range(3, 7))
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], -1)
     return np.arctan2(np.linalg.norm(np.cross(up[0], up[1]), axis=-1), (up[0] * up[1]).sum(-1))
+
+
+def best_of(errors: Sequence[ImageError]) -> ImageError:
+    """The error of each item's best sample: the one with the smallest excess.
+
+    Args:
+        errors: One a sample.
+    """
+    excess = np.stack([error.excess for error in errors])
+    best, item = excess.argmin(0), np.arange(excess.shape[1])
+    return ImageError(*(np.stack(leaves)[best, item] for leaves in zip(*errors, strict=True)))
+
+
+def gradient_energy(images: np.ndarray) -> np.ndarray:
+    """Sum of the squared differences of neighbouring pixels along both axes, `(*n,)`.
+
+    Args:
+        images: Grey values in [0, 1], `(*n, height, width, 3)`.
+    """
+    down, across = (np.diff(images, axis=axis) for axis in (-3, -2))
+    return (down.astype(np.float64) ** 2).sum((-3, -2, -1)) + (across.astype(np.float64) ** 2).sum((-3, -2, -1))
+
+
+def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Energy score of samples of a position, `E|X - y| - E|X - X'| / 2`, in the unit of the positions, `(n,)`.
+
+    The second mean is taken over the k (k - 1) pairs of different samples, so that the expectation does not depend on
+    k. One sample scores its distance: the score of a deterministic prediction is its absolute error.
+
+    Args:
+        samples: `(k, n, d)`.
+        target: `(n, d)`.
+
+    Source: Gneiting and Raftery (2007), Strictly proper scoring rules, prediction, and estimation.
+    """
+    error = np.linalg.norm(samples - target, axis=-1).mean(0)
+    number = len(samples)
+    if number < 2:
+        return error
+    spread = np.linalg.norm(samples[:, None] - samples[None], axis=-1).sum((0, 1)) / (number * (number - 1))
+    return error - spread / 2
+
+
+def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> np.ndarray:
+    """Whether the target lies in the central region of some samples, `(n,)`; the mean over items is the coverage.
+
+    The target and the k samples are ranked by their mean distance from each other. The region leaves out the
+    outermost points. A calibrated predictor's target is a draw like its samples, whatever their distribution, so that
+    its rank is one of 1 to k + 1 with equal probability. A rank r counts `level (k + 1) - (r - 1)`, limited to
+    [0, 1]: the mean is then `level` for every k. Points of equal distance share the mean of their counts.
+
+    Args:
+        samples: `(k, n, d)`, k >= 1.
+        target: `(n, d)`.
+        level: Probability of the region.
+    """
+    points = np.concatenate([target[None], samples]).astype(np.float64)
+    outlying = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(1)  # (k + 1, n)
+    # Sums of the same distances differ by rounding.
+    tolerance = 1e-9 * outlying.max(0)
+    inner = (outlying < outlying[0] - tolerance).sum(0)
+    ties = (np.abs(outlying - outlying[0]) <= tolerance).sum(0)  # the target included
+
+    def counted(ranks: np.ndarray) -> np.ndarray:  # the counts of ranks 1 to `ranks`, added up
+        return np.minimum(ranks, level * len(points))
+
+    return (counted(inner + ties) - counted(inner)) / ties
+
+
+def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
+    """One pose for some samples: the position with the smallest mean distance from theirs (geometric median), and the
+    orientation of the sample with the smallest mean angle to the others.
+
+    Args:
+        samples: `(k, n, 7)`, unit quaternions.
+        iterations: Of Weiszfeld's method.
+
+    Returns:
+        `(n, 7)`.
+    """
+    place = samples[..., :3].astype(np.float64)
+    middle = place.mean(0)
+    for _ in range(iterations):
+        weight = 1 / np.maximum(np.linalg.norm(place - middle, axis=-1, keepdims=True), _CLOSE)
+        middle = (weight * place).sum(0) / weight.sum(0)
+    quat = samples[..., 3:].astype(np.float64)
+    angle = np.arccos(np.minimum(np.abs((quat[:, None] * quat[None]).sum(-1)), 1)).sum(1)
+    chosen = quat[angle.argmin(0), np.arange(quat.shape[1])]
+    return np.concatenate([middle, chosen], -1).astype(samples.dtype)
+
+
+def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -> np.ndarray:
+    """Minus the logarithm of the true outcome's probability, nats `(n,)`.
+
+    Args:
+        probability: `(n, c)`.
+        label: The column of the true outcome, int `(n,)`.
+        floor: Smaller probabilities count as this: no single item decides the mean.
+    """
+    return -np.log(np.maximum(probability[np.arange(len(label)), label], floor))
+
+
+class Reliability(NamedTuple):
+    """Outcomes that were predicted with similar confidence, bin by bin."""
+
+    confidence: np.ndarray  # (bins,) mean probability of the likeliest outcome; nan where the bin is empty
+    accuracy: np.ndarray  # (bins,) share of the items in which that outcome came true
+    items: np.ndarray  # (bins,) how many, weighted
+
+
+def reliability(
+    confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
+) -> Reliability:
+    """How often the likeliest outcome came true, against its probability.
+
+    Args:
+        confidence: Probability of the likeliest outcome, `(n,)`.
+        right: Whether it came true, bool `(n,)`.
+        weight: Of the items, `(n,)`; 1 where not given.
+        bins: How many, of equal width in [0, 1].
+    """
+    w = np.ones(len(right)) if weight is None else weight
+    place = np.minimum((confidence * bins).astype(int), bins - 1)
+    count, said, came = (np.bincount(place, w * x, bins) for x in (np.ones(len(w)), confidence, right))
+    some = np.where(count > 0, count, np.nan)
+    return Reliability(said / some, came / some, count)
+
+
+def calibration_error(
+    confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
+) -> float:
+    """Expected calibration error: the mean over items of |accuracy - confidence| of the bin that they are in.
+
+    The arguments are those of `reliability`.
+
+    Source: Guo et al. (2017), On calibration of modern neural networks.
+    """
+    found = reliability(confidence, right, weight, bins=bins)
+    total = float(found.items.sum())
+    gap = np.nansum(found.items * np.abs(found.accuracy - found.confidence))
+    return float(gap) / total if total > 0 else float("nan")
+
+
+def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Area under the ROC curve: the probability that a positive item scores above a negative one; ties count half.
+
+    Args:
+        positive: bool `(n,)`.
+        score: `(n,)`.
+        weight: Of the items, `(n,)`; 1 where not given.
+    """
+    w = np.ones(len(score)) if weight is None else weight
+    _, place = np.unique(score, return_inverse=True)
+    above, below = (np.bincount(place, w * kind, place.max() + 1) for kind in (positive, ~positive))
+    pairs = float(above.sum() * below.sum())
+    return float((above * (np.cumsum(below) - below / 2)).sum()) / pairs if pairs > 0 else float("nan")
+
+
+def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """The weighted median: the mean of the lower and the upper one; nan without any weight."""
+    w = np.ones(len(values)) if weight is None else weight
+    order = np.argsort(values, kind="stable")
+    upto = np.cumsum(w[order])
+    if not len(upto) or upto[-1] <= 0:
+        return float("nan")
+    low, high = (np.searchsorted(upto, upto[-1] / 2, side) for side in ("left", "right"))
+    return float(values[order[low]] + values[order[min(high, len(order) - 1)]]) / 2
 
 
 def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> float:

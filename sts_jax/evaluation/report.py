@@ -1,6 +1,6 @@
-"""Predictions on held-out objects, scored, compared and written as a table."""
+"""Predictions on held-out objects, the baselines, and their errors per item."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,16 +13,54 @@ from sts_jax.evaluation import metrics
 
 
 class Predicted(NamedTuple):
-    """What some predictor says of the last moment of `n` trajectories; None where it says nothing."""
+    """The predicted last moment of `n` trajectories; None for a quantity that is not predicted.
 
-    visual: np.ndarray | None = None  # float (n, height, width, 3) in [0, 1]
-    tactile: np.ndarray | None = None  # float (n, height, width, 3)
+    With samples, `visual` and `tactile` are their means and `pose` is a point prediction.
+    """
+
+    visual: np.ndarray | None = None  # (n, height, width, 3), float in [0, 1] or uint8
+    tactile: np.ndarray | None = None  # (n, height, width, 3), float in [0, 1] or uint8
     pose: np.ndarray | None = None  # float (n, 7)
     outcome: np.ndarray | None = None  # int (n,), physics.Outcome
+    samples: "Predicted | None" = None  # k draws of the whole prediction: (k, n, ...); None if it is deterministic
+    outcome_probability: np.ndarray | None = None  # float (n, c), in the order of `scenario.outcomes`
+
+
+def first(predicted: Predicted, count: int) -> Predicted:
+    """The prediction for the first `count` items."""
+    return _mapped(lambda leaves, axis: leaves[0][:count] if axis == 0 else leaves[0][:, :count], [predicted])
+
+
+def joined(parts: Sequence[Predicted]) -> Predicted:
+    """One prediction for the items of several, in order; all predict the same quantities."""
+    return _mapped(np.concatenate, parts)
+
+
+def _mapped(
+    function: Callable[[Sequence[np.ndarray], int], np.ndarray], parts: Sequence[Predicted], axis: int = 0
+) -> Predicted:
+    """Apply a function of some arrays and their axis of items to every quantity of some predictions."""
+
+    def apply(leaves: Sequence[np.ndarray | None]) -> np.ndarray | None:
+        there = [leaf for leaf in leaves if leaf is not None]
+        return function(there, axis) if there else None
+
+    samples = [part.samples for part in parts if part.samples is not None]
+    return Predicted(
+        visual=apply([part.visual for part in parts]),
+        tactile=apply([part.tactile for part in parts]),
+        pose=apply([part.pose for part in parts]),
+        outcome=apply([part.outcome for part in parts]),
+        samples=_mapped(function, samples, 1) if samples else None,
+        outcome_probability=apply([part.outcome_probability for part in parts]),
+    )
 
 
 class Scores(NamedTuple):
-    """Errors of one predictor, per item."""
+    """Errors of one predictor, per item; None where it does not predict the quantity.
+
+    The last fields belong to predicted distributions. A deterministic position has an energy score too: its error.
+    """
 
     visual: metrics.ImageError | None
     visual_object: metrics.ImageError | None
@@ -32,14 +70,40 @@ class Scores(NamedTuple):
     angle: np.ndarray | None  # rad (n,)
     axis: np.ndarray | None  # rad (n,), of the up axes
     outcome: np.ndarray | None  # int (n,)
+    energy: np.ndarray | None = None  # m (n,), energy score of the position
+    coverage: np.ndarray | None = None  # (n,), see `metrics.coverage`
+    best: metrics.ImageError | None = None  # visual, of each item's sample with the smallest excess
+    gradient: np.ndarray | None = None  # (n,) gradient energy of visual samples, their mean; else of the image
+    gradient_target: np.ndarray | None = None  # (n,) that of the true images
+    log_loss: np.ndarray | None = None  # nats (n,), of the outcome
+    confidence: np.ndarray | None = None  # (n,) probability of the likeliest outcome
+    right: np.ndarray | None = None  # bool (n,), whether that outcome came true
+    fell_off: np.ndarray | None = None  # (n,) probability of FELL_OFF
 
 
 CONSTANT, COPY, NEIGHBOUR = "constant (mean training target)", "copy of the input", "nearest neighbour"
+BELOW = "rests below its start"
+BASELINES = (CONSTANT, COPY, NEIGHBOUR, BELOW)
+CEILING, ONE_REROLL = "ceiling (mean of re-rolls)", "one re-roll"
+CEILINGS = (CEILING, ONE_REROLL)
 
 
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """`scenario.outcome` of poses `(n, 7)`, true or predicted."""
     return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
+
+
+def shares(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarray:
+    """Probabilities `(n, c)` of outcomes from samples of the outcome.
+
+    One more sample is spread evenly over the outcomes, so that no probability is 0.
+
+    Args:
+        outcome: int `(k, n)`, of each sample.
+        outcomes: `scenario.outcomes`, the columns.
+    """
+    counts = (outcome[..., None] == np.array([int(one) for one in outcomes])).sum(0)
+    return (counts + 1 / len(outcomes)) / (len(outcome) + 1)
 
 
 def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
@@ -57,10 +121,13 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
-    """What can be said without learning: the mean target, the input itself, the target of the nearest input.
+    """Predictions without learning: the mean target, the input itself, the nearest input's target, and a rule.
 
     The neighbour is the training item whose first visual image is nearest in squared distance. With a condition, its
     squared distance counts as much: both are divided by the training set's variance, the condition's number by number.
+
+    The rule keeps x, y and the orientation of the start, at the median height of the training objects that stay on
+    the pad. It predicts no images.
     """
     inputs = train.visual[:, 0].reshape(len(train.visual), -1).astype(np.float32)
     queries = test.visual[:, 0].reshape(len(test.visual), -1).astype(np.float32)
@@ -79,12 +146,17 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     mean_pose = train.pose[:, 1].mean(0)
     mean_pose[3:] /= max(np.linalg.norm(mean_pose[3:]), 1e-6)
     majority = np.bincount(train.outcome).argmax()
+    frequency = np.array([np.mean(train.outcome == outcome) for outcome in scenario.outcomes])
+    rests = train.outcome != int(physics.Outcome.FELL_OFF)
+    below = test.pose[:, 0].copy()
+    below[:, 2] = np.median(train.pose[rests if rests.any() else slice(None), 1, 2])
     return {
         CONSTANT: Predicted(
             repeat(train.visual[:, 1].mean(0) / 255),
             repeat(train.tactile[:, 1].mean(0) / 255),
             repeat(mean_pose),
             np.full(num, majority),
+            outcome_probability=repeat(frequency),
         ),
         COPY: Predicted(
             test.visual[:, 0] / 255,
@@ -98,155 +170,85 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
             train.pose[nearest, 1],
             train.outcome[nearest],
         ),
+        BELOW: Predicted(pose=below, outcome=outcome_of_pose(scenario, test.pose[:, 0], below)),
     }
 
 
-def score(predicted: Predicted, test: Pairs) -> Scores:
-    """Errors per item of a prediction of the last moment."""
-    inside = test.segmentation[:, 1]
+def score(predicted: Predicted, test: Pairs, *, outcomes: Sequence[physics.Outcome] = ()) -> Scores:
+    """Errors per item of a prediction of the last moment.
+
+    Args:
+        predicted: Of all items, or of the first ones only.
+        test: The held-out items.
+        outcomes: `scenario.outcomes`, for predictions with `outcome_probability`.
+
+    Raises:
+        ValueError: `outcome_probability` has another number of columns than `outcomes`.
+    """
+    leaves = (predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability)
+    count = next((len(leaf) for leaf in leaves if leaf is not None), len(test.object))
+    test = Pairs(*(leaf[:count] for leaf in test))
+    inside, truth = test.segmentation[:, 1], test.visual[:, 1] / 255
 
     def images(image: np.ndarray | None, target: np.ndarray, mask: np.ndarray | None) -> metrics.ImageError | None:
-        return None if image is None else metrics.image_error(image, target / 255, mask)
+        return None if image is None else metrics.image_error(in_unit(image), target, mask)
 
     pose = predicted.pose
-    return Scores(
-        images(predicted.visual, test.visual[:, 1], None),
-        images(predicted.visual, test.visual[:, 1], inside),
-        images(predicted.tactile, test.tactile[:, 1], None),
-        images(predicted.tactile, test.tactile[:, 1], inside),
+    scores = Scores(
+        images(predicted.visual, truth, None),
+        images(predicted.visual, truth, inside),
+        images(predicted.tactile, test.tactile[:, 1] / 255, None),
+        images(predicted.tactile, test.tactile[:, 1] / 255, inside),
         None if pose is None else metrics.position_error(pose, test.pose[:, 1]),
         None if pose is None else metrics.geodesic_angle(pose, test.pose[:, 1]),
         None if pose is None else metrics.axis_angle(pose, test.pose[:, 1]),
         predicted.outcome,
     )
+    samples = predicted.samples or Predicted()
+    place = test.pose[:, 1, :3]
+    if samples.pose is not None:
+        scores = scores._replace(
+            energy=metrics.energy_score(samples.pose[..., :3], place),
+            coverage=metrics.coverage(samples.pose[..., :3], place),
+        )
+    elif pose is not None:
+        scores = scores._replace(energy=scores.position)
+    if samples.visual is not None:
+        scores = scores._replace(
+            best=metrics.best_of([metrics.image_error(in_unit(image), truth) for image in samples.visual]),
+            gradient=np.mean([metrics.gradient_energy(in_unit(image)) for image in samples.visual], axis=0),
+        )
+    elif predicted.visual is not None:
+        scores = scores._replace(gradient=metrics.gradient_energy(in_unit(predicted.visual)))
+    if predicted.visual is not None or samples.visual is not None:
+        scores = scores._replace(gradient_target=metrics.gradient_energy(truth))
+    if predicted.outcome_probability is not None:
+        scores = _with_probability(scores, predicted.outcome_probability, test, outcomes)
+    return scores
 
 
-def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, seed: int = 0) -> dict:
-    """All figures of all predictors with 95 % intervals over objects, and the differences from the baselines.
-
-    Args:
-        scores: By name; the constant, the copy and the neighbour must be among them.
-        test: The items that were scored.
-        num: Bootstrap draws.
-        seed: Of the draws.
-
-    Returns:
-        A JSON-able dictionary: `items`, `objects`, `outcomes`, `predictors` (name -> figure -> value, low, high), and
-        `differences` (name -> baseline -> figure -> value, low, high), where a positive difference of skill and a
-        negative difference of an error speak for the predictor.
-    """
-    stayed = test.outcome != int(physics.Outcome.FELL_OFF)
-
-    def figures(weight: np.ndarray) -> np.ndarray:
-        return np.stack([_figures(s, scores[CONSTANT], test, stayed, weight) for s in scores.values()])
-
-    value = figures(np.ones(len(test.object)))
-    draws = metrics.bootstrap(test.object, figures, num=num, seed=seed)
-    names = list(scores)
-
-    def cell(number: float, sample: np.ndarray) -> dict | None:
-        if not np.isfinite(number):
-            return None
-        low, high = metrics.interval(sample)
-        return {"value": float(number), "low": low, "high": high}
-
-    def column(values: np.ndarray, sample: np.ndarray) -> dict:
-        return {f: cell(values[k], sample[:, k]) for k, f in enumerate(FIGURES)}
-
-    reference = {name: names.index(name) for name in (CONSTANT, COPY, NEIGHBOUR)}
-    return {
-        "items": len(test.object),
-        "objects": len(np.unique(test.object)),
-        "outcomes": {physics.Outcome(o).name.lower(): int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
-        "predictors": {name: column(value[i], draws[:, i]) for i, name in enumerate(names)},
-        "differences": {
-            name: {base: column(value[i] - value[j], draws[:, i] - draws[:, j]) for base, j in reference.items()}
-            for i, name in enumerate(names)
-            if name not in reference
-        },
-    }
+def in_unit(image: np.ndarray) -> np.ndarray:
+    """Grey values in [0, 1], of floats in [0, 1] or of `uint8`."""
+    return image.astype(np.float32) / 255 if image.dtype == np.uint8 else image
 
 
-# The figures of a predictor: per stream BCE and excess (nats a pixel and channel), skill over all pixels and over the
-# target's object pixels; position (m), angle and angle of the up axes (rad) over all items and over those that stayed
-# on the pad.
-FIGURES = (
-    *(f"{s}_{f}{p}" for s in ("visual", "tactile") for f in ("bce", "excess", "skill") for p in ("", "_object")),
-    *("position", "position_on_pad", "angle", "angle_on_pad", "axis", "axis_on_pad", "outcome_balanced_accuracy"),
-)
-
-
-def _figures(s: Scores, constant: Scores, test: Pairs, stayed: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    out: list[float] = []
-    for stream in ("visual", "tactile"):
-        errors = [getattr(s, stream), getattr(s, f"{stream}_object")]
-        references = [getattr(constant, stream), getattr(constant, f"{stream}_object")]
-        for kind in ("bce", "excess"):
-            out += [
-                float("nan") if e is None else metrics.mean_per_pixel(getattr(e, kind), e.pixels, weight)
-                for e in errors
-            ]
-        out += [
-            float("nan") if e is None else metrics.skill(e, r, weight) for e, r in zip(errors, references, strict=True)
-        ]
-    for error in (s.position, s.angle, s.axis):
-        for keep in (np.ones_like(stayed), stayed):
-            w = weight * keep
-            out.append(float("nan") if error is None or w.sum() == 0 else float((w * error).sum() / w.sum()))
-    out.append(float("nan") if s.outcome is None else metrics.balanced_accuracy(s.outcome, test.outcome, weight))
-    return np.array(out)
-
-
-def table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
-    """The summary as Markdown: one row a predictor, then the differences from the baselines."""
-    heads = [
-        ("visual BCE", "visual_bce", 1, 4),
-        ("visual excess x1e-4", "visual_excess", 1e4, 1),
-        ("visual skill", "visual_skill", 1, 3),
-        ("visual on object", "visual_skill_object", 1, 3),
-        ("tactile BCE", "tactile_bce", 1, 4),
-        ("tactile excess x1e-4", "tactile_excess", 1e4, 1),
-        ("tactile skill", "tactile_skill", 1, 3),
-        ("tactile on object", "tactile_skill_object", 1, 3),
-        ("position (mm)", "position", 1e3, 1),
-        ("on pad", "position_on_pad", 1e3, 1),
-        ("angle (deg)", "angle", 180 / np.pi, 0),
-        ("on pad", "angle_on_pad", 180 / np.pi, 0),
-        ("up axis (deg)", "axis", 180 / np.pi, 0),
-        ("on pad", "axis_on_pad", 180 / np.pi, 0),
-        ("outcome, balanced", "outcome_balanced_accuracy", 1, 3),
-    ]
-    outcomes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items())
-    lines = [
-        f"# {title}",
-        "",
-        f"{summary['items']} held-out trajectories of {summary['objects']} objects ({outcomes}). In brackets: 95 % "
-        "intervals, bootstrapped over objects. BCE and excess are nats a pixel and channel; skill is 1 - excess / "
-        "excess of the constant.",
-        "",
-        f"| predictor | {' | '.join(h[0] for h in heads)} |",
-        "|---" * (len(heads) + 1) + "|",
-    ]
-    for name, row in summary["predictors"].items():
-        cells = [_cell(row[key], scale, digits, "skill" in key) for _, key, scale, digits in heads]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    shown = [h for h in heads if "_skill" in h[1] or h[1] in ("position", "angle", "axis")]
-    lines += [
-        "",
-        "Differences from the baselines (skill: positive is better; errors: negative is better):",
-        "",
-        f"| predictor | against | {' | '.join(h[0] for h in shown)} |",
-        "|---" * (len(shown) + 2) + "|",
-    ]
-    for name, against in summary["differences"].items():
-        for base, row in against.items():
-            cells = [_cell(row[key], scale, digits, True) for _, key, scale, digits in shown]
-            lines.append(f"| {name} | {base} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *notes, ""])
-
-
-def _cell(figure: dict | None, scale: float, digits: int, with_interval: bool) -> str:
-    if figure is None:
-        return "-"
-    value, low, high = (f"{figure[key] * scale:.{digits}f}" for key in ("value", "low", "high"))
-    return f"{value} [{low}, {high}]" if with_interval else value
+def _with_probability(
+    scores: Scores, probability: np.ndarray, test: Pairs, outcomes: Sequence[physics.Outcome]
+) -> Scores:
+    """The scores with those of the outcome's probabilities."""
+    if probability.shape != (len(test.outcome), len(outcomes)):
+        raise ValueError(
+            f"outcome_probability has shape {probability.shape}, expected {(len(test.outcome), len(outcomes))}: one "
+            "column for each of `outcomes`; pass outcomes=scenario.outcomes"
+        )
+    number = np.array([int(outcome) for outcome in outcomes])
+    likeliest = number[probability.argmax(1)]
+    label = (test.outcome[:, None] == number).argmax(1)
+    fell_off = number.tolist().index(int(physics.Outcome.FELL_OFF))
+    return scores._replace(
+        outcome=likeliest if scores.outcome is None else scores.outcome,
+        log_loss=metrics.log_loss(probability, label),
+        confidence=probability.max(1),
+        right=likeliest == test.outcome,
+        fell_off=probability[:, fell_off],
+    )

@@ -1,0 +1,85 @@
+"""Re-rolls begin at the given starts, and their ends are samples of the prediction. The engine is replaced."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_evaluation_report import pairs
+
+import sts_jax as sts
+from sts_jax import dataset, evaluation, physics
+from sts_jax.evaluation import rerolls
+from sts_jax.physics.simulate import _draw, _shapes
+
+TIMES, SIDE = 3, 4
+COLLECTION = dataset.Collection(physics.Freefall(), num_objects=2, num_per_object=2, resolution=(SIDE, SIDE))
+OFF_FIRST = np.array([0.0, 1.0, -1.0])  # m, added to z in the re-rolls of an item
+
+
+def starts():
+    """Two starts of object 1, then one of object 0."""
+    test = pairs([0, 0, 0], np.zeros((3, 0)))
+    rng = np.random.default_rng(0)
+    test.pose[:, 0, :3] = rng.uniform(0, 0.05, (3, 3))
+    quat = rng.normal(size=(3, 4))
+    test.pose[:, 0, 3:] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    return test._replace(object=np.array([1, 1, 0]))
+
+
+@pytest.fixture
+def engine(monkeypatch):
+    """What starts `simulate` draws; the ends lie above or below them. Pictures show which object is drawn, and z."""
+    seen = {}
+
+    def simulate(key, bodies, sensor, scenario, num, *, progress=False):
+        which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
+        pad = tuple(float(side) for side in sensor.gel.size)
+        start, hidden = _draw(key, which, nth, 0 * nth, _shapes(bodies, scenario), scenario=scenario, pad=pad)
+        seen.update(bodies=bodies, held=start.held, hidden=hidden)
+        pose = jnp.stack([start.pose, start.pose + jnp.zeros(7).at[2].set(1) * OFF_FIRST[nth][:, None]], 1)
+        nothing = jnp.zeros((len(which), 2, 6))
+        rest = dict.fromkeys(physics.Trajectory._fields)
+        outcome = jax.vmap(scenario.outcome)(pose[:, 0], pose[:, 1])
+        return physics.Trajectory(**{**rest, "pose": pose, "wrench": nothing, "outcome": outcome})
+
+    def render(sensor, body, pose, wrench, *, resolution, crop):
+        grey = jnp.round(100 + 50 * pose[:, 2] + 10 * (body.shell_mass == seen["bodies"][0].shell_mass))
+        image = jnp.broadcast_to(grey[:, None, None, None], (len(pose), SIDE, SIDE, 3)).astype(jnp.uint8)
+        return image, image, image[..., 0] > 0
+
+    monkeypatch.setattr(rerolls.physics, "simulate", simulate)
+    monkeypatch.setattr(rerolls.dataset, "render_uint8", render)
+    return seen
+
+
+def test_every_re_roll_begins_at_its_items_start_and_ends_are_samples(engine):
+    test = starts()
+    found = evaluation.ceiling(COLLECTION, sts.Sensor(), test, TIMES, jax.random.key(0))
+    assert found.samples.pose.shape == (TIMES, 3, 7)
+    for number, off in enumerate(OFF_FIRST):
+        expected = test.pose[:, 0].copy()
+        expected[:, 2] += off
+        np.testing.assert_allclose(found.samples.pose[number], expected, atol=1e-6)
+    np.testing.assert_allclose(found.pose[:, :3], test.pose[:, 0, :3], atol=1e-4)  # the median of -1, 0 and 1 m
+    assert (np.asarray(engine["held"]) == COLLECTION.scenario.steps).all()
+    assert len(np.unique(np.asarray(engine["hidden"].fill))) == 3 * TIMES
+    # Each item is drawn with its own object: the first body of the engine is object 1.
+    ends = 100 + 50 * found.samples.pose[..., 2]
+    np.testing.assert_allclose(found.samples.visual[..., 0, 0, 0], ends + np.array([10, 10, 0]), atol=0.51)
+    np.testing.assert_allclose(found.visual, found.samples.visual.mean(0) / 255, rtol=1e-6)
+    # Two of three stay, one falls off; one more re-roll is spread evenly.
+    rests = [outcome == physics.Outcome.RESTS for outcome in COLLECTION.scenario.outcomes]
+    np.testing.assert_allclose(found.outcome_probability[:, rests.index(True)], 2.5 / 4)
+    assert found.outcome.tolist() == [physics.Outcome.RESTS] * 3
+
+
+def test_a_start_that_the_engine_draws_otherwise_is_refused(engine, monkeypatch):
+    real = rerolls.physics.simulate
+    monkeypatch.setattr(rerolls.physics, "simulate", lambda key, *rest, **k: real(jax.random.key(9), *rest, **k))
+    with pytest.raises(RuntimeError, match="draws its starts otherwise"):
+        evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), TIMES, jax.random.key(0))
+
+
+def test_nothing_is_rolled_no_times():
+    with pytest.raises(ValueError, match="times must be >= 1, got 0"):
+        evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), 0, jax.random.key(0))
