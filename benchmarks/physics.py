@@ -6,13 +6,14 @@
     python -m benchmarks.physics --scaling         # about 10 minutes on two cores; writes benchmarks/results/physics/
     python -m benchmarks.physics --compile         # about 8 minutes on two cores
 
-The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in both engines, C MuJoCo's
+The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in MJX and in C MuJoCo's
 batch (`mujoco.rollout`) on all cores, measured in turn. `--engines` simulates falls of Freefall's default, so many of
-each of 16 objects, in both engines of `simulate`: falls per second, all costs but compilation. `--pipeline` drops a bottle so many times and draws every frame
-of it, vision and touch, 64x64, uint8, fetched from the device: seconds and frames per second of either and of both,
-all costs but compilation (a frame is one world at one time). `--scaling` steps 1 to 4,096 worlds at once (65,536 on a
-GPU). `--compile` tells seconds before the first step of each scenario, and how often a hundred objects compile, in
-fresh processes: first with an empty cache of compiled programs, then with what the first left there.
+each of 16 objects, in both engines of `simulate`: falls per second, all costs but compilation. `--pipeline` drops a
+bottle so many times and draws every frame of it, vision and touch, 64x64, uint8, fetched from the device: seconds and
+frames per second of either and of both, all costs but compilation (a frame is one world at one time). `--scaling` steps
+1 to 4,096 worlds at once (65,536 on a GPU). `--compile` tells seconds before the first step of each scenario, and how
+often a hundred objects compile, in fresh processes: first with an empty cache of compiled programs, then with what the
+first left there.
 """
 
 import argparse

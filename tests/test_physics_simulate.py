@@ -27,9 +27,15 @@ def bodies() -> list[objects.Body]:
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "webcam", "watch"])]
 
 
+@pytest.fixture(scope="module", params=["mjx", "mujoco"])
+def engine(request: pytest.FixtureRequest) -> physics.Engine:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def drops(bodies: list[objects.Body]) -> physics.Trajectory:
-    return jax.tree.map(np.asarray, physics.simulate(jax.random.key(3), bodies, Sensor(), SCENARIO, NUM, chunk=24))
+def drops(bodies: list[objects.Body], engine: physics.Engine) -> physics.Trajectory:
+    found = physics.simulate(jax.random.key(3), bodies, Sensor(), SCENARIO, NUM, chunk=24, engine=engine)
+    return jax.tree.map(np.asarray, found)
 
 
 def rigid(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> tuple[float, np.ndarray, np.ndarray]:
@@ -122,10 +128,13 @@ def energy(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> n
 
 
 @pytest.mark.slow
-def test_energy_out_of_contact_never_exceeds_the_start_s_in_any_step(bodies: list[objects.Body]) -> None:
+def test_energy_out_of_contact_never_exceeds_the_start_s_in_any_step(
+    bodies: list[objects.Body], engine: physics.Engine
+) -> None:
     every_step = dataclasses.replace(SCENARIO, rate=1000.0, frames=400)
     drops = jax.tree.map(
-        np.asarray, physics.simulate(jax.random.key(3), bodies, Sensor(), every_step, NUM, chunk=4 * NUM)
+        np.asarray,
+        physics.simulate(jax.random.key(3), bodies, Sensor(), every_step, NUM, chunk=4 * NUM, engine=engine),
     )
     flights = 0
     for row in range(4 * NUM):
@@ -137,7 +146,7 @@ def test_energy_out_of_contact_never_exceeds_the_start_s_in_any_step(bodies: lis
 
 
 def test_states_are_c_mujoco_s_before_and_shortly_after_the_first_touch(
-    bodies: list[objects.Body], drops: physics.Trajectory
+    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine
 ) -> None:
     steps = round(1 / SCENARIO.rate / SCENARIO.contact.timestep)
     before, after = [], []
@@ -155,7 +164,8 @@ def test_states_are_c_mujoco_s_before_and_shortly_after_the_first_touch(
     assert len(after) == 4 * NUM
     assert np.max(before) < 2e-5
     # Within one frame of a touch at 1 m/s: nearly all drops strike with one or two points, which C finds too.
-    assert np.median(after) < 1e-6
+    # As an engine C has the mesh's contact beside that of the vertex, and is stiffer for the moment of the impact.
+    assert np.median(after) < {"mjx": 1e-6, "mujoco": 2e-5}[engine]
     assert np.mean(np.array(after) < 1e-3) >= 0.9
 
 
@@ -229,31 +239,36 @@ def test_gravity_may_change_with_time() -> None:
 
 
 def test_same_key_same_bytes_and_independent_of_number_and_of_a_bar_that_is_shown_before_the_first_chunk(
-    bodies: list[objects.Body], drops: physics.Trajectory, capsys: pytest.CaptureFixture
+    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, capsys: pytest.CaptureFixture
 ) -> None:
-    again = physics.simulate(jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24, progress=True)
+    again = physics.simulate(
+        jax.random.key(3), bodies[:1], Sensor(), SCENARIO, 3, chunk=24, progress=True, engine=engine
+    )
     out, err = capsys.readouterr()
     assert out == ""
-    assert re.search(r"simulate: compiling: +0%.* 0/3 .*simulate: 100%.* 3/3 ", err, re.DOTALL)
+    first = "simulate: compiling" if engine == "mjx" else "simulate"
+    assert re.search(rf"{first}: +0%.* 0/3 .*simulate: 100%.* 3/3 ", err, re.DOTALL)
     for name in ("pose", "velocity", "wrench", "settled", "touches"):
         np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[:3])
 
 
 def test_hidden_rolls_the_same_start_again_and_nothing_is_printed_unasked(
-    bodies: list[objects.Body], drops: physics.Trajectory, capsys: pytest.CaptureFixture
+    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, capsys: pytest.CaptureFixture
 ) -> None:
     hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
     heavy = hidden._replace(fill=np.append(hidden.fill[:1], np.ones(NUM - 1, np.float32)))
-    other = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, hidden=heavy, chunk=24)
+    other = physics.simulate(
+        jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, hidden=heavy, chunk=24, engine=engine
+    )
     assert capsys.readouterr() == ("", "")
     np.testing.assert_array_equal(other.pose[:, 0], drops.pose[:NUM, 0])
     np.testing.assert_array_equal(other.pose[0], drops.pose[0])
     assert not np.any(np.all(other.pose[1:, -1] == drops.pose[1:NUM, -1], axis=1))
 
 
-def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body]) -> None:
+def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body], engine: physics.Engine) -> None:
     scenario = dataclasses.replace(SCENARIO, spread=0.15)
-    drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24)
+    drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24, engine=engine)
     fell = np.asarray(drops.outcome) == physics.Outcome.FELL_OFF
     assert 0.1 < fell.mean() < 1
     gone = fell & np.asarray(drops.settled)
@@ -264,18 +279,19 @@ def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body]) -> N
 
 
 @pytest.mark.slow
-def test_objects_compile_once(bodies: list[objects.Body], drops: physics.Trajectory) -> None:
+def test_objects_compile_once(bodies: list[objects.Body]) -> None:
     from sts_jax.physics.simulate import _roll
 
+    physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
     before = _roll._cache_size()
     more = [objects.make(jax.random.key(20), "spoon"), objects.make(jax.random.key(21), "mouse")]
-    physics.simulate(jax.random.key(0), more, Sensor(), SCENARIO, 1, chunk=24)
+    physics.simulate(jax.random.key(0), more, Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
     assert _roll._cache_size() == before
 
 
 @pytest.mark.slow
 def test_progress_and_resampling(
-    bodies: list[objects.Body], drops: physics.Trajectory, monkeypatch: pytest.MonkeyPatch
+    bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import sys
 
@@ -284,7 +300,9 @@ def test_progress_and_resampling(
     limit = float(np.sort(sunk)[-2] + np.sort(sunk)[-1]) / 2
     monkeypatch.setattr(module, "SUNK_LIMIT", limit)
     done: list[int] = []
-    again = physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24, progress=done.append)
+    again = physics.simulate(
+        jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24, progress=done.append, engine=engine
+    )
     worst = int(np.argmax(sunk))
     assert again.resampled[worst] >= 1
     assert np.all(again.sunk <= limit)
@@ -293,7 +311,7 @@ def test_progress_and_resampling(
     monkeypatch.setattr(module, "SUNK_LIMIT", 0.0)
     monkeypatch.setattr(module, "ATTEMPTS", 1)
     with pytest.raises(ValueError, match=r"body 0: trajectory 0 is .* in 1 draws"):
-        physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24)
+        physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine=engine)
 
 
 def test_the_outcome_is_read_from_the_last_pose() -> None:

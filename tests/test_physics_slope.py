@@ -106,10 +106,11 @@ def bodies() -> list[objects.Body]:
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "camera", "scissors"])]
 
 
-@pytest.fixture(scope="module")
-def slid(bodies: list[objects.Body]) -> physics.Trajectory:
+@pytest.fixture(scope="module", params=["mjx", "mujoco"])
+def slid(bodies: list[objects.Body], request: pytest.FixtureRequest) -> physics.Trajectory:
     varied = dataclasses.replace(SCENARIO, friction=(0.35, 0.75), resting=0.8, tries=1)  # so that much slides
-    return jax.tree.map(np.asarray, physics.simulate(jax.random.key(1), bodies, Sensor(), varied, 8))
+    found = physics.simulate(jax.random.key(1), bodies, Sensor(), varied, 8, engine=request.param)
+    return jax.tree.map(np.asarray, found)
 
 
 def points(bodies: list[objects.Body], slid: physics.Trajectory, row: int, frame: int) -> np.ndarray:

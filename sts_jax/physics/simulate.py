@@ -284,7 +284,7 @@ def _rigids(bodies: Sequence[Body], which: np.ndarray, hidden: Hidden) -> _Rigid
         mine = np.flatnonzero(which == index)
         for rows in np.split(mine, range(RIGIDS, len(mine), RIGIDS)):
             # Always as many at once: another number rounds differently, and compiles anew.
-            own = jax.tree.map(lambda x, rows=np.resize(rows, RIGIDS): x[rows], values)
+            own = Hidden(*(x[np.resize(rows, RIGIDS)] for x in values))
             rigid = _rigid(bodies[index], own.fill, own.shell_scale, own.up)
             found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])
     return _Rigid(*(np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True)))
