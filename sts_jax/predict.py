@@ -248,6 +248,8 @@ class Predictor:
                     f"{folder} was trained on {field}={there}, asked for is {field}={asked}: "
                     "render that view, or train a model on this one."
                 )
+        if isinstance(model.config, statespace.Config):
+            _check_view(str(folder), model.config, preprocessing)
         blank = training.load_blank(Path(folder))
         if any(image.shape[:2] != preprocessing.resolution for image in blank):
             raise ValueError(
@@ -415,6 +417,23 @@ class Predictor:
                 "usual; are these SI units?"
             )
         return condition, None
+
+
+def _check_view(name: str, config: statespace.Config, preprocessing: training.Preprocessing) -> None:
+    """Raise a ValueError where the networks presume another view or another code of a pose."""
+    presumed = {
+        "resolution": (config.input_size,) * 2,
+        "crop": False,
+        "rotation": "matrix",
+        "position_scale": config.position_scale,
+    }
+    for field, wanted in presumed.items():
+        found = getattr(preprocessing, field)
+        if found != wanted:
+            raise ValueError(
+                f"{name}: its state-space model presumes {field}={wanted!r}, its preprocessing has {field}={found!r}; "
+                "train it on what it presumes, or change its configuration."
+            )
 
 
 def _traced(value: object) -> bool:

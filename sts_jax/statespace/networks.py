@@ -66,6 +66,11 @@ class Config:
                 raise ValueError(f"{name} is {getattr(self, name)} pixels; it takes a multiple of {part}")
         if len(self.encoder) != 3 or len(self.decoder) != 4:
             raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths; give 3 and 4")
+        if self.condition < 0 or self.condition == 1:
+            raise ValueError(f"condition is {self.condition} numbers; give 0, or at least the 2 of a vector")
+        for name in ("drawn", "drawn_first"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} is {getattr(self, name)}; it takes a share of a batch, above 0 and at most 1")
 
     def to_json(self) -> dict[str, Any]:
         """Plain dictionaries and lists."""

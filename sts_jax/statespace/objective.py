@@ -31,18 +31,24 @@ _LEAST = 1 / 1020  # predicted images are kept this far from 0 and 1
 
 
 def experts(
-    model: Model, inputs: dict[str, Array], empty: dict[str, Float[Array, "size size 3"]]
+    model: Model,
+    inputs: dict[str, Array],
+    counts: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Gaussian]:
     """The Gaussian of each input over pose code and look.
 
     Args:
         model: the networks.
-        inputs: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], `pose` `(n, 12)`, a code.
-        empty: the images of the untouched sensor, of the same size.
+        inputs: some of `visual` and `tactile` `(n, size, size, 3)` in [0, 1], and `pose` `(n, 12)`, a code.
+        counts: which items of each input count. The values of the others, NaN among them, have no influence.
+        empty: both images of the untouched sensor, of the same size.
     """
-    found = {name: model.encoders[name](inputs[name] - empty[name]) for name in IMAGES if name in inputs}
+    # Replaced before the networks see them: neither the product of experts nor a gradient is safe from 0 * NaN.
+    change = {name: _where(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
+    found = {name: model.encoders[name](x) for name, x in change.items()}
     if "pose" in inputs:
-        code = inputs["pose"]
+        code = _where(counts["pose"], inputs["pose"])
         nothing = jnp.zeros((len(code), model.config.look))
         log_var = [jnp.full_like(code, POSE_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
         found["pose"] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
@@ -53,6 +59,11 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
     """The product of the standard normal prior and of the experts that count, sample by sample."""
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
+
+
+def _where(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Zero in place of the items that do not count."""
+    return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
 
 
 def log_density(
@@ -120,7 +131,7 @@ def loss(
     number = len(targets["pose"])
     counts = {name: jnp.ones(number, bool) for name in config.inputs} | (present or {})
     choice, noise = jax.random.split(key)
-    found = experts(model, inputs, empty)
+    found = experts(model, inputs, counts, empty)
     images = [name for name in IMAGES if name in found]
     state, doubt = zip(*(_state_error(found[name], targets["state"], counts[name]) for name in images), strict=True)
     terms = {"state": jnp.sum(jnp.stack(state)), "doubt": jnp.sum(jnp.stack(doubt))}
@@ -149,8 +160,12 @@ def loss(
     pictures = model.decoder(code, jnp.concatenate([drawn[:last], drawn[:first]]), shown)
     for name in IMAGES:
         terms[name] = jnp.mean(excess(pictures[name][:last], targets[name][:last]))
-    before = [excess(pictures[name][last:], reduced(inputs[name][:first], config.image_size)) for name in images]
-    terms["first"] = jnp.mean(jnp.sum(jnp.stack(before), axis=0))
+    terms["first"] = jnp.zeros(())
+    for name in images:
+        known = counts[name][:first]
+        before = reduced(_where(known, inputs[name][:first]), config.image_size)
+        wrong = jnp.where(known, excess(pictures[name][last:], before), 0)
+        terms["first"] += jnp.sum(wrong) / jnp.maximum(jnp.sum(known), 1)
     total = (
         terms["visual"]
         + config.tactile_weight * terms["tactile"]

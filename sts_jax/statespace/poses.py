@@ -32,18 +32,18 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     return jnp.where(length > 1e-3, chosen / jnp.maximum(length, 1e-3), jnp.array([1.0, 0.0]))
 
 
-def turn(angle: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
     """Turn vectors of the pad's plane by an angle that is given as cosine and sine."""
     cos, sin, x, y = angle[..., 0], angle[..., 1], vector[..., 0], vector[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def turn_back(angle: Float[Array, "*n 2"], vector: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+def turn_back(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
     """The inverse of `turn`."""
     return turn(angle * jnp.array([1.0, -1.0]), vector)
 
 
-def turn_code(angle: Float[Array, "*n 2"], code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
     """Pose codes after everything was turned about the vertical through the sensor's origin."""
     position = jnp.concatenate([turn(angle, code[..., :2]), code[..., 2:3]], axis=-1)
     rows = code[..., 3:].reshape(*code.shape[:-1], 3, 3)
@@ -52,12 +52,12 @@ def turn_code(angle: Float[Array, "*n 2"], code: Float[Array, "*n 12"]) -> Float
     return jnp.concatenate([position, rows.reshape(*code.shape[:-1], 9)], axis=-1)
 
 
-def turn_code_back(angle: Float[Array, "*n 2"], code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+def turn_code_back(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
     """The inverse of `turn_code`."""
     return turn_code(angle * jnp.array([1.0, -1.0]), code)
 
 
-def turn_variance(angle: Float[Array, "*n 2"], variance: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+def turn_variance(angle: Float[Array, "*#n 2"], variance: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
     """The variances of a turned pose code's components, where those of the code are independent."""
     cos, sin = angle[..., :1] ** 2, angle[..., 1:] ** 2
 

@@ -48,7 +48,7 @@ def sample(
         drawn: of how many of them both streams are drawn, each with its own look.
     """
     model = nnx.merge(graphdef, params)
-    belief = fuse(experts(model, inputs, empty), present)
+    belief = fuse(experts(model, inputs, present, empty), present)
     final = model.transition(belief, condition)
     end, appearance = jax.random.split(key)
     codes = jax.vmap(lambda key: _final_code(key, final))(jax.random.split(end, num))

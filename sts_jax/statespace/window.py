@@ -74,8 +74,8 @@ def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"])
     """Bilinear interpolation at some columns and rows, whole numbers at pixel centres; zero outside of the image."""
     side = images.shape[1]
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0))).reshape(len(images), (side + 2) ** 2, -1)
-    places = jnp.clip(places + 1, 0, side + 0.999)
-    corner = jnp.floor(places).astype(jnp.int32)
+    places = jnp.clip(places + 1, 0, side + 1)
+    corner = jnp.minimum(jnp.floor(places), side).astype(jnp.int32)
     share = places - corner
     found = jnp.zeros((*places.shape[:-1], images.shape[-1]))
     for down in (0, 1):

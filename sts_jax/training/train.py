@@ -428,6 +428,11 @@ def _record(done: int, recent: list[Terms]) -> dict[str, float]:
 
 
 def _check_state(model: statespace.Config, arrays: Arrays) -> None:
+    if arrays.target_present or not set(arrays.present) <= set(model.inputs):
+        raise ValueError(
+            f"present named {sorted(arrays.present)} and target_present named {sorted(arrays.target_present)}; the "
+            f"model takes masks of its inputs {list(model.inputs)}, and every target"
+        )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {name: (statespace.CODE,) for name in ("state", "pose")}, statespace.IMAGES
     expected = {
@@ -440,6 +445,12 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
             raise ValueError(f"{kind} have samples of {found}; the model takes {expected[kind]}")
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
         raise ValueError(f"empty needs `visual` and `tactile` of shape {(*size, 3)}, from dataset.empty_frame")
+    outcome = arrays.targets["outcome"]
+    if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
+        raise ValueError(
+            f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}; give whole numbers from 0 to "
+            f"{model.outcomes - 1}, or a model of more outcomes"
+        )
     _check_condition(model.condition, arrays)
 
 

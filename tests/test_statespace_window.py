@@ -1,0 +1,92 @@
+"""Windows and interpolation: against drawn rectangles, SciPy and turned pictures."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from sts_jax.statespace import window
+
+SIZE = 64
+
+
+def rectangle(centre, angle, extent, size=SIZE):
+    """A picture `(size, size, 3)` of a turned rectangle; lengths are shares of the side, the angle in radians."""
+    place = (np.arange(size) + 0.5) / size
+    x, y = np.meshgrid(place - centre[0], place - centre[1])
+    along, across = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
+    inside = (np.abs(along) < extent[0] / 2) & (np.abs(across) < extent[1] / 2)
+    return np.repeat(inside[..., None], 3, axis=-1).astype(np.float32) * 0.5
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, -1.2, np.pi / 2 - 0.1])
+def test_a_window_follows_a_rectangle(angle):
+    centre, extent = (0.45, 0.55), (0.5, 0.2)
+    found = window.locate(jnp.asarray(rectangle(centre, angle, extent)[None]))
+    np.testing.assert_allclose(found.centre[0], centre, atol=0.01)
+    line = np.array([np.cos(angle), np.sin(angle)])
+    assert abs(np.dot(found.angle[0], line)) > np.cos(0.03)  # either way along the line
+    np.testing.assert_allclose(found.side[0], window.MARGIN * extent[0], atol=2.5 / SIZE)
+
+
+def test_the_sign_of_a_change_and_its_channel_do_not_matter():
+    change = rectangle((0.4, 0.5), 0.3, (0.4, 0.2))
+    one = jnp.stack([change, -change, change * np.array([0, 0, 1], np.float32)])
+    found = window.locate(one)
+    for leaf in found:
+        np.testing.assert_array_equal(leaf, np.broadcast_to(leaf[:1], leaf.shape))
+
+
+def test_the_window_of_an_unchanged_image_is_the_whole_image():
+    faint = jnp.full((1, SIZE, SIZE, 3), 0.9 * window.THRESHOLD, jnp.float32)
+    found = window.locate(faint)
+    np.testing.assert_array_equal(found.centre, [[0.5, 0.5]])
+    np.testing.assert_array_equal(found.angle, [[1, 0]])
+    np.testing.assert_array_equal(found.side, [1])
+    np.testing.assert_allclose(window.cut(faint, found, SIZE // 2), 0.9 * window.THRESHOLD, rtol=1e-5)
+
+
+def test_a_speck_gets_the_smallest_window():
+    change = np.zeros((1, SIZE, SIZE, 3), np.float32)
+    change[0, 10, 20] = 1
+    found = window.locate(jnp.asarray(change))
+    np.testing.assert_allclose(found.centre, [[20.5 / SIZE, 10.5 / SIZE]], rtol=1e-6)
+    np.testing.assert_allclose(found.side, window.SMALLEST)
+
+
+def test_a_picture_and_the_picture_turned_have_the_same_cut():
+    change = rectangle((0.4, 0.6), -0.9, (0.5, 0.2))
+    change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # nothing symmetric
+    turned = np.rot90(change, -1).copy()  # columns to rows: by +90 degrees where rows count downwards
+    both = jnp.stack([change, turned])
+    found = window.locate(both)
+    np.testing.assert_allclose(found.angle[1], [-found.angle[0, 1], found.angle[0, 0]], atol=1e-4)
+    cut = window.cut(both, found, 16)
+    np.testing.assert_allclose(cut[1], cut[0], atol=1e-3)
+    assert np.std(cut[0]) > 0.1
+
+
+def test_a_cut_of_a_gradient_is_the_gradient_along_the_window():
+    place = (np.arange(SIZE) + 0.5) / SIZE
+    column, row = np.meshgrid(place, place)
+    image = (0.2 * column + 0.5 * row)[None, :, :, None].astype(np.float32)
+    cos, sin = np.cos(0.4), np.sin(0.4)
+    square = window.Window(jnp.array([[0.5, 0.45]]), jnp.array([[cos, sin]], jnp.float32), jnp.array([0.4]))
+    x, y = np.meshgrid(*[((np.arange(8) + 0.5) / 8 - 0.5) * 0.4] * 2)
+    expected = 0.2 * (0.5 + cos * x - sin * y) + 0.5 * (0.45 + sin * x + cos * y)
+    np.testing.assert_allclose(window.cut(jnp.asarray(image), square, 8)[0, ..., 0], expected, atol=1e-5)
+
+
+def test_samples_are_those_of_scipy_and_zero_outside():
+    rng = np.random.default_rng(0)
+    images = rng.random((2, 8, 8, 3), np.float32)
+    places = rng.uniform(-3, 10, (2, 200, 2)).astype(np.float32)
+    places[:, :4] = [[7, 7], [8, 8], [-1, 3], [1e4, -1e4]]
+    found = window.sample(jnp.asarray(images), jnp.asarray(places))
+    for image, place, own in zip(images, places, found, strict=True):
+        for channel in range(3):
+            padded = np.pad(image[..., channel], 1)
+            expected = ndimage.map_coordinates(padded, place.T[::-1] + 1, order=1, mode="constant")
+            np.testing.assert_allclose(own[:, channel], expected, atol=1e-5)
+    outside = ((places <= -1) | (places >= 8)).any(-1)
+    np.testing.assert_array_equal(np.asarray(found)[outside], 0)
