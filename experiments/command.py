@@ -41,7 +41,9 @@ class Args:
     """What the command line of an experiment says."""
 
     workdir: Folder
-    preset: Literal["smoke", "default", "paper"] = "default"
+    preset: Literal["smoke", "default", "long", "paper"] = "default"
+    # the state-space model, or the paper's models; the preset "paper" has only the latter
+    model: Literal["statespace", "paper"] | None = None
     plan: bool = False  # print seconds per stage from a short measurement, and stop
     hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
     objects: Folder | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
@@ -84,6 +86,10 @@ def configure(config: stages.Config, args: Args) -> stages.Config:
         if unknown:
             raise ValueError(f"unknown classes {', '.join(unknown)}: take some of {', '.join(sts.objects.CATEGORIES)}")
         collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
+    if args.model is not None:
+        if config.model == "paper" and args.model != "paper":
+            raise ValueError("--preset paper trains the paper's models: leave --model out, or choose another preset")
+        config = dataclasses.replace(config, model=args.model)
     return dataclasses.replace(config, collection=collection)
 
 

@@ -1,6 +1,8 @@
 """Objects laid on the tilted pad, or let go just above: from the first moment to what the sensor sees at rest.
 
     python -m experiments.inclined                    # about 15 to 20 minutes on two CPU cores
+    python -m experiments.inclined --preset long      # about 150 minutes; can be stopped and started again
+    python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
     python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours; a GPU helps
     python -m experiments.inclined --plan             # seconds per stage, measured on a little of each; then stops
@@ -12,17 +14,33 @@ the same --workdir it goes on where it stopped, and touches nothing where all is
 import dataclasses
 
 from experiments import command, stages
-from sts_jax import dataset, physics, training
+from sts_jax import dataset, physics
+from sts_jax.training import TrainConfig
 
-OBJECTS = dataset.Collection(physics.Inclined())
+COLLECTION = dataset.Collection(
+    physics.Inclined(),
+    num_objects=1000,
+    num_per_object=4,
+    num_full=20,
+    symmetries=False,
+    resolution=(128, 128),
+    shares=(0.9, 0.04, 0.06),
+    seed=2,
+)
 DEFAULT = stages.Config(
-    collection=dataclasses.replace(OBJECTS, num_objects=192, num_per_object=4, num_full=20, seed=2),
-    training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
+    collection=COLLECTION,
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=900),
+    training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
+LONG = dataclasses.replace(
+    DEFAULT,
+    collection=dataclasses.replace(COLLECTION, num_objects=5000, shares=(0.98, 0.008, 0.012)),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=14000),
+)
 SMOKE = stages.smoke(DEFAULT)
-PAPER = stages.paper(OBJECTS, num_objects=480, num_per_object=5)  # 2,400 trajectories
-PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
+PAPER = stages.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories
+PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
     command.run(PRESETS, "runs/inclined", __doc__)  # collect, train, evaluate: stages.main

@@ -1,6 +1,8 @@
 """A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to what the sensor sees at rest.
 
     python -m experiments.perturbed                    # about 15 minutes on two CPU cores
+    python -m experiments.perturbed --preset long      # about 150 minutes; can be stopped and started again
+    python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
     python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours; a GPU helps
     python -m experiments.perturbed --plan             # seconds per stage, measured on a little of each; then stops
@@ -12,17 +14,34 @@ the same --workdir it goes on where it stopped, and touches nothing where all is
 import dataclasses
 
 from experiments import command, stages
-from sts_jax import dataset, physics, training
+from sts_jax import dataset, physics
+from sts_jax.training import TrainConfig
 
-BOTTLES = dataset.Collection(physics.Perturbed(), categories=("bottle",))
+COLLECTION = dataset.Collection(
+    physics.Perturbed(),
+    categories=("bottle",),
+    num_objects=1000,
+    num_per_object=4,
+    num_full=20,
+    symmetries=False,
+    resolution=(128, 128),
+    shares=(0.9, 0.04, 0.06),
+    seed=2,
+)
 DEFAULT = stages.Config(
-    collection=dataclasses.replace(BOTTLES, num_objects=240, num_per_object=4, num_full=20, seed=2),
-    training=training.TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
+    collection=COLLECTION,
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=900),
+    training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
+LONG = dataclasses.replace(
+    DEFAULT,
+    collection=dataclasses.replace(COLLECTION, num_objects=5000, shares=(0.98, 0.008, 0.012)),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=14000),
+)
 SMOKE = stages.smoke(DEFAULT)
-PAPER = stages.paper(BOTTLES, num_objects=500, num_per_object=5)  # 2,500 trajectories
-PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
+PAPER = stages.paper(COLLECTION, num_objects=500, num_per_object=5)  # 2,500 trajectories
+PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
     command.run(PRESETS, "runs/perturbed", __doc__)  # collect, train, evaluate: stages.main

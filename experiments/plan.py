@@ -10,8 +10,7 @@ import numpy as np
 import sts_jax as sts
 from experiments import stages
 from experiments.progress import Bar
-from sts_jax import dataset, training
-from sts_jax.dataset.collect import SPLITS
+from sts_jax import dataset
 
 
 def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
@@ -45,7 +44,7 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
             spent["frames"].append(stamps["frames"] - stamps["trajectories"])
         last, seen = collection.scenario.frames, len(dataset.symmetries_of(collection))
         ends = collection.num_trajectories * 2 * seen
-        rerolled = min(config.num_rerolled, round(SPLITS["test"] * collection.num_trajectories)) * config.rerolls
+        rerolled = min(config.num_rerolled, round(collection.shares[2] * collection.num_trajectories)) * config.rerolls
         frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
         rerolling = 0.0
         for stage, total, measured in (
@@ -64,33 +63,24 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
         data = dataset.load(Path(name) / "0")
         tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",), rerolls=2)
         pairs = data.pairs(np.arange(num), symmetries=True)
-        blank = dataset.empty_frame(sensor, collection)
-        samples = round(stages.train_share(config.splits[0]) * collection.num_trajectories) * seen
-        for number, (model, modalities) in enumerate(stages.MODELS.items()):
-            arrays, preprocessing = training.moments(pairs, modalities, stages.preprocessing_of(config), blank.tactile)
-            folder = stages.model_folder(Path(name), model, tiny, "trajectory")
+        samples = round(stages.train_share(collection.shares, config.splits[0]) * collection.num_trajectories) * seen
+        for job in stages.jobs(config, sensor, pairs):
             stamps_of_steps = [time.perf_counter()]
 
-            def tick(done: int, total: int, _: dict, stamps: list[float] = stamps_of_steps, model: str = model) -> None:
+            def tick(
+                done: int, total: int, _: dict, stamps: list[float] = stamps_of_steps, name: str = job.name
+            ) -> None:
                 stamps.append(time.perf_counter())
-                bar(f"plan: train {model}", done, total)
+                bar(f"plan: train {name}", done, total)
 
-            training.train(
-                dataclasses.replace(config.training, steps=steps, log_every=1, checkpoint_every=steps),
-                training.paper_model(modalities, preprocessing),
-                arrays,
-                workdir=folder,
-                absent=preprocessing.absent,
-                targets=config.targets,
-                preprocessing=dataclasses.asdict(preprocessing),
-                progress=tick,
-            )
-            training.save_blank(folder, blank.visual, blank.tactile)
+            few = dataclasses.replace(job.schedule, steps=steps, warmup=0, log_every=1, checkpoint_every=steps)
+            folder = stages.model_folder(Path(name), job.name, tiny, "trajectory")
+            stages.run(job._replace(schedule=few), folder, config.targets, tick)
             each = float(np.median(np.diff(stamps_of_steps)[1:]))
             compiling = stamps_of_steps[1] - stamps_of_steps[0] - each
-            total = config.steps[number] if config.steps is not None else config.training.total(samples)
+            total = job.schedule.total(samples)
             note = f"{each:.3g} s a step, {compiling:.0f} s to compile"
-            lines.append((f"train {model}: {total} steps", compiling + total * each, note))
+            lines.append((f"train {job.name}: {total} steps", compiling + total * each, note))
         held_out = len(stages.rows_of(data, "trajectory")["test"])
         start = time.perf_counter()
         stages.evaluate(tiny, data, Path(name), sensor, "trajectory")

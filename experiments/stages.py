@@ -3,9 +3,9 @@
 import dataclasses
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -14,23 +14,27 @@ import sts_jax as sts
 from experiments import pictures, results
 from experiments.ceilings import Ceilings, ceilings
 from experiments.progress import Bar, say
-from sts_jax import _files, dataset, evaluation, training
-from sts_jax.dataset.collect import SPLITS
+from sts_jax import _files, dataset, evaluation, mvae, statespace, training
+from sts_jax.training import TrainConfig
 
-# The rows of the paper's Table 1, by the modalities a model has.
-MODELS: dict[str, tuple[str, ...]] = {
-    "mvae": ("visual", "tactile", "pose"),
-    "mvae-without-pose": ("visual", "tactile"),
-    "vae-visual": ("visual",),
-    "vae-tactile": ("tactile",),
+# The models of an experiment by the modalities they have, the main one first; the paper's are the rows of its Table 1.
+MODELS: dict[str, dict[str, tuple[str, ...]]] = {
+    "statespace": {"statespace": ("visual", "tactile", "pose")},
+    "paper": {
+        "mvae": ("visual", "tactile", "pose"),
+        "mvae-without-pose": ("visual", "tactile"),
+        "vae-visual": ("visual",),
+        "vae-tactile": ("tactile",),
+    },
 }
 TITLES = {
+    "statespace": "state-space model",
     "mvae": "MVAE with pose",
     "mvae-without-pose": "MVAE without pose",
     "vae-visual": "VAE visual only",
     "vae-tactile": "VAE tactile only",
 }
-# The main table shows the model with pose from the first five of these inputs that it can be given.
+# The main table shows the main model from the first five of these inputs that it can be given.
 MAIN_SUBSETS = ("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose")
 JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # whose outcome probabilities are drawn
 CHUNK = 64  # items predicted by one call
@@ -41,8 +45,10 @@ class Config:
     """One experiment: what is collected, how it is learnt, how it is judged."""
 
     collection: dataset.Collection
-    training: training.TrainConfig
-    steps: tuple[int, ...] | None = None  # gradient steps of each of MODELS; None: training.epochs decide
+    training: TrainConfig  # of the paper's models
+    state_training: TrainConfig  # of the state-space model
+    model: Literal["statespace", "paper"] = "statespace"  # which of MODELS are trained
+    steps: tuple[int, ...] | None = None  # gradient steps of each of the paper's models; None: training.epochs decide
     targets: Literal["all", "own"] = (
         "all"  # a subset of modalities is asked for "all" targets, or for its "own" (paper)
     )
@@ -52,18 +58,49 @@ class Config:
     # sides (paper). With several, each has its own models and table.
     splits: tuple[str, ...] = ("object",)
     num_shown: int = 8  # held-out trajectories in the figures
-    num_samples: int = 0  # of each prediction; 0 judges deterministic predictions
+    image_size: int = 64  # pixels, side of the images that are predicted and judged
+    num_samples: int = 16  # of each prediction of the state-space model; the paper's are judged by their mean
     rerolls: int = 16  # of each start, for the ceilings
     num_rerolled: int = 256  # held-out starts, the first ones, that the ceilings are computed on
+
+
+# The same for all scenarios; `steps` is the preset's.
+STATE_TRAINING = TrainConfig(
+    batch_size=64,
+    learning_rate=1.5e-3,
+    schedule="cosine",
+    warmup=100,
+    b2=0.99,
+    clip=200.0,
+    beta_warmup=0.2,
+)
 
 
 def smoke(default: Config) -> Config:
     """An experiment for tests: every stage, a little of each."""
     collection = dataclasses.replace(
-        default.collection, num_objects=16, num_per_object=2, num_full=4, objects_per_shard=8, symmetries=False, seed=0
+        default.collection,
+        num_objects=16,
+        num_per_object=2,
+        num_full=4,
+        objects_per_shard=8,
+        symmetries=False,
+        shares=(0.7, 0.1, 0.2),
+        seed=0,
     )
     schedule = dataclasses.replace(default.training, batch_size=8, log_every=2, checkpoint_every=4)
-    return dataclasses.replace(default, collection=collection, training=schedule, steps=(8, 8, 8, 8), rerolls=4)
+    state = dataclasses.replace(
+        default.state_training, steps=8, warmup=0, batch_size=8, log_every=2, checkpoint_every=4
+    )
+    return dataclasses.replace(
+        default,
+        collection=collection,
+        training=schedule,
+        state_training=state,
+        steps=(8, 8, 8, 8),
+        rerolls=4,
+        num_samples=4,
+    )
 
 
 def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
@@ -75,10 +112,14 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
             num_per_object=num_per_object,
             num_full=num_objects * num_per_object,  # of about 60 frames of both streams
             symmetries=False,
+            resolution=(64, 64),
             crop=True,
+            shares=(0.7, 0.1, 0.2),
             objects_per_shard=20,
         ),
-        training=training.TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
+        training=TrainConfig(epochs=200, batch_size=64, learning_rate=1e-3),
+        state_training=STATE_TRAINING,
+        model="paper",
         targets="own",
         rotation="quaternion",
         mask_blank_touch=False,
@@ -132,10 +173,15 @@ def note(path: Path, lines: Sequence[str]) -> None:
         _files.write_bytes(path, (there + new).encode())
 
 
-def train_share(split: str) -> float:
-    """Of all objects, or of all trajectories where these are held out, the share that trains."""
+def train_share(shares: Sequence[float], split: str) -> float:
+    """Of all objects, or of all trajectories where these are held out, the share that trains.
+
+    Args:
+        shares: of the collection.
+        split: "object" or "trajectory".
+    """
     # The paper has no validation part.
-    return SPLITS["train"] if split == "object" else 1 - SPLITS["test"]
+    return shares[0] if split == "object" else 1 - shares[2]
 
 
 def rows_of(data: dataset.Dataset, split: str) -> dict[str, np.ndarray]:
@@ -145,7 +191,7 @@ def rows_of(data: dataset.Dataset, split: str) -> dict[str, np.ndarray]:
     if split != "trajectory":
         raise ValueError(f"unknown split {split!r}: hold out by 'object' or by 'trajectory'.")
     order = np.random.default_rng(data.collection["seed"]).permutation(len(data.trajectory["outcome"]))
-    cut = round(train_share(split) * len(order))
+    cut = round(train_share(data.collection["shares"], split) * len(order))
     # Without a validation part the outcome's threshold is chosen on training trajectories.
     return {"train": np.sort(order[:cut]), "validation": np.sort(order[:cut]), "test": np.sort(order[cut:])}
 
@@ -155,39 +201,80 @@ def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
     return workdir / "models" / (name if split == config.splits[0] else f"{name}-by-{split}")
 
 
-def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
-    """Train the models of the paper's Table 1 on one split."""
-    pairs = data.pairs(rows_of(data, split)["train"], symmetries=True)
-    blank = dataset.empty_frame(sensor, config.collection)
-    for number, (name, modalities) in enumerate(MODELS.items()):
-        arrays, preprocessing = training.moments(pairs, modalities, preprocessing_of(config), blank.tactile)
+class Job(NamedTuple):
+    """One training of an experiment."""
+
+    name: str  # of the model
+    schedule: TrainConfig
+    model: mvae.Config | statespace.Config
+    arrays: training.Arrays
+    preprocessing: training.Preprocessing
+    empty: dict[str, np.ndarray]  # images of the untouched sensor, uint8
+
+
+def jobs(config: Config, sensor: sts.Sensor, pairs: dataset.Pairs) -> Iterator[Job]:
+    """The trainings of an experiment.
+
+    Args:
+        config: The experiment.
+        sensor: That of the collection.
+        pairs: The training trajectories, with images as they were collected.
+    """
+    preprocessing, scenario = preprocessing_of(config), config.collection.scenario
+    frame = dataset.empty_frame(sensor, config.collection)
+    empty = {"visual": frame.visual, "tactile": frame.tactile}
+    if config.model == "statespace":
+        state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty)
+        arrays = training.state_moments(pairs, state, scenario, own, empty)
+        yield Job("statespace", config.state_training, state, arrays, own, empty)
+        return
+    pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
+    for number, (name, modalities) in enumerate(MODELS["paper"].items()):
+        arrays, own = training.moments(pairs, modalities, preprocessing, empty["tactile"])
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
-        folder = model_folder(workdir, name, config, split)
-        training.save_blank(folder, blank.visual, blank.tactile)
+        yield Job(name, schedule, training.paper_model(modalities, own), arrays, own, empty)
+
+
+def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
+    """Train the models of an experiment on one split, each with a progress bar."""
+    pairs = data.pairs(rows_of(data, split)["train"], symmetries=True)
+    for job in jobs(config, sensor, pairs):
         with Bar() as bar:
 
-            def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = folder.name) -> None:
+            def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = job.name) -> None:
                 bar(f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else "")
 
-            training.train(
-                schedule,
-                training.paper_model(modalities, preprocessing),
-                arrays,
-                workdir=folder,
-                absent=preprocessing.absent,
-                targets=config.targets,
-                preprocessing=dataclasses.asdict(preprocessing),
-                progress=show,
-            )
+            run(job, model_folder(workdir, job.name, config, split), config.targets, show)
+
+
+def run(
+    job: Job,
+    folder: Path,
+    targets: Literal["all", "own"],
+    progress: Callable[[int, int, dict[str, float]], None],
+) -> None:
+    """Train one model in a folder, or go on where an earlier call on it stopped."""
+    training.save_blank(folder, job.empty["visual"], job.empty["tactile"])
+    training.train(
+        job.schedule,
+        job.model,
+        job.arrays,
+        workdir=folder,
+        absent=job.preprocessing.absent,
+        targets=targets,
+        preprocessing=dataclasses.asdict(job.preprocessing),
+        progress=progress,
+    )
 
 
 def preprocessing_of(config: Config) -> training.Preprocessing:
     """How an experiment's measurements are made ready for the networks."""
     collection = config.collection
+    small = (config.image_size, config.image_size)
     return training.Preprocessing(
-        collection.resolution,
+        collection.resolution if config.model == "statespace" else small,
         collection.crop,
         rotation=config.rotation,
         mask_blank_touch=config.mask_blank_touch,
@@ -205,7 +292,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
     table, complete = workdir / f"table{suffix}.md", workdir / f"table-full{suffix}.md"
     inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
-    for folder in (model_folder(workdir, name, config, split) for name in MODELS):
+    for folder in (model_folder(workdir, name, config, split) for name in MODELS[config.model]):
         inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
     reason = results.stale(done, inputs)
     if reason is None:
@@ -214,12 +301,15 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         say(f"evaluate: again, because {reason}")
     scenario, rows_in = config.collection.scenario, rows_of(data, split)
     train_pairs = data.pairs(rows_in["train"], symmetries=True)
-    validation, test = data.pairs(rows_in["validation"]), data.pairs(rows_in["test"])
-    blank = training.load_blank(model_folder(workdir, "mvae", config, split))[0] / 255
+    validation, given = data.pairs(rows_in["validation"]), data.pairs(rows_in["test"])
+    train_pairs, test = (dataset.reduced(pairs, config.image_size) for pairs in (train_pairs, given))
+    if config.model == "paper":
+        validation, given = dataset.reduced(validation, config.image_size), test
+    blank = training.load_blank(model_folder(workdir, main_model(config), config, split))[0] / 255
     possible = ceilings(
         workdir,
         suffix,
-        config.collection,
+        dataclasses.replace(config.collection, resolution=test.visual.shape[2:4]),
         sensor,
         data,
         test,
@@ -234,14 +324,14 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         jobs = list(queries(config, workdir, split))
         for number, (title, predictor, names) in enumerate(jobs):
             bar("evaluate", number, len(jobs), title)
-            row = predict(scenario, predictor, names, validation, test, blank, num_samples=config.num_samples)
+            row = predict(scenario, predictor, names, validation, given, blank, num_samples=number_of_samples(config))
             scores[title] = evaluation.score(row, test, outcomes=scenario.outcomes)
             shown[title] = evaluation.first(row, config.num_shown)
         summary = evaluation.summarise(scores, test)
         bar("evaluate", len(jobs), len(jobs), "intervals done")
 
     drawn = _draw(config, workdir, figures, sensor, test, scores, shown, possible)
-    logs = {TITLES[name]: _read_log(model_folder(workdir, name, config, split)) for name in MODELS}
+    logs = {TITLES[name]: _read_log(model_folder(workdir, name, config, split)) for name in MODELS[config.model]}
     drawn.append(figures / "training.png")
     evaluation.figures.training_curves(drawn[-1], logs)
     if split == config.splits[0] and len(data.full_trajectories()):
@@ -252,32 +342,47 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     notes = [
         "Gradient steps: "
         + ", ".join(f"{name} {count}" for name, count in steps.items())
-        + f"; batch {config.training.batch_size}.",
+        + f"; batch {_schedule(config).batch_size}.",
         f"Ceiling: {config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
         "values, and a model from touch can exceed it.",
     ]
-    notes += _gains(scores, test)
+    notes += _gains(TITLES[main_model(config)], scores, test)
     title = f"{workdir.name}: the last moment predicted from the first, held out by {split}"
-    text = evaluation.table(summary, title=title, rows=main_rows(list(shown)), notes=notes)
+    text = evaluation.table(summary, title=title, rows=main_rows(TITLES[main_model(config)], list(shown)), notes=notes)
     _files.write_bytes(table, text.encode())
     _files.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
     results.write(done, {"split": split, **summary}, inputs, [table, complete, *drawn])
     return text
 
 
-def main_rows(titles: Sequence[str]) -> list[str]:
-    """The rows of the main table, ten at most: the ceiling, the baselines, and the model with pose from five subsets.
+def main_model(config: Config) -> str:
+    """The name of the model that the main table and the figures show."""
+    return next(iter(MODELS[config.model]))
+
+
+def number_of_samples(config: Config) -> int:
+    """Samples of each prediction; 0 judges deterministic predictions."""
+    return config.num_samples if config.model == "statespace" else 0
+
+
+def _schedule(config: Config) -> TrainConfig:
+    return config.state_training if config.model == "statespace" else config.training
+
+
+def main_rows(model: str, titles: Sequence[str]) -> list[str]:
+    """The rows of the main table, ten at most: the ceiling, the baselines, and the main model from five subsets.
 
     Args:
+        model: Title of the main model.
         titles: Of the models' rows, in the order of `queries`.
     """
-    first = [f"{TITLES['mvae']}, from {given}" for given in MAIN_SUBSETS]
+    first = [f"{model}, from {given}" for given in MAIN_SUBSETS]
     return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in first if title in titles][:5]]
 
 
-def _gains(scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
+def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
     """A line on the share of the outcome's log loss from vision that touch removes, if both were predicted."""
-    before, after = (f"{TITLES['mvae']}, from {given}" for given in ("visual", "visual and tactile"))
+    before, after = (f"{model}, from {given}" for given in ("visual", "visual and tactile"))
     if before not in scores or after not in scores:
         return []
     found = evaluation.gain(scores[before], scores[after], test)
@@ -300,7 +405,7 @@ def _draw(
     """Draw the predictions of two queries and, of predicted distributions, their calibration and some ends."""
     drawn = []
     for given, name in (("visual", "predictions"), ("all inputs", "predictions-all")):
-        query = f"{TITLES['mvae']}, from {given}"
+        query = f"{TITLES[main_model(config)]}, from {given}"
         if query not in shown:
             continue
         title = f"{workdir.name}, from {given}: the first {config.num_shown} of the held-out list"
@@ -323,18 +428,18 @@ def _draw(
                 title=f"{workdir.name}, from {given}: ends of #{test.trajectory[item]}, the start with the widest "
                 f"spread among the first {len(spread)}",
             )
-    judged = {given: scores.get(f"{TITLES['mvae']}, from {given}") for given in JUDGED_SUBSETS}
+    judged = {given: scores.get(f"{TITLES[main_model(config)]}, from {given}") for given in JUDGED_SUBSETS}
     known = {f"from {given}": own for given, own in judged.items() if own is not None and own.confidence is not None}
     if known:
         drawn.append(figures / "calibration.png")
-        title = f"{workdir.name}: outcome probabilities of {TITLES['mvae']}"
+        title = f"{workdir.name}: outcome probabilities of {TITLES[main_model(config)]}"
         evaluation.figures.calibration(drawn[-1], known, title=title)
     return drawn
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
     """Every model with every subset of the inputs it can be given, the empty one where it can be given none."""
-    for name in MODELS:
+    for name in MODELS[config.model]:
         predictor = sts.Predictor.load(model_folder(workdir, name, config, split))
         usable = predictor.modalities
         subsets = [s for n in range(1, len(usable) + 1) for s in itertools.combinations(usable, n)]
@@ -408,13 +513,14 @@ def _asked(
         )
     else:
         out = predictor.prior((len(rows),), condition=condition)
-    visual, tactile, pose = (None if leaf is None else np.asarray(leaf) for leaf in (out.visual, out.tactile, out.pose))
+    found = (out.visual, out.tactile, out.pose, out.outcome_probability)
+    visual, tactile, pose, probability = (None if leaf is None else np.asarray(leaf) for leaf in found)
     samples = None
     if out.samples is not None:
         images = (out.samples.visual, out.samples.tactile)
         drawn, felt = (None if leaf is None else np.round(255 * np.asarray(leaf)).astype(np.uint8) for leaf in images)
         samples = evaluation.Predicted(drawn, felt, None if out.samples.pose is None else np.asarray(out.samples.pose))
-    return evaluation.Predicted(visual, tactile, pose, samples=samples)
+    return evaluation.Predicted(visual, tactile, pose, samples=samples, outcome_probability=probability)
 
 
 def _read_log(folder: Path) -> list[dict[str, float]]:

@@ -34,7 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_presets_hold_out_what_they_should_and_the_paper_s_has_its_counts(experiment, classes, trajectories):
     default, paper = experiment.DEFAULT.collection, experiment.PAPER.collection
-    for one, num, held_out in ((default, 120, 24), (paper, 300, 60)):
+    for one, num, held_out in ((default, 120, 24), (experiment.LONG.collection, 120, 24), (paper, 300, 60)):
         assert one.num_objects >= num
         assert len(dataset.split_objects(one)["test"]) >= held_out
         assert set(dataset.class_names(one)) == set(classes)
@@ -45,7 +45,7 @@ def test_presets_hold_out_what_they_should_and_the_paper_s_has_its_counts(experi
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     assert not experiment.PAPER.mask_blank_touch
-    model = training.paper_model(stages.MODELS["mvae"], stages.preprocessing_of(experiment.PAPER))
+    model = training.paper_model(stages.MODELS["paper"]["mvae"], stages.preprocessing_of(experiment.PAPER))
     assert [m.weight for m in model.modalities] == [1, 1, 1000]
     assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 
@@ -68,7 +68,7 @@ def test_flags_reach_the_experiment(tmp_path, monkeypatch, capsys):
     assert ran == [(asked, tmp_path), (freefall.SMOKE, tmp_path / "other")]
     monkeypatch.setattr("sys.argv", ["freefall", "--plan"])
     command.run(freefall.PRESETS, str(tmp_path), None)
-    assert capsys.readouterr().out == "plan of 320 objects\n"
+    assert capsys.readouterr().out == "plan of 2000 objects\n"
     assert len(ran) == 2
     assert list(tmp_path.iterdir()) == []
 

@@ -20,6 +20,8 @@ from sts_jax.dataset.collect import symmetries_of as symmetries_of
 from sts_jax.dataset.load import Dataset as Dataset
 from sts_jax.dataset.load import Pairs as Pairs
 from sts_jax.dataset.load import load as load
+from sts_jax.dataset.load import reduced as reduced
+from sts_jax.dataset.load import reduced_images as reduced_images
 from sts_jax.dataset.records import Images as Images
 from sts_jax.dataset.records import write_arrays as write_arrays
 
@@ -41,6 +43,8 @@ __all__ = [
     "load",
     "make_bodies",
     "mesh_classes",
+    "reduced",
+    "reduced_images",
     "render_uint8",
     "split_objects",
     "survey_meshes",

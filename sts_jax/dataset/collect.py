@@ -25,7 +25,7 @@ from sts_jax.sensor import Sensor
 # Frames rendered by one compiled call.
 RENDER_BATCH = 32
 SAME = 1e-5  # m, by which files of one mesh in several formats differ at most
-SPLITS = {"train": 0.7, "validation": 0.1, "test": 0.2}  # shares of the objects
+PARTS = ("train", "validation", "test")  # of the objects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +55,7 @@ class Collection:
     symmetries: bool = True  # see each trajectory in all `scenario.symmetries`, or only as it is
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
+    shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # of the objects, which train, validate and test
     objects_per_shard: int = 40
     seed: int = 0
     engine: physics.Engine = "mujoco"  # of the physics, see `physics.simulate`; trajectories differ between engines
@@ -213,15 +214,15 @@ def head(collection: Collection, count: int) -> Collection:
 
 
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
-    """Which objects train, validate and test (70/10/20): shuffled by the seed, each class spread alike."""
+    """Which objects train, validate and test: shuffled by the seed, each class spread alike."""
     rng = np.random.default_rng([collection.seed, 1])
     # A block of one object of each class after the other, the objects of a class in random order.
     names = np.array(class_names(collection))
     members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
     blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
-    cuts = np.round(np.cumsum(list(SPLITS.values()))[:-1] * collection.num_objects).astype(int)
+    cuts = np.round(np.cumsum(collection.shares)[:-1] * collection.num_objects).astype(int)
     parts = np.split(np.concatenate(blocks), cuts)
-    return {name: np.sort(part).astype(np.int64) for name, part in zip(SPLITS, parts, strict=True)}
+    return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, parts, strict=True)}
 
 
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
@@ -287,6 +288,8 @@ def collect(
     quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(collection))
     if quarter_turns and sides[0] != sides[1]:
         raise ValueError(f"symmetries=True with gel.size={sides}: only a square pad is itself after a quarter turn")
+    if min(collection.shares) < 0 or not math.isclose(sum(collection.shares), 1):
+        raise ValueError(f"shares is {collection.shares}; the shares of the objects must be at least 0 and have sum 1")
     if collection.meshes is not None and collection.num_objects != len(collection.meshes.names):
         raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)}")
     with lock(folder):

@@ -9,7 +9,7 @@ import numpy as np
 
 from sts_jax._files import TornFileError, digest, read_json, sha256
 from sts_jax.dataset import records
-from sts_jax.dataset.collect import SPLITS, shard_path, turn, turn_condition
+from sts_jax.dataset.collect import PARTS, shard_path, turn, turn_condition
 
 
 class Pairs(NamedTuple):
@@ -24,6 +24,37 @@ class Pairs(NamedTuple):
     outcome: np.ndarray  # int32 (n,), physics.Outcome
     object: np.ndarray  # int64 (n,), index of the object in the collection
     trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
+
+
+def reduced(pairs: Pairs, size: int) -> Pairs:
+    """The same moments in images of another resolution: means over blocks of pixels.
+
+    Args:
+        pairs: with square images.
+        size: pixels, the new side; that of the images must be a multiple of it.
+
+    Raises:
+        ValueError: the images are not square, or not of a multiple of the size.
+    """
+    height, width = pairs.visual.shape[2:4]
+    if height != width or size < 1 or height % size:
+        raise ValueError(f"size is {size} and the images have {height} x {width} pixels; their side must be a multiple")
+    return pairs._replace(
+        visual=_means(pairs.visual, size),
+        tactile=_means(pairs.tactile, size),
+        segmentation=_means(pairs.segmentation[..., None], size)[..., 0],
+    )
+
+
+def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
+    """Single square images `(side, side, channels)` as `reduced` makes them."""
+    return {name: _means(image, size) for name, image in images.items()}
+
+
+def _means(images: np.ndarray, size: int) -> np.ndarray:
+    factor = images.shape[-2] // size
+    blocks = images.reshape(*images.shape[:-3], size, factor, size, factor, images.shape[-1])
+    return ((blocks.sum((-4, -2), dtype=np.uint32) + factor**2 // 2) // factor**2).astype(images.dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,9 +219,9 @@ def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
     """Read which objects train, validate and test: each object in one part."""
     remedy = f"delete {path} and start the collection again, which writes it anew"
     content = _read(path, remedy)
-    if not isinstance(content, dict) or set(content) != set(SPLITS):
+    if not isinstance(content, dict) or set(content) != set(PARTS):
         parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
-        raise TornFileError(f"{path} must have the parts {', '.join(SPLITS)}, got {parts}; {remedy}.")
+        raise TornFileError(f"{path} must have the parts {', '.join(PARTS)}, got {parts}; {remedy}.")
     for name, part in content.items():
         if not isinstance(part, list) or not all(type(i) is int for i in part):
             raise TornFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}; {remedy}.")

@@ -44,7 +44,8 @@ class Config:
     window: int = 32  # pixels, side of the magnified part of an image
     encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window
     decoder: tuple[int, ...] = (128, 64, 32, 16)  # channels at 1/8, 1/4, 1/2 and all of the canvas
-    hidden: int = 384  # width of fully connected layers
+    hidden: int = 384  # width of the encoders' fully connected layers
+    transition: int = 768  # width of the transition's layers
     canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
     canvas_side: float = 0.18  # m, its side on the gel's face
     tactile_weight: float = 4.0  # of the tactile image's nats in the loss
@@ -177,12 +178,12 @@ class Transition(nnx.Module):
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.first = nnx.Linear(2 * poses.CODE + config.look + 4 + 2 * config.condition, config.hidden, rngs=rngs)
-        self.layers = nnx.List([_ResidualDense(config.hidden, rngs) for _ in range(3)])
-        self.norm = nnx.LayerNorm(config.hidden, rngs=rngs)
-        self.outcome = nnx.Linear(config.hidden, config.outcomes, kernel_init=_SMALL, rngs=rngs)
+        self.first = nnx.Linear(2 * poses.CODE + config.look + 4 + 2 * config.condition, config.transition, rngs=rngs)
+        self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(4)])
+        self.norm = nnx.LayerNorm(config.transition, rngs=rngs)
+        self.outcome = nnx.Linear(config.transition, config.outcomes, kernel_init=_SMALL, rngs=rngs)
         components = config.outcomes * config.components * (1 + 2 * poses.CODE)
-        self.mixture = nnx.Linear(config.hidden, components, kernel_init=_SMALL, rngs=rngs)
+        self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
         """The density, from the means and variances of the fused posterior.

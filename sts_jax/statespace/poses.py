@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sts_jax import geometry
+
 CODE = 12  # numbers in a pose code
 LEVEL = 0.85  # an axis whose horizontal part is longer than this gives the heading
 
@@ -30,6 +32,12 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     length = jnp.linalg.norm(chosen, axis=-1, keepdims=True)
     # A belief that knows nothing about the rotation has no heading.
     return jnp.where(length > 1e-3, chosen / jnp.maximum(length, 1e-3), jnp.array([1.0, 0.0]))
+
+
+def rigid(code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
+    """The pose codes with the nearest rotations in place of the nine numbers."""
+    quat = geometry.quat_from_matrix(code[..., 3:].reshape(*code.shape[:-1], 3, 3))
+    return jnp.concatenate([code[..., :3], geometry.quat_to_matrix(quat).reshape(*code.shape[:-1], 9)], axis=-1)
 
 
 def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:

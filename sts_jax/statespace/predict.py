@@ -18,7 +18,7 @@ class Samples(NamedTuple):
 
     belief: Gaussian  # over the present pose code and the look, (n, 12 + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
-    pose: Float[Array, "k n 12"]  # codes of final poses; the nine numbers are near a rotation
+    pose: Float[Array, "k n 12"]  # codes of final poses
     images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first poses
 
 
@@ -71,4 +71,5 @@ def _final_code(key: PRNGKeyArray, final: FinalPose) -> Float[Array, "n 12"]:
         return jnp.take_along_axis(flat, chosen[:, None, None], axis=1)[:, 0]
 
     mean, log_var = of_chosen(final.mean), of_chosen(final.log_var)
-    return poses.turn_code(final.heading, mean + jnp.exp(0.5 * log_var) * jax.random.normal(noise, mean.shape))
+    code = mean + jnp.exp(0.5 * log_var) * jax.random.normal(noise, mean.shape)
+    return poses.turn_code(final.heading, poses.rigid(code))

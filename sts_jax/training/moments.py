@@ -1,12 +1,13 @@
-"""From a collection's first and last moments to the arrays and the model of the paper's task."""
+"""From a collection's first and last moments to the arrays and the model of a training."""
 
 import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax import mvae
-from sts_jax.dataset import Pairs
+from sts_jax import mvae, optics, physics, statespace
+from sts_jax.dataset import Pairs, reduced
+from sts_jax.sensor import Sensor
 from sts_jax.training.preprocess import Preprocessing
 from sts_jax.training.train import Arrays
 
@@ -28,9 +29,7 @@ def moments(
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
-    touched = np.asarray(
-        preprocessing.touched(jnp.asarray(pairs.tactile[:, 0] / 255, jnp.float32), jnp.asarray(blank / 255))
-    )
+    touched = _touched(pairs, preprocessing, blank)
     absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
     arrays = Arrays(
         inputs={name: np.ascontiguousarray(found[name][:, 0]) for name in modalities if name not in absent},
@@ -48,3 +47,84 @@ def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mv
     images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
     kept = tuple({**images, "pose": pose}[name] for name in modalities)
     return mvae.Config(kept, condition=len(preprocessing.condition_scale))
+
+
+def state_moments(
+    pairs: Pairs,
+    model: statespace.Config,
+    scenario: physics.Scenario,
+    preprocessing: Preprocessing,
+    empty: dict[str, np.ndarray],
+) -> Arrays:
+    """The arrays that train a state-space model.
+
+    Args:
+        pairs: trajectories, from `dataset.Dataset.pairs`, with images of the model's `input_size`.
+        model: from `state_model`.
+        scenario: whose outcomes the trajectories have.
+        preprocessing: how the networks see measurements.
+        empty: the images of the untouched sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
+    """
+    code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
+    last = reduced(pairs._replace(visual=pairs.visual[:, 1:], tactile=pairs.tactile[:, 1:]), model.image_size)
+    numbers = np.array([int(outcome) for outcome in scenario.outcomes])
+    inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
+    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
+    touched = {"tactile": _touched(pairs, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
+    return Arrays(
+        inputs={name: np.ascontiguousarray(inputs[name]) for name in model.inputs},
+        targets={
+            "visual": last.visual[:, 0],
+            "tactile": last.tactile[:, 0],
+            "state": code[:, 0],
+            "pose": code[:, 1],
+            "outcome": (pairs.outcome[:, None] == numbers).argmax(1).astype(np.int32),
+        },
+        present=touched,
+        condition=condition if condition.shape[1] else None,
+        empty=empty,
+    )
+
+
+def state_model(
+    pairs: Pairs,
+    sensor: Sensor,
+    scenario: physics.Scenario,
+    preprocessing: Preprocessing,
+    empty: dict[str, np.ndarray],
+) -> tuple[statespace.Config, Preprocessing]:
+    """A state-space model of the size that the experiments use, and the preprocessing with `absent` set.
+
+    Touch is no input where no first moment has a contact. Other arguments as of `state_moments`.
+
+    Raises:
+        ValueError: the images are not square, or are cropped: the model finds the object itself.
+    """
+    height, width = preprocessing.resolution
+    if height != width or preprocessing.crop:
+        raise ValueError(
+            f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}; a state-space model takes "
+            "square images of the whole view"
+        )
+    absent = () if _touched(pairs, preprocessing, empty["tactile"]).any() else ("tactile",)
+    model = statespace.Config(
+        inputs=tuple(name for name in statespace.INPUTS if name not in absent),
+        outcomes=len(scenario.outcomes),
+        condition=len(preprocessing.condition_scale),
+        input_size=height,
+        camera_distance=float(sensor.camera.distance),
+        view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
+        position_scale=preprocessing.position_scale,
+    )
+    return model, dataclasses.replace(preprocessing, absent=absent)
+
+
+def _touched(pairs: Pairs, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
+    """Whether the first tactile image of each trajectory shows a contact; some at a time, which bounds the memory."""
+    parts = np.array_split(pairs.tactile[:, 0], max(len(pairs.tactile) // 256, 1))
+    return np.concatenate(
+        [
+            np.asarray(preprocessing.touched(jnp.asarray(part / 255, jnp.float32), jnp.asarray(blank / 255)))
+            for part in parts
+        ]
+    )
