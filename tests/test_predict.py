@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from sts_jax import mvae, training
+from sts_jax import mvae, statespace, training
 from sts_jax.predict import predict
 
 SIDE = 32
@@ -261,12 +261,12 @@ def test_a_saved_predictor_comes_back(predictor, tmp_path):
 def test_reprs_fit_on_a_line(predictor, folder):
     assert repr(predictor) == (
         f"Predictor('{folder}': takes visual, tactile, pose; predicts visual, tactile, pose; resolution=(32, 32), "
-        "crop=False, condition=0, latent=8, steps=2)"
+        "crop=False, condition=0, steps=2)"
     )
     out = predictor(pose=measurement(2)["pose"])
     assert repr(out._replace(visual=None)) == (
         "Prediction(visual=None, tactile=float32[2, 32, 32, 3], pose=float32[2, 7], mean=float32[2, 8], "
-        "log_var=float32[2, 8], samples=None)"
+        "log_var=float32[2, 8], samples=None, outcome_probability=None)"
     )
 
 
@@ -385,3 +385,116 @@ def test_a_prior_of_no_shape_is_named(predictor, shape):
 def test_floats_of_any_precision_are_taken(predictor, dtype):
     pose = np.array([0, 0, 0.5, 1, 0, 0, 0], np.float32)
     close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))
+
+
+STATE = statespace.Config(
+    inputs=statespace.INPUTS,
+    outcomes=3,
+    condition=3,
+    input_size=SIDE,
+    image_size=16,
+    look=4,
+    components=2,
+    window=8,
+    encoder=(4, 4, 4),
+    decoder=(8, 4, 4, 4),
+    hidden=16,
+    transition=16,
+    canvas=16,
+)
+
+
+def state_model(**changes):
+    """A state-space model before its training."""
+    view = {"resolution": (SIDE, SIDE), "condition_scale": (10.0, 10.0, 0.1)} | changes
+    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
+    settings = {"kind": "statespace", "model": STATE.to_json()}
+    model = training.Model(STATE, graphdef, params, 0, settings)
+    grey = np.full((SIDE, SIDE, 3), 178, np.uint8)
+    return sts.Predictor(model, training.Preprocessing(**view), (grey, grey), "new")
+
+
+@pytest.fixture(scope="module")
+def state_predictor(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("statespace") / "saved"
+    state_model().save(folder)
+    return sts.Predictor.load(folder)
+
+
+CONDITION = np.array([[4.0, -9.0, 0.07], [-4.0, 9.0, 0.12]], np.float32)
+SAMPLES = {"key": jax.random.key(0), "num_samples": 64}
+
+
+def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
+    given = measurement(2)
+    given["visual"][1, 4:12, 6:20] = 0.1
+    present = {"visual": np.array([True, True])}
+    out = state_predictor(**given, condition=CONDITION, present=present, **SAMPLES)
+    assert out.visual.shape == out.tactile.shape == (2, 16, 16, 3)
+    assert out.samples.visual.shape == out.samples.tactile.shape == (64, 2, 16, 16, 3)
+    assert out.samples.pose.shape == (64, 2, 7)
+    assert out.mean.shape == out.log_var.shape == (2, statespace.CODE + STATE.look)
+    np.testing.assert_allclose(out.outcome_probability.sum(-1), 1, rtol=1e-5)
+    assert out.outcome_probability.shape == (2, STATE.outcomes)
+    np.testing.assert_allclose(out.visual, out.samples.visual.mean(0), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(out.samples.pose[..., 3:], axis=-1), 1, rtol=1e-5)
+    assert np.std(out.samples.pose[..., :3], axis=0).min() > 0
+    # A pose that is given is believed: its expert is by far the most precise.
+    np.testing.assert_allclose(out.mean[:, :12], state_predictor.preprocessing.encode_pose(given["pose"]), atol=0.02)
+    for i in range(2):  # the pose is the most central sample
+        place, quat = np.asarray(out.samples.pose[:, i, :3]), np.asarray(out.samples.pose[:, i, 3:])
+        turned = 2 * np.arccos(np.clip(np.abs(quat @ quat.T), 0, 1))
+        apart = np.linalg.norm(place[:, None] - place, axis=-1) + 0.02 * turned
+        np.testing.assert_allclose(out.pose[i], out.samples.pose[apart.mean(0).argmin(), i], atol=1e-6)
+
+    broken = {**given, "visual": np.where(np.arange(2)[:, None, None, None] == 1, np.nan, given["visual"])}
+    masked = {"visual": np.array([True, False])}
+    nan = state_predictor(**broken, condition=CONDITION, present=masked, **SAMPLES)
+    close(nan, state_predictor(**given, condition=CONDITION, present=masked, **SAMPLES), atol=0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nan))
+    close(
+        jax.tree.map(lambda x: x[0], nan._replace(samples=None)),
+        jax.tree.map(lambda x: x[0], out._replace(samples=None)),
+    )
+
+
+def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
+    pose, condition = measurement(2)["pose"], CONDITION
+    want = state_predictor(pose=pose, condition=condition)
+    close(want, state_predictor(pose=pose, condition=condition), atol=0)  # without a key: the same at every call
+    each = jax.jit(jax.vmap(lambda pose, condition: state_predictor(pose=pose, condition=condition)))
+    out = each(pose, condition)
+    close(out.mean, want.mean)
+    close(out.outcome_probability, want.outcome_probability)
+    wrong = each(pose * np.array([[1], [np.nan]], np.float32), condition)
+    close(wrong.visual[0], out.visual[0])
+    assert np.isnan(wrong.outcome_probability).all(-1).tolist() == [False, True]
+    slope = jax.grad(lambda pose: state_predictor(pose=pose, condition=condition).pose[:, 0].sum())(jnp.asarray(pose))
+    assert np.isfinite(slope).all()
+    assert np.abs(slope).max() > 0
+
+
+def test_the_prior_of_a_state_space_model_is_standard_normal(state_predictor):
+    out = state_predictor.prior((2,), condition=CONDITION)
+    np.testing.assert_array_equal(out.mean, 0)
+    np.testing.assert_array_equal(out.log_var, 0)
+    assert np.abs(out.outcome_probability[0] - out.outcome_probability[1]).max() > 1e-4  # the condition differs
+
+
+def test_a_saved_state_space_model_comes_back(state_predictor, tmp_path):
+    state_predictor.save(tmp_path / "copy")
+    again = sts.Predictor.load(tmp_path / "copy")
+    jax.tree.map(np.testing.assert_array_equal, again.model.state, state_predictor.model.state)
+    assert repr(again) == (
+        f"Predictor('{tmp_path / 'copy'}': takes visual, tactile, pose; predicts visual, tactile, pose; "
+        "resolution=(32, 32), crop=False, condition=3, steps=0)"
+    )
+
+
+@pytest.mark.parametrize(
+    "change", [{"resolution": (16, 16)}, {"crop": True}, {"rotation": "quaternion"}, {"position_scale": 0.1}]
+)
+def test_a_state_space_model_of_another_view_is_refused(tmp_path, change):
+    state_model(**change).save(tmp_path / "model")
+    with pytest.raises(ValueError, match=f"presumes {next(iter(change))}="):
+        sts.Predictor.load(tmp_path / "model")

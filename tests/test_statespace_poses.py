@@ -9,7 +9,6 @@ from sts_jax import geometry, training
 from sts_jax.statespace import poses
 
 
-
 def encode(pose):
     return training.Preprocessing().encode_pose(jnp.asarray(pose, jnp.float32))
 

@@ -1,0 +1,339 @@
+"""The state-space model: densities against SciPy, symmetries, masks, and which target each part of the loss sees."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from scipy import special, stats
+
+from sts_jax import optics, statespace, training
+from sts_jax.evaluation import metrics
+from sts_jax.mvae import Gaussian
+from sts_jax.statespace import networks, objective, poses
+
+CONFIG = statespace.Config(
+    inputs=("visual", "tactile", "pose"),
+    outcomes=3,
+    condition=3,
+    input_size=32,
+    image_size=16,
+    look=4,
+    components=2,
+    window=8,
+    encoder=(4, 4, 4),
+    decoder=(8, 4, 4, 4),
+    hidden=16,
+    transition=16,
+    canvas=16,
+    drawn=0.5,
+    drawn_first=0.5,
+)
+NUMBER, QUARTER = 4, jnp.array([0.0, 1.0])  # samples of a batch; a turn by 90 degrees
+
+
+class Batch(NamedTuple):
+    inputs: dict
+    targets: dict
+    present: dict
+    condition: jax.Array
+
+
+def codes(rng, number):
+    quat = rng.normal(size=(number, 4))
+    pose = np.concatenate([0.02 * rng.normal(size=(number, 3)), quat / np.linalg.norm(quat, axis=1)[:, None]], axis=1)
+    return training.Preprocessing().encode_pose(jnp.asarray(pose, jnp.float32))
+
+
+@pytest.fixture(scope="module")
+def empty():
+    rng = np.random.default_rng(9)
+    return {name: jnp.asarray(rng.uniform(0.3, 0.6, (32, 32, 3)), jnp.float32) for name in statespace.IMAGES}
+
+
+@pytest.fixture(scope="module")
+def batch(empty):
+    rng = np.random.default_rng(0)
+    images = {name: np.tile(image, (NUMBER, 1, 1, 1)) for name, image in empty.items()}
+    for image in images.values():
+        for i in range(NUMBER):
+            image[i, 5 + 2 * i : 20, 8 : 16 + 3 * i] = rng.uniform(0.1, 0.9, 3)
+    small = {name: jnp.asarray(rng.uniform(0.2, 0.8, (NUMBER, 16, 16, 3)), jnp.float32) for name in images}
+    state = codes(rng, NUMBER)
+    return Batch(
+        inputs={name: jnp.asarray(image) for name, image in images.items()} | {"pose": state},
+        targets=small | {"state": state, "pose": codes(rng, NUMBER), "outcome": jnp.array([0, 1, 2, 0])},
+        present={name: jnp.ones(NUMBER, bool) for name in statespace.INPUTS},
+        condition=jnp.asarray(rng.normal(size=(NUMBER, 3)), jnp.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def model():
+    graphdef, params, _ = statespace.init(jax.random.key(0), CONFIG)
+    return graphdef, params
+
+
+@pytest.fixture(scope="module")
+def loss(model, empty):
+    """The loss, its parts and its gradient, compiled once."""
+    graphdef, params = model
+
+    @jax.jit
+    def run(batch, params=params):
+        def total(params):
+            return statespace.loss(
+                graphdef,
+                params,
+                jax.random.key(0),
+                batch.inputs,
+                batch.targets,
+                empty,
+                present=batch.present,
+                condition=batch.condition,
+            )
+
+        return jax.value_and_grad(total, has_aux=True)(params)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def sample(model, empty):
+    """Samples of a batch's first moments, compiled once; targets are no argument."""
+    run = jax.jit(functools.partial(statespace.sample, model[0], num=6, drawn=2))
+    return lambda batch: run(model[1], jax.random.key(1), batch.inputs, batch.present, empty, batch.condition)
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def changed(params, path, change):
+    """Parameters with another kernel at a path."""
+    module = nnx.to_pure_dict(params)
+    at = functools.reduce(lambda node, name: node[name], path, module)
+    at["kernel"] = change(at["kernel"])
+    new = jax.tree.map(lambda x: x, params)
+    nnx.replace_by_pure_dict(new, module)
+    return new
+
+
+def test_excess_is_that_of_the_metrics_and_zero_at_the_target():
+    rng = np.random.default_rng(0)
+    image, target = (rng.uniform(0.01, 0.99, (2, 8, 8, 3)).astype(np.float32) for _ in range(2))
+    target[0, :4] = 1  # saturated: its own entropy is 0
+    found = objective.excess(jnp.asarray(image), jnp.asarray(target))
+    np.testing.assert_allclose(found, metrics.image_error(image, target).excess, rtol=1e-4)
+    np.testing.assert_allclose(objective.excess(jnp.asarray(image), jnp.asarray(image)), 0, atol=1e-4)
+
+
+def test_reduced_images_are_means_of_blocks():
+    image = np.random.default_rng(0).random((6, 6, 3), np.float32)
+    expected = [[image[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean((0, 1)) for j in range(3)] for i in range(3)]
+    np.testing.assert_allclose(objective.reduced(jnp.asarray(image), 3), expected, rtol=1e-5)
+
+
+def test_the_log_density_is_that_of_a_mixture_in_the_turned_frame():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(-3, 3, 2)
+    final = networks.FinalPose(
+        outcome=jnp.asarray(special.log_softmax(rng.normal(size=(2, 3)), axis=1), jnp.float32),
+        weight=jnp.asarray(special.log_softmax(rng.normal(size=(2, 3, 2)), axis=2), jnp.float32),
+        mean=jnp.asarray(rng.normal(size=(2, 3, 2, 12)), jnp.float32),
+        log_var=jnp.asarray(rng.normal(size=(2, 3, 2, 12)), jnp.float32),
+        heading=jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1), jnp.float32),
+    )
+    code, outcome = codes(rng, 2), jnp.array([2, 0])
+    chance, density = objective.log_density(final, code, outcome)
+    for i, j in enumerate([2, 0]):
+        turn = np.eye(3)
+        turn[:2, :2] = [[np.cos(angle[i]), np.sin(angle[i])], [-np.sin(angle[i]), np.cos(angle[i])]]
+        position, matrix = np.asarray(code[i, :3]), np.asarray(code[i, 3:]).reshape(3, 3)
+        own = np.concatenate([turn @ position, (turn @ matrix).ravel()])
+        parts = [
+            float(final.weight[i, j, k])
+            + stats.multivariate_normal(final.mean[i, j, k], np.diag(np.exp(final.log_var[i, j, k]))).logpdf(own)
+            for k in range(2)
+        ]
+        np.testing.assert_allclose(density[i], special.logsumexp(parts), rtol=1e-4)
+        np.testing.assert_allclose(chance[i], final.outcome[i, j])
+
+
+def test_an_expert_turns_with_the_picture(model, empty):
+    """In a quarter turn pixels map to pixels. The light does not turn: weights of the absolute angle are zero here."""
+    params = changed(model[1], ("encoders", "visual", "place"), lambda kernel: kernel.at[5:].set(0))
+    place = (np.arange(32) - 15.5) / 32
+    x, y = np.meshgrid(place - 0.1, place + 0.05)
+    along, across = np.cos(-1.0) * x + np.sin(-1.0) * y, np.cos(-1.0) * y - np.sin(-1.0) * x
+    inside = (np.abs(along) < 0.3) & (np.abs(across) < 0.12)
+    change = inside[..., None] * np.random.default_rng(0).uniform(0.1, 0.5, (32, 32, 3))
+    both = jnp.asarray(np.stack([change, np.rot90(change, -1)]), jnp.float32)  # rows count downwards: columns to rows
+    expert = jax.jit(lambda params, x: nnx.merge(model[0], params).encoders["visual"](x))(params, both)
+    pose, look = jnp.split(expert.mean, [12], axis=1)
+    log_var = expert.log_var
+    np.testing.assert_allclose(pose[1], poses.turn_code(QUARTER, pose[0]), atol=1e-4)
+    np.testing.assert_allclose(jnp.exp(log_var[1, :12]), poses.turn_variance(QUARTER, jnp.exp(log_var[0, :12])), 1e-3)
+    np.testing.assert_allclose(look[1], look[0], atol=1e-4)
+    np.testing.assert_allclose(log_var[1, 12:], log_var[0, 12:], atol=1e-4)
+    assert np.abs(pose[1] - pose[0]).max() > 0.1
+
+
+def test_the_final_pose_turns_with_state_and_condition(model):
+    """Exact where the weights of the absolute heading, place and condition are zero, for doubts that are level."""
+    absolute = slice(2 * 12 + CONFIG.look, 2 * 12 + CONFIG.look + 4 + 2)
+    params = changed(model[1], ("transition", "first"), lambda kernel: kernel.at[absolute].set(0))
+    rng = np.random.default_rng(0)
+    state, end, condition = codes(rng, 3), codes(rng, 3), jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
+    outcome, look = jnp.array([0, 1, 2]), jnp.asarray(rng.normal(size=(3, 4)), jnp.float32)
+    angle = jnp.stack([jnp.cos(jnp.array([0.4, 2.0, -1.3])), jnp.sin(jnp.array([0.4, 2.0, -1.3]))], axis=1)
+
+    @jax.jit
+    def density(state, end, condition):
+        belief = Gaussian(jnp.concatenate([state, look], axis=1), jnp.full((3, 16), -3.0))
+        final = nnx.merge(model[0], params).transition(belief, condition)
+        return objective.log_density(final, end, outcome)
+
+    before = density(state, end, condition)
+    moved = jnp.concatenate([poses.turn(angle, condition[:, :2]), condition[:, 2:]], axis=1)
+    after = density(poses.turn_code(angle, state), poses.turn_code(angle, end), moved)
+    for a, b in zip(before, after, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4)
+    alone = density(poses.turn_code(angle, state), end, condition)
+    assert np.abs(alone[1] - before[1]).min() > 1
+
+
+def test_a_picture_is_where_the_camera_sees_the_object(model):
+    """The drawing of one look, displaced and turned: absolute inputs and the neighbours' weights are zero here."""
+    params = changed(model[1], ("decoder", "first"), lambda kernel: kernel.at[jnp.r_[0:2, 12:16]].set(0))
+    params = changed(params, ("decoder", "light"), jnp.zeros_like)
+    for name in ("view", "last"):
+        params = changed(
+            params, ("decoder", name), lambda kernel: jnp.zeros_like(kernel).at[1, 1].set(10 * kernel[1, 1])
+        )
+    code = codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 0.4]))
+    step = CONFIG.view / 16 * (CONFIG.camera_distance + 0.4 * CONFIG.position_scale) / CONFIG.camera_distance
+    there = code.at[:2].set(jnp.array([3 * step, -2 * step]) / CONFIG.position_scale)
+    camera = optics.Camera()
+    pixels, _ = optics.to_pixels(
+        camera, optics.full_window(camera, (16, 16)), (16, 16), jnp.stack([code, there])[:, :3] * CONFIG.position_scale
+    )
+    np.testing.assert_allclose(pixels[1] - pixels[0], [3, -2], atol=1e-4)
+    grey = {name: jnp.full((16, 16, 3), 0.4) for name in statespace.IMAGES}
+    batch = jnp.stack([code, there, poses.turn_code(QUARTER, code)])
+    look = jnp.ones((3, CONFIG.look))
+    drawn = jax.jit(lambda code: nnx.merge(model[0], params).decoder(code, look, grey))(batch)
+    for picture in drawn.values():
+        here, moved, turned = np.asarray(picture)
+        assert np.std(here[4:12, 4:12]) > 1e-3
+        np.testing.assert_allclose(moved[:-2, 3:], here[2:, :-3], atol=1e-4)
+        np.testing.assert_allclose(turned, np.rot90(here, -1), atol=1e-4)
+
+
+def test_beliefs_are_products_of_the_single_ones(sample, batch):
+    def belief(*names):
+        return sample(batch._replace(present={name: x & (name in names) for name, x in batch.present.items()})).belief
+
+    parts = [belief(name) for name in statespace.INPUTS]
+    precision = 1 + sum(np.exp(-part.log_var.astype(np.float64)) - 1 for part in parts)
+    mean = sum(part.mean * np.exp(-part.log_var.astype(np.float64)) for part in parts) / precision
+    fused = belief(*statespace.INPUTS)
+    np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-3)
+    np.testing.assert_allclose(fused.mean, mean, atol=1e-3)
+    np.testing.assert_allclose(parts[2].mean[:, :12], batch.inputs["pose"], atol=1e-3)  # a pose is exact,
+    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and without a look
+    same(belief(), jax.tree.map(jnp.zeros_like, fused))
+
+
+def test_items_that_do_not_count_may_be_nan(sample, loss, batch):
+    present = {name: x.at[i].set(False) for i, (name, x) in enumerate(batch.present.items())}
+    masked = batch._replace(present=present)
+    broken = {name: x.at[i].set(jnp.nan) for i, (name, x) in enumerate(batch.inputs.items())}
+    wrong = masked._replace(inputs=broken)
+    same(sample(wrong), sample(masked))
+    (total, terms), gradient = loss(wrong)
+    same(((total, terms), gradient), loss(masked))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((total, terms, gradient)))
+
+
+def test_an_item_does_not_depend_on_its_neighbours(sample, batch):
+    before = sample(batch)
+    after = sample(batch._replace(inputs={name: x.at[1:].set(x[1:][::-1]) for name, x in batch.inputs.items()}))
+    for a, b in zip(before.belief, after.belief, strict=True):
+        np.testing.assert_array_equal(a[0], b[0])
+        assert np.abs(a[1] - b[1]).max() > 1e-3
+    np.testing.assert_array_equal(before.pose[:, 0], after.pose[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("name", "concerned"),
+    [
+        ("visual", {"visual"}),
+        ("tactile", {"tactile"}),
+        ("state", {"state", "doubt", "first"}),
+        ("pose", {"pose", "visual", "tactile"}),
+        ("outcome", {"outcome", "pose"}),
+    ],
+)
+def test_a_target_changes_its_own_parts_of_the_loss_alone(loss, batch, name, concerned):
+    """What is believed of a first moment, the look's divergence among it, never sees the end."""
+    (_, before), _ = loss(batch)
+    target = batch.targets[name]
+    new = (target + 1) % 3 if name == "outcome" else target[::-1]
+    (_, after), _ = loss(batch._replace(targets=batch.targets | {name: new}))
+    assert {part for part in before if before[part] != after[part]} == concerned
+
+
+def test_a_few_steps_lower_the_loss(loss, batch, model):
+    params = model[1]
+    (first, _), gradient = loss(batch)
+    for _ in range(5):
+        length = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+        params = jax.tree.map(lambda p, g, length=length: p - 0.1 * g / length, params, gradient)
+        (last, _), gradient = loss(batch, params)
+    assert last < first - 10
+
+
+def test_samples_are_poses_and_pictures(sample, batch):
+    found = sample(batch)
+    assert found.pose.shape == (6, NUMBER, 12)
+    assert {name: x.shape for name, x in found.images.items()} == dict.fromkeys(
+        statespace.IMAGES, (2, NUMBER, 16, 16, 3)
+    )
+    matrix = np.asarray(found.pose[..., 3:]).reshape(-1, 3, 3)
+    np.testing.assert_allclose(matrix @ matrix.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(matrix), 1, atol=1e-5)
+    np.testing.assert_allclose(found.outcome.sum(1), 1, rtol=1e-5)
+    assert all(((x >= 0) & (x <= 1)).all() for x in found.images.values())
+    assert np.std(found.pose, axis=0).min() > 0
+
+
+def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
+    code = codes(np.random.default_rng(0), 5)
+    noisy = code.at[:, 3:].multiply(1.7) + 1e-3
+    u, _, vt = np.linalg.svd(np.asarray(noisy[:, 3:]).reshape(-1, 3, 3).astype(np.float64))
+    np.testing.assert_allclose(poses.rigid(noisy)[:, 3:].reshape(-1, 3, 3), u @ vt, atol=1e-5)
+    np.testing.assert_array_equal(poses.rigid(noisy)[:, :3], noisy[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"inputs": ("pose",)}, "the look needs an image: add 'visual' or 'tactile'"),
+        ({"inputs": ("pose", "visual")}, "in this order"),
+        ({"inputs": ()}, "at least one of"),
+        ({"window": 12}, "window is 12 pixels; it takes a multiple of 8"),
+        ({"input_size": 24}, "input_size is 24 pixels; it takes a multiple of 16"),
+        ({"encoder": (4, 4)}, "encoder has 2 and decoder 4 widths; give 3 and 4"),
+        ({"condition": 1}, "condition is 1 numbers"),
+        ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
+    ],
+)
+def test_a_wrong_configuration_is_named(change, message):
+    values = CONFIG.to_json() | change
+    with pytest.raises(ValueError, match=message):
+        statespace.Config.from_json(values)
+    assert statespace.Config.from_json(CONFIG.to_json()) == CONFIG
