@@ -21,7 +21,7 @@ _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
 _FARTHEST = 10.0  # m, of a position: beyond it the numbers are no metres
 _LARGEST_CONDITION = 100.0  # in units of the condition's usual size
 _POSES = 64  # samples of a state-space model's final pose, among which the predicted one is chosen
-_DRAWN = 16  # of them are drawn where no number of samples is asked for: the mean image is theirs
+_DRAWN = 16  # of them are drawn where `num_samples` is 0; the predicted images are their means
 _TURN = 0.02  # m, by which one radian counts in the choice of the pose
 
 
@@ -120,8 +120,8 @@ def predict_samples(
 ) -> Prediction:
     """The prediction of a state-space model: images are means over samples, the pose is the most central sample.
 
-    Without a number of samples the prediction rests on 16 with a key of its own, and is the same at every call.
-    Arguments as of `predict`; `empty` has both images of the untouched sensor.
+    Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
+    prediction. Arguments as of `predict`, but for `empty`: both images of the untouched sensor, [0, 1].
     """
     lead = shape
     for name, value in inputs.items():
@@ -154,7 +154,7 @@ def predict_samples(
 
 
 def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
-    """Of each item's poses, the one with the least mean distance from the others."""
+    """The pose of each item that has the least mean distance from the item's other poses."""
     apart = jnp.linalg.norm(poses[:, None, :, :3] - poses[None, :, :, :3], axis=-1)
     cosine = jnp.abs(jnp.einsum("inq,jnq->ijn", poses[..., 3:], poses[..., 3:]))
     turned = 2 * jnp.arccos(jnp.clip(cosine, 0, 1))
@@ -309,7 +309,7 @@ class Predictor:
                 of the pad along x and y (m/s^2) and its duration (s).
             present: By name, which items of a modality count, bool `(*n,)`; what does not count may be NaN.
             key: For `num_samples`; consumed.
-            num_samples: Draw this many predictions from the posterior besides that of its mean.
+            num_samples: Draw this many predictions. A state-space model's images are then the means over them.
 
         Raises:
             ValueError: Nothing given, a modality the model does not have or was never given in training, a wrong

@@ -4,8 +4,8 @@ The latent is the present state: a pose code (`statespace.poses`) and a look, wh
 felt of an object. An encoder per image gives a Gaussian over both. The transition maps a belief about the present
 state to a density of the final pose. The decoder draws both streams of an object of a look in a pose.
 
-Convolutions have stride 1, which XLA's CPU back end is quick at: pixels are folded into channels to make an image
-smaller, and channels unfolded into pixels to make it larger.
+Convolutions have stride 1, for which XLA's CPU backend is fast. Pixels are folded into channels to make an image
+smaller, and channels are unfolded into pixels to make it larger.
 """
 
 import dataclasses
@@ -29,7 +29,11 @@ _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last l
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The make-up of a model; plain values, so that `dataclasses.asdict` of it is JSON."""
+    """The size, view and loss weights of a model, as plain values, so that `dataclasses.asdict` of it is JSON.
+
+    Raises:
+        ValueError: a field is out of range, or two fields contradict each other.
+    """
 
     inputs: tuple[str, ...] = ("visual", "pose")  # some of INPUTS
     outcomes: int = 2  # of the scenario
@@ -106,7 +110,7 @@ class _Residual(nnx.Module):
 
 
 class _ResidualDense(nnx.Module):
-    """The same with two fully connected layers."""
+    """A residual block of two fully connected layers."""
 
     def __init__(self, width: int, rngs: nnx.Rngs) -> None:
         self.norm = nnx.LayerNorm(width, rngs=rngs)
@@ -117,12 +121,14 @@ class _ResidualDense(nnx.Module):
         return x + self.second(jax.nn.swish(self.first(jax.nn.swish(self.norm(x)))))
 
 
-def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h/2 w/2 4*c"]:
+def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h//2 w//2 4*c"]:
+    """Blocks of 2x2 pixels as channels."""
     n, h, w, c = x.shape
     return x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
 
 
-def _unfold(x: Float[Array, "n h w 4*c"]) -> Float[Array, "n 2*h 2*w c"]:
+def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
+    """The inverse of `_fold`."""
     n, h, w, c = x.shape
     return x.reshape(n, h, w, 2, 2, c // 4).transpose(0, 1, 3, 2, 4, 5).reshape(n, 2 * h, 2 * w, c // 4)
 
@@ -146,7 +152,14 @@ class Encoder(nnx.Module):
         self.last = nnx.Linear(config.hidden, 2 * (poses.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, change: Float[Array, "n size size 3"]) -> Gaussian:
-        """The expert of images less that of the empty sensor."""
+        """The expert of each image.
+
+        Args:
+            change: images less that of the empty sensor.
+
+        Returns:
+            A Gaussian over pose code and look, `(n, 12 + look)`.
+        """
         config = self.config
         place = window.locate(jax.lax.stop_gradient(change))
         x = self.first(_fold(3 * window.cut(change, place, config.window)))
@@ -189,8 +202,11 @@ class Transition(nnx.Module):
         """The density, from the means and variances of the fused posterior.
 
         Args:
-            belief: over pose code and look.
+            belief: over pose code and look, `(n, 12 + look)`.
             condition: each number divided by its usual size; None where the model has none.
+
+        Returns:
+            The density in the frame of the heading of the belief's mean.
         """
         config = self.config
         pose, look = jnp.split(belief.mean, [poses.CODE], axis=-1)
@@ -243,7 +259,16 @@ class Decoder(nnx.Module):
         look: Float[Array, "n look"],
         empty: dict[str, Float[Array, "size size 3"]],
     ) -> dict[str, Float[Array, "n size size 3"]]:
-        """Images in [0, 1]; `empty` has both of the untouched sensor."""
+        """Draw both images of each object.
+
+        Args:
+            pose: pose codes.
+            look: the looks.
+            empty: both images of the untouched sensor, of the size that is predicted.
+
+        Returns:
+            `visual` and `tactile`, in [0, 1].
+        """
         config = self.config
         heading = poses.heading(pose)
         place = jnp.concatenate([heading, pose[:, :2]], axis=-1)

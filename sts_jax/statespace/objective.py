@@ -45,10 +45,10 @@ def experts(
         empty: both images of the untouched sensor, of the same size.
     """
     # Replaced before the networks see them: neither the product of experts nor a gradient is safe from 0 * NaN.
-    change = {name: _where(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
+    change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
     found = {name: model.encoders[name](x) for name, x in change.items()}
     if "pose" in inputs:
-        code = _where(counts["pose"], inputs["pose"])
+        code = _counted(counts["pose"], inputs["pose"])
         nothing = jnp.zeros((len(code), model.config.look))
         log_var = [jnp.full_like(code, POSE_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
         found["pose"] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
@@ -61,7 +61,7 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
 
 
-def _where(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Zero in place of the items that do not count."""
     return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
 
@@ -118,13 +118,14 @@ def loss(
         targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], of the size that is predicted; the codes `state`
             and `pose` `(n, 12)` of the first and the last pose; `outcome` `(n,)`, an index into the scenario's.
         empty: as of `experts`.
-        present: which inputs count, by name; all where not given. Each sample needs one.
+        present: which inputs count, by name; all where not given. Each sample needs one. The values of those that do
+            not count, NaN among them, have no influence.
         condition: as of `Transition`.
         beta: weight of the look's divergence.
 
     Returns:
-        The loss, and its parts, means over the batch before any weight: `state` in units of the code squared, all
-        others in nats.
+        The loss, and its parts: means over the items that count, before any weight. `state` is in units of the code
+        squared, all others are in nats. `state`, `doubt` and `first` are summed over the input images.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
@@ -163,7 +164,7 @@ def loss(
     terms["first"] = jnp.zeros(())
     for name in images:
         known = counts[name][:first]
-        before = reduced(_where(known, inputs[name][:first]), config.image_size)
+        before = reduced(_counted(known, inputs[name][:first]), config.image_size)
         wrong = jnp.where(known, excess(pictures[name][last:], before), 0)
         terms["first"] += jnp.sum(wrong) / jnp.maximum(jnp.sum(known), 1)
     total = (

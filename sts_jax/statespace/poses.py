@@ -30,7 +30,7 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     axis = jnp.where(lengths[..., 0] > LEVEL, 0, jnp.where(lengths[..., 2] > LEVEL, 2, least_steep))
     chosen = jnp.take_along_axis(columns, axis[..., None, None], axis=-1)[..., 0]
     length = jnp.linalg.norm(chosen, axis=-1, keepdims=True)
-    # A belief that knows nothing about the rotation has no heading.
+    # A belief without information about the rotation has no heading.
     return jnp.where(length > 1e-3, chosen / jnp.maximum(length, 1e-3), jnp.array([1.0, 0.0]))
 
 

@@ -14,12 +14,12 @@ from sts_jax.statespace.objective import experts, fuse, reduced
 
 
 class Samples(NamedTuple):
-    """What may come of a first moment: k samples of n items."""
+    """Samples of the last moment: k final poses of each of n items, and both images of the first few of them."""
 
     belief: Gaussian  # over the present pose code and the look, (n, 12 + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
     pose: Float[Array, "k n 12"]  # codes of final poses
-    images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first poses
+    images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first `drawn` poses
 
 
 def sample(
@@ -45,7 +45,7 @@ def sample(
         empty: as of `objective.experts`.
         condition: as of `Transition`.
         num: how many final poses.
-        drawn: of how many of them both streams are drawn, each with its own look.
+        drawn: for how many of them both images are drawn, each with its own look; at most `num`.
     """
     model = nnx.merge(graphdef, params)
     belief = fuse(experts(model, inputs, present, empty), present)

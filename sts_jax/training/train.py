@@ -428,6 +428,7 @@ def _record(done: int, recent: list[Terms]) -> dict[str, float]:
 
 
 def _check_state(model: statespace.Config, arrays: Arrays) -> None:
+    """Raise a ValueError where arrays do not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
             f"present named {sorted(arrays.present)} and target_present named {sorted(arrays.target_present)}; the "
