@@ -66,10 +66,10 @@ class Config:
 
 # The same for all scenarios; `steps` is the preset's.
 STATE_TRAINING = TrainConfig(
-    batch_size=64,
+    batch_size=32,
     learning_rate=1.5e-3,
     schedule="cosine",
-    warmup=100,
+    warmup=150,
     b2=0.99,
     clip=200.0,
     beta_warmup=0.2,

@@ -1,4 +1,4 @@
-"""The whole line with the paper's models at the smallest size: from drops to a table, resumed, refused, and called as the README calls it."""
+"""The whole line with the paper's models at the smallest size: from drops to a table, resumed, refused and called."""
 
 import dataclasses
 import json
