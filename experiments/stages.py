@@ -309,7 +309,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     possible = ceilings(
         workdir,
         suffix,
-        dataclasses.replace(config.collection, resolution=test.visual.shape[2:4]),
+        config.collection,
         sensor,
         data,
         test,
