@@ -1,6 +1,7 @@
 import dataclasses
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
@@ -40,7 +41,8 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
 
     body, sensor = sense.read(config, "bottle"), sts.Sensor()
     pose, wrench, _ = sense.lay(config, sensor, body)
-    frame = sts.sense(sensor, body, pose, wrench, resolution=TINY)
+    given = (jnp.asarray(x, jnp.float32) for x in (pose, wrench))
+    frame = sts.sense(sensor, body, *given, resolution=TINY)
     picture = np.asarray(Image.open(out))
     times, step = 5, 5 * 32 + 4  # small images are shown with larger pixels
     assert picture.shape == (2 * (24 * times + sense.HEAD), 3 * step, 3)
