@@ -237,9 +237,9 @@ def test_beliefs_are_products_of_the_single_ones(sample, batch):
     def belief(*names):
         return sample(batch._replace(present={name: x & (name in names) for name, x in batch.present.items()})).belief
 
-    parts = [belief(name) for name in statespace.INPUTS]
-    precision = 1 + sum(np.exp(-part.log_var.astype(np.float64)) - 1 for part in parts)
-    mean = sum(part.mean * np.exp(-part.log_var.astype(np.float64)) for part in parts) / precision
+    parts = [Gaussian(*(np.asarray(x, np.float64) for x in belief(name))) for name in statespace.INPUTS]
+    precision = 1 + sum(np.exp(-part.log_var) - 1 for part in parts)
+    mean = sum(part.mean * np.exp(-part.log_var) for part in parts) / precision
     fused = belief(*statespace.INPUTS)
     np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-3)
     np.testing.assert_allclose(fused.mean, mean, atol=1e-3)
