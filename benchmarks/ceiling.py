@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import sts_jax as sts
 from experiments import ceilings, freefall, inclined, perturbed, stages
-from sts_jax import _files, evaluation
+from sts_jax import _files, dataset, evaluation
 
 CONFIGS = {"freefall": freefall.DEFAULT, "perturbed": perturbed.DEFAULT, "inclined": inclined.DEFAULT}
 
@@ -58,7 +58,8 @@ def main(name: str, times: int, workdir: Path | None) -> None:
         stages.claim(config, folder)
         data = stages.collect(config, folder, sensor)
         rows = stages.rows_of(data, config.splits[0])
-        train, test = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
+        pairs = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
+    train, test = (dataset.reduced(part, config.image_size) for part in pairs)
     with tqdm(total=times * len(test.object), desc="re-roll", unit="trajectories") as bar:
         made = ceilings.reroll(config.collection, sensor, test, times, lambda done: bar.update(done - bar.n))
     outcomes = config.collection.scenario.outcomes

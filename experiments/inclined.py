@@ -29,14 +29,14 @@ COLLECTION = dataset.Collection(
 )
 DEFAULT = stages.Config(
     collection=COLLECTION,
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=900),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=1700),
     training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
 LONG = dataclasses.replace(
     DEFAULT,
     collection=dataclasses.replace(COLLECTION, num_objects=5000, shares=(0.98, 0.008, 0.012)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=14000),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=26000),
 )
 SMOKE = stages.smoke(DEFAULT)
 PAPER = stages.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories

@@ -66,10 +66,10 @@ class Config:
 
 # The same for all scenarios; `steps` is the preset's.
 STATE_TRAINING = TrainConfig(
-    batch_size=64,
+    batch_size=32,
     learning_rate=1.5e-3,
     schedule="cosine",
-    warmup=100,
+    warmup=150,
     b2=0.99,
     clip=200.0,
     beta_warmup=0.2,
@@ -309,7 +309,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     possible = ceilings(
         workdir,
         suffix,
-        dataclasses.replace(config.collection, resolution=test.visual.shape[2:4]),
+        config.collection,
         sensor,
         data,
         test,

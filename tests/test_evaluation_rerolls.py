@@ -12,7 +12,7 @@ from sts_jax.evaluation import rerolls
 from sts_jax.physics.simulate import _draw, _shapes
 
 TIMES, SIDE = 3, 4
-COLLECTION = dataset.Collection(physics.Freefall(), num_objects=2, num_per_object=2, resolution=(SIDE, SIDE))
+COLLECTION = dataset.Collection(physics.Freefall(), num_objects=2, num_per_object=2, resolution=(2 * SIDE, 2 * SIDE))
 OFF_FIRST = np.array([0.0, 1.0, -1.0])  # m, added to z in the re-rolls of an item
 
 
@@ -28,10 +28,13 @@ def starts():
 
 @pytest.fixture
 def engine(monkeypatch):
-    """What starts `simulate` draws; the ends lie above or below them. Pictures show which object is drawn, and z."""
+    """What starts `simulate` draws; the ends lie above or below them. Pictures show which object is drawn, and z.
+
+    They are twice as large as those of the items.
+    """
     seen = {}
 
-    def simulate(key, bodies, sensor, scenario, num, *, progress=False):
+    def simulate(key, bodies, sensor, scenario, num, *, engine, progress):
         which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
         pad = tuple(float(side) for side in sensor.gel.size)
         start, hidden = _draw(key, which, nth, 0 * nth, _shapes(bodies, scenario), scenario=scenario, pad=pad)
@@ -44,7 +47,7 @@ def engine(monkeypatch):
 
     def render(sensor, body, pose, wrench, *, resolution, crop):
         grey = jnp.round(100 + 50 * pose[:, 2] + 10 * (body.shell_mass == seen["bodies"][0].shell_mass))
-        image = jnp.broadcast_to(grey[:, None, None, None], (len(pose), SIDE, SIDE, 3)).astype(jnp.uint8)
+        image = jnp.broadcast_to(grey[:, None, None, None], (len(pose), *resolution, 3)).astype(jnp.uint8)
         return image, image, image[..., 0] > 0
 
     monkeypatch.setattr(rerolls.physics, "simulate", simulate)
@@ -64,6 +67,7 @@ def test_every_re_roll_begins_at_its_items_start_and_ends_are_samples(engine):
     assert (np.asarray(engine["held"]) == COLLECTION.scenario.steps).all()
     assert len(np.unique(np.asarray(engine["hidden"].fill))) == 3 * TIMES
     # Each item is drawn with its own object: the first body of the engine is object 1.
+    assert found.samples.tactile.shape == (TIMES, 3, SIDE, SIDE, 3)
     ends = 100 + 50 * found.samples.pose[..., 2]
     np.testing.assert_allclose(found.samples.visual[..., 0, 0, 0], ends + np.array([10, 10, 0]), atol=0.51)
     np.testing.assert_allclose(found.visual, found.samples.visual.mean(0) / 255, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""The whole line with the paper's models at the smallest size: from drops to a table, resumed, refused, and called as the README calls it."""
+"""The whole line with the paper's models at the smallest size: from drops to a table, resumed, refused and called."""
 
 import dataclasses
 import json
@@ -142,9 +142,7 @@ def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
     rests = np.flatnonzero((traj.outcome == physics.Outcome.RESTS) & traj.settled)
     assert len(rests) > 0
     one = int(rests[0])
-    frame = jax.jit(lambda p, w: sts.sense(sensor, body, p, w, resolution=(200, 200)))(
-        traj.pose[one, -1], traj.wrench[one, -1]
-    )
+    frame = sts.sense(sensor, body, traj.pose[one, -1], traj.wrench[one, -1], resolution=(200, 200))
     empty = sts.sense(sensor, body, jnp.array([0.0, 0, -1, 1, 0, 0, 0]), jnp.zeros(6), resolution=(200, 200))
     seen = np.asarray(frame.segmentation)
     assert seen.mean() > 0.01

@@ -1,7 +1,6 @@
 import dataclasses
 import re
 
-import jax
 import numpy as np
 import pytest
 import trimesh
@@ -41,9 +40,7 @@ def test_all_streams_of_a_class_in_one_picture(tmp_path, capsys):
 
     body, sensor = sense.read(config, "bottle"), sts.Sensor()
     pose, wrench, _ = sense.lay(config, sensor, body)
-    frame = jax.jit(sts.sense, static_argnames="resolution")(
-        sensor, body, pose.astype(np.float32), wrench.astype(np.float32), resolution=TINY
-    )
+    frame = sts.sense(sensor, body, pose, wrench, resolution=TINY)
     picture = np.asarray(Image.open(out))
     times, step = 5, 5 * 32 + 4  # small images are shown with larger pixels
     assert picture.shape == (2 * (24 * times + sense.HEAD), 3 * step, 3)

@@ -12,6 +12,7 @@ from sts_jax.physics import contact, roll, scene
 PAD = (0.15, 0.15)
 HALF = jnp.array([0.075, 0.075])
 COLLIDE = jax.jit(jax.vmap(contact.collide, in_axes=(None, 0, None)))
+CONTACTS = jax.jit(roll._contacts)
 
 
 def points(name: str) -> np.ndarray:
@@ -138,12 +139,12 @@ def test_parts_leave_free_what_their_common_hull_fills() -> None:
     _, model, _ = scene.template(PAD, physics.Contact(), 0.02)
     pose = jnp.array([0, 0.08, 0.0249, 1, 0, 0, 0])
     arch, filled = (jax.tree.map(jnp.asarray, contact.hull(x)) for x in (parts, parts.reshape(1, -1, 3)))
-    found = roll._contacts(model, arch, pose)
+    found = CONTACTS(model, arch, pose)
     assert np.all(found.dist[8:] > 0)
     assert np.sum(found.dist[:8] < 0) == 4  # the post that stands on the pad; the other is beyond it
     np.testing.assert_allclose(found.dist[:8].min(), -1e-4, atol=1e-6)
     assert np.all(found.pos[:8][np.asarray(found.dist[:8] < 0), 1] < 0.066)
-    assert np.min(roll._contacts(model, filled, pose).dist[8:]) < -0.004
+    assert np.min(CONTACTS(model, filled, pose).dist[8:]) < -0.004
 
 
 @pytest.mark.slow
@@ -162,7 +163,7 @@ def test_what_lies_across_the_wall_is_held_by_it_as_in_c(lean: float) -> None:
     pose = np.array([0.01, 0.082, low, *quat])
     dist, normal, pos = in_c(model, data, pose)
     _, ours, _ = scene.template(PAD, physics.Contact(), 0.02)
-    found = roll._contacts(ours, jax.tree.map(jnp.asarray, contact.hull(rod)), jnp.asarray(pose, jnp.float32))
+    found = CONTACTS(ours, jax.tree.map(jnp.asarray, contact.hull(rod)), jnp.asarray(pose, jnp.float32))
     deepest = int(jnp.argmin(found.dist))
     np.testing.assert_allclose(found.dist[deepest], dist, atol=2e-6)
     np.testing.assert_allclose(abs(found.frame[deepest, 0] @ normal), 1, atol=1e-3)

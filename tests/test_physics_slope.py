@@ -201,7 +201,7 @@ def test_pad_and_wall_together_are_all_that_pushes() -> None:
     own = like.tree_replace(jax.tree.map(jnp.asarray, scene.drawn(model, like)))
     hull = contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None])
     data = data.replace(qpos=jnp.array([0, 0.0552, 0.0098, 1, 0, 0, 0]))
-    contacts = roll._contacts(own, jax.tree.map(jnp.asarray, hull), data.qpos)
+    contacts = jax.jit(roll._contacts)(own, jax.tree.map(jnp.asarray, hull), data.qpos)
     new = jax.jit(lambda data: scene.step(own, data, contacts))(data)
     pad, wall = scene.push(new, slice(0, 8)), scene.push(new, slice(8, 12))
     np.testing.assert_allclose(pad + wall, new.qfrc_constraint, rtol=1e-4, atol=1e-5)

@@ -1,6 +1,7 @@
 """The gel's equilibrium against a float64 solver, closed forms and its own balance."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -119,13 +120,17 @@ def test_a_ball_sinks_as_the_springs_closed_form_says(radius, force):
     assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
 
 
+# Heights and wrench are arguments: one program serves all cases.
+SEVERAL = jax.jit(jax.vmap(lambda height, wrench, load: tactile.settle(GEL, height, wrench * load), (None, None, 0)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_more_load_never_makes_the_imprint_smaller(name):
     make, wrench = CASES[name]
     height = jnp.asarray(make(*grid()), jnp.float32)
     loads = jnp.linspace(0, 6, 25)[1:]
-    several = jax.jit(jax.vmap(lambda load: tactile.settle(GEL, height, wrench * load)))(loads)
+    several = SEVERAL(height, wrench, loads)
     cells = np.asarray(several.pressure > 0).sum((1, 2))
     depth = np.asarray(several.pressure).max((1, 2))
     assert np.all(np.diff(cells) >= 0)
@@ -274,24 +279,25 @@ def test_odd_things_under_any_load_are_balanced_or_flagged():
     assert balanced < 250
 
 
+@jax.jit
+@functools.partial(jax.value_and_grad, argnums=(1, 2, 3))
+def measured(height, wrench, stiffness, lift):
+    gel = dataclasses.replace(GEL, stiffness=stiffness)
+    got = tactile.settle(gel, height + lift, wrench)
+    return got.sink + 0.03 * got.turn[0] - 0.05 * got.turn[1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball", "box pushed off its middle", "box pushed near its edge"])
 def test_gradients_are_the_finite_differences(name):
     make, wrench = CASES[name]
     height = jnp.asarray(make(*grid()), jnp.float32)
-
-    def measure(wrench, stiffness, lift):
-        gel = dataclasses.replace(GEL, stiffness=stiffness)
-        got = tactile.settle(gel, height + lift, wrench)
-        return got.sink + 0.03 * got.turn[0] - 0.05 * got.turn[1]
-
     arguments = (wrench, jnp.float32(2e6), jnp.float32(0))
-    measure = jax.jit(measure)
-    gradient = jax.grad(measure, argnums=(0, 1, 2))(*arguments)
+    gradient = measured(height, *arguments)[1]
     change = (jnp.array([0.0, 0.0, 0.02, 1e-4, 1e-4, 0.0]), jnp.float32(4e4), jnp.float32(2e-5))
     for k in range(3):
         moved = [[a + s * change[k] if i == k else a for i, a in enumerate(arguments)] for s in (1, -1)]
-        numeric = (measure(*moved[0]) - measure(*moved[1])) / 2
+        numeric = (measured(height, *moved[0])[0] - measured(height, *moved[1])[0]) / 2
         assert float(jnp.sum(gradient[k] * change[k])) == pytest.approx(float(numeric), rel=0.05, abs=1e-8)
 
 

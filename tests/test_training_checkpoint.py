@@ -285,22 +285,31 @@ def test_blanks_of_another_kind_are_named(tmp_path):
             training.load_blank(tmp_path)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("line", [b"\xff\xfe", b"[]", b"{}", b'{"step": "one"}', b'{"step"', b"7"])
-def test_a_damaged_record_is_named_and_a_torn_last_one_is_dropped(tmp_path, finished, line):
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A training that was killed after its second record."""
+    workdir = tmp_path_factory.mktemp("stopped")
+
     def stop(done, total, record):
         if done == 2:
             raise Killed
 
     with pytest.raises(Killed):
-        train(tmp_path, progress=stop)
-    log = tmp_path / "metrics.jsonl"
+        train(workdir, progress=stop)
+    return workdir
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", [b"\xff\xfe", b"[]", b"{}", b'{"step": "one"}', b'{"step"', b"7"])
+def test_a_damaged_record_is_named_and_a_torn_last_one_is_dropped(tmp_path, finished, stopped, line):
+    workdir = shutil.copytree(stopped, tmp_path / "run")
+    log = workdir / "metrics.jsonl"
     first, second = log.read_bytes().splitlines()
     log.write_bytes(b"\n".join([first, line, second, b""]))
     with pytest.raises(_files.TornFileError, match=r"metrics\.jsonl, line 2, is damaged.*delete this line"):
-        train(tmp_path)
+        train(workdir)
     log.write_bytes(b"\n".join([first, second, line]))
-    train(tmp_path)
+    train(workdir)
     assert log.read_bytes() == (finished[0] / "metrics.jsonl").read_bytes()
 
 

@@ -40,7 +40,7 @@ def ceiling(
     Args:
         collection: Whose objects and scenario the items have.
         sensor: What sees them.
-        test: The items.
+        test: The items. Ends are drawn as the collection draws them, and `dataset.reduced` where the items are.
         times: Re-rolls of each.
         key: Of the re-rolls.
         progress: Called with the number of simulated re-rolls.
@@ -59,13 +59,15 @@ def ceiling(
     owners, place = np.unique(test.object, return_inverse=True)
     bodies = dataset.make_bodies(collection, owners)
     again = _replayed(scenario, test.pose[:, 0], test.condition, times, key)
-    traj = physics.simulate(key, [bodies[i] for i in place], sensor, again, times, progress=progress or False)
+    traj = physics.simulate(
+        key, [bodies[i] for i in place], sensor, again, times, engine=collection.engine, progress=progress or False
+    )
     first = np.asarray(traj.pose[:, 0]).reshape(len(test.object), times, 7)
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
         raise RuntimeError(f"a re-roll began {off:.3g} from its item's first pose: simulate draws its starts otherwise")
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
-    drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench)
+    drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])
 
     def samples(leaf: np.ndarray) -> np.ndarray:
         return np.moveaxis(leaf.reshape(len(test.object), times, *leaf.shape[1:]), 1, 0)
@@ -121,8 +123,13 @@ def _drawn(
     owner: np.ndarray,
     pose: np.ndarray,
     wrench: np.ndarray,
+    size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both streams of all ends, `uint8`, object by object in calls of equal size; one thread a core."""
+    """Both streams of all ends, `uint8`, object by object in calls of equal size; one thread a core.
+
+    Their height is that of the collection, or `size` if it is another one.
+    """
+    same = size == collection.resolution[0]
     jobs = [
         np.flatnonzero(owner == index)[start : start + RENDER_BATCH]
         for index in range(len(bodies))
@@ -139,10 +146,14 @@ def _drawn(
             resolution=collection.resolution,
             crop=collection.crop,
         )
-        visual, tactile = (np.asarray(image)[: len(rows)] for image in images[:2])
-        return visual, tactile
+        drawn = {
+            name: np.asarray(image)[: len(rows)] for name, image in zip(("visual", "tactile"), images, strict=False)
+        }
+        drawn = drawn if same else dataset.reduced_images(drawn, size)
+        return drawn["visual"], drawn["tactile"]
 
-    out = tuple(np.empty((len(owner), *collection.resolution, 3), np.uint8) for _ in range(2))
+    shape = collection.resolution if same else (size, size)
+    out = tuple(np.empty((len(owner), *shape, 3), np.uint8) for _ in range(2))
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         for rows, images in zip(jobs, pool.map(work, jobs), strict=True):
             for whole, part in zip(out, images, strict=True):

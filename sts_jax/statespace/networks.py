@@ -49,7 +49,7 @@ class Config:
     encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window
     decoder: tuple[int, ...] = (128, 64, 32, 16)  # channels at 1/8, 1/4, 1/2 and all of the canvas
     hidden: int = 384  # width of the encoders' fully connected layers
-    transition: int = 768  # width of the transition's layers
+    transition: int = 512  # width of the transition's layers
     canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
     canvas_side: float = 0.18  # m, its side on the gel's face
     tactile_weight: float = 4.0  # of the tactile image's nats in the loss
@@ -58,8 +58,8 @@ class Config:
     outcome_weight: float = 8.0  # of the outcome's nats
     first_weight: float = 0.5  # of the nats of the first moment's images
     look_weight: float = 0.3  # of the look's divergence: below 1, samples are sharper
-    drawn: float = 0.375  # share of a batch whose last moment is drawn; every sample trains the rest
-    drawn_first: float = 0.09375  # share whose first moment is drawn
+    drawn: float = 0.4375  # share of a batch whose last moment is drawn; every sample trains the rest
+    drawn_first: float = 0.125  # share whose first moment is drawn
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
@@ -192,7 +192,7 @@ class Transition(nnx.Module):
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
         self.first = nnx.Linear(2 * poses.CODE + config.look + 4 + 2 * config.condition, config.transition, rngs=rngs)
-        self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(4)])
+        self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(3)])
         self.norm = nnx.LayerNorm(config.transition, rngs=rngs)
         self.outcome = nnx.Linear(config.transition, config.outcomes, kernel_init=_SMALL, rngs=rngs)
         components = config.outcomes * config.components * (1 + 2 * poses.CODE)
