@@ -237,9 +237,9 @@ def test_beliefs_are_products_of_the_single_ones(sample, batch):
     def belief(*names):
         return sample(batch._replace(present={name: x & (name in names) for name, x in batch.present.items()})).belief
 
-    parts = [belief(name) for name in statespace.INPUTS]
-    precision = 1 + sum(np.exp(-part.log_var.astype(np.float64)) - 1 for part in parts)
-    mean = sum(part.mean * np.exp(-part.log_var.astype(np.float64)) for part in parts) / precision
+    parts = [Gaussian(*(np.asarray(x, np.float64) for x in belief(name))) for name in statespace.INPUTS]
+    precision = 1 + sum(np.exp(-part.log_var) - 1 for part in parts)
+    mean = sum(part.mean * np.exp(-part.log_var) for part in parts) / precision
     fused = belief(*statespace.INPUTS)
     np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-3)
     np.testing.assert_allclose(fused.mean, mean, atol=1e-3)
@@ -288,11 +288,12 @@ def test_a_target_changes_its_own_parts_of_the_loss_alone(loss, batch, name, con
 
 
 def test_a_few_steps_lower_the_loss(loss, batch, model):
-    params = model[1]
+    params = jax.tree.map(np.asarray, model[1])  # in NumPy there is nothing to compile
     (first, _), gradient = loss(batch)
     for _ in range(5):
-        length = jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
-        params = jax.tree.map(lambda p, g, length=length: p - 0.1 * g / length, params, gradient)
+        gradient = jax.tree.map(np.asarray, gradient)
+        step = np.float32(0.1) / np.sqrt(sum(np.sum(leaf**2) for leaf in jax.tree.leaves(gradient)))
+        params = jax.tree.map(lambda p, g, step=step: p - step * g, params, gradient)
         (last, _), gradient = loss(batch, params)
     assert last < first - 10
 

@@ -289,9 +289,7 @@ class Decoder(nnx.Module):
         return {"visual": visual, "tactile": tactile}
 
 
-def _on_canvas(
-    config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"]
-) -> Float[Array, "n size*size 2"]:
+def _on_canvas(config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"]) -> Float[Array, "n m 2"]:
     """Where on the canvas each pixel of the view lies: column and row, whole numbers at pixel centres."""
     position = pose[:, :3] * config.position_scale
     depth = jnp.maximum(config.camera_distance + position[:, 2], _NEAREST * config.camera_distance)
