@@ -440,7 +440,8 @@ def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
     np.testing.assert_allclose(np.linalg.norm(out.samples.pose[..., 3:], axis=-1), 1, rtol=1e-5)
     assert np.std(out.samples.pose[..., :3], axis=0).min() > 0
     # A pose that is given is believed: its expert is by far the most precise.
-    np.testing.assert_allclose(out.mean[:, :12], state_predictor.preprocessing.encode_pose(given["pose"]), atol=0.02)
+    code = state_predictor.preprocessing.encode_pose(jnp.asarray(given["pose"]))
+    np.testing.assert_allclose(out.mean[:, :12], code, atol=0.02)
     for i in range(2):  # the pose is the most central sample
         place, quat = np.asarray(out.samples.pose[:, i, :3]), np.asarray(out.samples.pose[:, i, 3:])
         turned = 2 * np.arccos(np.clip(np.abs(quat @ quat.T), 0, 1))
