@@ -64,10 +64,18 @@ def state_moments(
         scenario: whose outcomes the trajectories have.
         preprocessing: how the networks see measurements.
         empty: the images of the untouched sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
+
+    Raises:
+        ValueError: a trajectory has an outcome that the scenario does not have.
     """
+    numbers = np.array([int(outcome) for outcome in scenario.outcomes])
+    if not np.isin(pairs.outcome, numbers).all():
+        raise ValueError(
+            f"pairs have the outcomes {np.unique(pairs.outcome).tolist()}; those of {type(scenario).__name__} are "
+            f"{numbers.tolist()}: give the scenario of the collection"
+        )
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     last = reduced(pairs._replace(visual=pairs.visual[:, 1:], tactile=pairs.tactile[:, 1:]), model.image_size)
-    numbers = np.array([int(outcome) for outcome in scenario.outcomes])
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
     touched = {"tactile": _touched(pairs, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
