@@ -433,7 +433,7 @@ def test_decimation_names_its_package(tmp_path, monkeypatch):
         ({"largest": 0.2}, r"the pad is 0\.15 m"),
         ({"density": 0.0}, "density must be a positive"),
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
-        ({"faces": 2}, "faces must be at least 4"),
+        ({"faces": 2}, "faces must be a whole number, at least 4"),
         ({"up": (0.0, 0.0, 0.0)}, "not all zero"),
         ({"up": (0.0, 1.0, 0.0)}, "lie in one line"),
         ({"up": "z", "front": (0.0, -1.0, 0.0)}, "three numbers where front is given"),

@@ -85,7 +85,9 @@ def test_gravity_holds_the_whole_impulse_and_ends() -> None:
     np.testing.assert_array_equal(gravity[32 + 76 :, :2], 0)
 
 
-def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
+def test_a_jerk_as_gravity_is_a_pad_that_moves(
+    bottles: list[objects.Body], shaken: physics.Trajectory, engine: physics.Engine
+) -> None:
     # In C MuJoCo, every vertex of the hull a contact: the object on a driven pad, and on a fixed one under the
     # scenario's gravity; and ours at every frame. Up to the end of the jerk or the first loss of contact, whatever
     # rocks; after that small things decide. Frequencies of outcomes are in test_benchmarks_invariance.
@@ -117,7 +119,8 @@ def test_a_jerk_as_gravity_is_a_pad_that_moves(bottles: list[objects.Body], shak
                 ours.append(np.linalg.norm(place - shaken.pose[row, step // SCENARIO.steps, :3]))
     assert len(ours) >= 2 * 2 * NUM
     assert np.max(apart) < 2e-4
-    assert np.quantile(ours, 0.9) < 1e-4
+    # In C the mesh pushes too, from .1 mm on, where the truth has it at 1 mm.
+    assert np.quantile(ours, 0.9) < (1e-4 if engine == "mjx" else 2e-4)
     assert np.max(ours) < 3e-4  # while it moves by centimetres
 
 

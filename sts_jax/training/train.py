@@ -106,8 +106,12 @@ class Model(NamedTuple):
     settings: dict[str, Any]  # config.json: `model`, `training`, `preprocessing`, ...
 
     def __repr__(self) -> str:
-        numbers = sum(x.size for x in jax.tree.leaves(self.state))
-        return f"Model({self.config!r}, {numbers:,} numbers, step={self.step})"
+        config, numbers = self.config, sum(x.size for x in jax.tree.leaves(self.state))
+        if isinstance(config, mvae.Config):
+            made = ", ".join(f"{m.name} {m.kind} {m.shape}" for m in config.modalities) + f"; latent={config.latent}"
+        else:
+            made = f"{', '.join(config.inputs)}; look={config.look}, outcomes={config.outcomes}"
+        return f"Model({made}, condition={config.condition}, {numbers:,} numbers, step={self.step})"
 
 
 class Learner(NamedTuple):
@@ -184,7 +188,7 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
     return adams if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adams)
 
 
-def _kinds(params: nnx.State) -> Any:
+def _kinds(params: Any) -> Any:
     """`encoders` for the encoders of an `mvae` model, `others` for all other parameters."""
     paper = "decoders" in params
     return jax.tree_util.tree_map_with_path(
