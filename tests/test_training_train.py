@@ -250,6 +250,7 @@ def falls(samples=4):
     )
 
 
+@pytest.mark.slow
 def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
     whole = training.train(STATE_CONFIG, STATE, falls(), workdir=tmp_path / "whole")
     with pytest.raises(Killed):
