@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -121,15 +121,11 @@ def predict_samples(
     """The prediction of a state-space model: images are means over samples, the pose is the most central sample.
 
     Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
-    prediction. Arguments as of `predict`, but for `empty`: both images of the untouched sensor, [0, 1].
+    prediction. Arguments as of `predict`, but for `empty`, both images of the untouched sensor, [0, 1]; `inputs` has
+    all that the model takes (see `_completed`), and `shape` their leading axes.
     """
     lead = shape
-    for name, value in inputs.items():
-        lead = value.shape[: -1 if name == "pose" else -3]
     flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
-    if not flat:  # the belief is then the prior
-        flat = {"pose": jnp.zeros((math.prod(shape), statespace.CODE))}
-        counts = {"pose": jnp.zeros(math.prod(shape), bool)}
     if condition is not None:
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
     drawn = num_samples or _DRAWN
@@ -160,6 +156,27 @@ def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
     turned = 2 * jnp.arccos(jnp.clip(cosine, 0, 1))
     best = jnp.argmin(jnp.mean(apart + _TURN * turned, axis=1), axis=0)
     return jnp.take_along_axis(poses, best[None, :, None], axis=0)[0]
+
+
+def _completed(
+    names: tuple[str, ...],
+    resolution: tuple[int, int],
+    inputs: dict[str, Any],
+    present: dict[str, Any],
+    lead: tuple[int, ...],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """All inputs of a model and their masks, so that one compiled program serves every subset.
+
+    What is not given counts for no item.
+    """
+    lying = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
+    nothing = {
+        name: np.broadcast_to(lying, (*lead, 7)) if name == "pose" else np.zeros((*lead, *resolution, 3), np.float32)
+        for name in names
+        if name not in inputs
+    }
+    counts = {name: np.full(lead, name in inputs) for name in names} | present
+    return inputs | nothing, counts
 
 
 def _flat(
@@ -205,16 +222,11 @@ class Predictor:
         self.preprocessing = preprocessing
         self.name = name
         self._images = blank
-        visual, tactile = (jnp.asarray(image.astype(np.float32) / 255) for image in blank)
-        if isinstance(model.config, mvae.Config):
-            self._names, self._inputs = model.config.names, model.config.names
-            self._predict: Callable[..., Prediction] = functools.partial(
-                predict, model.graphdef, model.state, preprocessing, tactile
-            )
-        else:
-            self._names, self._inputs = MODALITIES, model.config.inputs
-            empty = {"visual": visual, "tactile": tactile}
-            self._predict = functools.partial(predict_samples, model.graphdef, model.state, preprocessing, empty)
+        images = (jnp.asarray(image.astype(np.float32) / 255) for image in blank)
+        self._empty = dict(zip(("visual", "tactile"), images, strict=True))
+        config = model.config
+        self._inputs = config.names if isinstance(config, mvae.Config) else config.inputs
+        self._names = config.names if isinstance(config, mvae.Config) else MODALITIES
 
     @classmethod
     def load(
@@ -339,7 +351,7 @@ class Predictor:
         if plausible is not None:
             valid = plausible if valid is None else valid & plausible
         num_samples = _checked_samples(num_samples, key)
-        result = self._predict(arrays, masks, condition, key if num_samples else None, num_samples)
+        result = self._predicted(arrays, masks, lead, condition, key if num_samples else None, num_samples)
         return result if valid is None else _flagged(result, valid)
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
@@ -359,8 +371,36 @@ class Predictor:
         if min(shape, default=1) < 1:
             raise ValueError(f"shape is {shape}; each size must be at least 1.")
         condition, plausible = self._checked_condition(condition, shape)
-        result = self._predict({}, {}, condition, shape=shape)
+        result = self._predicted({}, {}, shape, condition, None, 0)
         return result if plausible is None else _flagged(result, plausible)
+
+    def _predicted(
+        self,
+        inputs: dict[str, Any],
+        present: dict[str, Any],
+        lead: tuple[int, ...],
+        condition: np.ndarray | Array | None,
+        key: PRNGKeyArray | None,
+        num_samples: int,
+    ) -> Prediction:
+        model, view = self.model, self.preprocessing
+        if isinstance(model.config, mvae.Config):
+            return predict(
+                model.graphdef,
+                model.state,
+                view,
+                self._empty["tactile"],
+                inputs,
+                present,
+                condition,
+                key,
+                num_samples,
+                () if inputs else lead,
+            )
+        inputs, present = _completed(self._inputs, view.resolution, inputs, present, lead)
+        return predict_samples(
+            model.graphdef, model.state, view, self._empty, inputs, present, condition, key, num_samples, lead
+        )
 
     @property
     def modalities(self) -> tuple[str, ...]:
