@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 NUM = 128  # four full chunks
 
 
-@pytest.mark.parametrize("index", range(3), ids=["box", "bottle", "jerked bottles"])
+@pytest.mark.parametrize("index", [1, 2], ids=["bottle", "jerked bottles"])  # the box is a drop, as the bottle is
 def test_ends_do_not_depend_on_the_step_the_engine_or_the_hand(index: int) -> None:
     case = invariance.cases()[index]
     case = case._replace(
