@@ -11,9 +11,9 @@ batch (`mujoco.rollout`) on all cores, measured in turn. `--engines` simulates f
 each of 16 objects, in both engines of `simulate`: falls per second, all costs but compilation. `--pipeline` drops a
 bottle so many times and draws every frame of it, vision and touch, 64x64, uint8, fetched from the device: seconds and
 frames per second of either and of both, all costs but compilation (a frame is one world at one time). `--scaling` steps
-1 to 4,096 worlds at once (65,536 on a GPU). `--compile` tells seconds before the first step of each scenario, and how
-often a hundred objects compile, in fresh processes: first with an empty cache of compiled programs, then with what the
-first left there.
+1 to 4,096 worlds at once (65,536 on a GPU). `--compile` prints the seconds before the first step of each scenario, and
+the number of compilations for a hundred objects. It uses fresh processes: the first has an empty cache of compiled
+programs, and the second finds the programs of the first there.
 """
 
 import argparse

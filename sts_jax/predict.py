@@ -471,8 +471,8 @@ def _check_view(name: str, config: statespace.Config, preprocessing: training.Pr
         found = getattr(preprocessing, field)
         if found != wanted:
             raise ValueError(
-                f"{name}: its state-space model presumes {field}={wanted!r}, its preprocessing has {field}={found!r}; "
-                "train it on what it presumes, or change its configuration."
+                f"{name}: the state-space model needs preprocessing with {field}={wanted!r}, got {found!r}: train it "
+                "with that preprocessing."
             )
 
 

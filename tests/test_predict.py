@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from statespace_config import TINY
 
 import sts_jax as sts
 from sts_jax import mvae, statespace, training
@@ -387,21 +388,7 @@ def test_floats_of_any_precision_are_taken(predictor, dtype):
     close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))
 
 
-STATE = statespace.Config(
-    inputs=statespace.INPUTS,
-    outcomes=3,
-    condition=3,
-    input_size=SIDE,
-    image_size=16,
-    look=4,
-    components=2,
-    window=8,
-    encoder=(4, 4, 4),
-    decoder=(8, 4, 4, 4),
-    hidden=16,
-    transition=16,
-    canvas=16,
-)
+STATE = dataclasses.replace(TINY, inputs=statespace.INPUTS, outcomes=3, condition=3, input_size=SIDE)
 
 
 def state_model(**changes):
@@ -497,5 +484,5 @@ def test_a_saved_state_space_model_comes_back(state_predictor, tmp_path):
 )
 def test_a_state_space_model_of_another_view_is_refused(tmp_path, change):
     state_model(**change).save(tmp_path / "model")
-    with pytest.raises(ValueError, match=f"presumes {next(iter(change))}="):
+    with pytest.raises(ValueError, match=f"needs preprocessing with {next(iter(change))}="):
         sts.Predictor.load(tmp_path / "model")

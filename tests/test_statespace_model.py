@@ -1,5 +1,6 @@
 """The state-space model: densities against SciPy, symmetries, masks, and which target each part of the loss sees."""
 
+import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -9,28 +10,15 @@ import numpy as np
 import pytest
 from flax import nnx
 from scipy import special, stats
+from statespace_config import TINY
 
 from sts_jax import optics, statespace, training
 from sts_jax.evaluation import metrics
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import networks, objective, poses
 
-CONFIG = statespace.Config(
-    inputs=("visual", "tactile", "pose"),
-    outcomes=3,
-    condition=3,
-    input_size=32,
-    image_size=16,
-    look=4,
-    components=2,
-    window=8,
-    encoder=(4, 4, 4),
-    decoder=(8, 4, 4, 4),
-    hidden=16,
-    transition=16,
-    canvas=16,
-    drawn=0.5,
-    drawn_first=0.5,
+CONFIG = dataclasses.replace(
+    TINY, inputs=("visual", "tactile", "pose"), outcomes=3, condition=3, input_size=32, drawn=0.5, drawn_first=0.5
 )
 NUMBER, QUARTER = 4, jnp.array([0.0, 1.0])  # samples of a batch; a turn by 90 degrees
 

@@ -1,5 +1,6 @@
 """Training: resuming to the last bit, the order of samples, folders of another run or damaged, learning."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -7,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from statespace_config import TINY
 
-from sts_jax import mvae, statespace, training
+from sts_jax import mvae, training
 
 SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
 CONFIG = training.TrainConfig(steps=12, batch_size=8, log_every=2, checkpoint_every=4)
@@ -211,20 +213,7 @@ def test_it_learns_where_a_square_goes(tmp_path: Path):
     assert evaluated < 1.02 * last["visual"]
 
 
-STATE = statespace.Config(
-    input_size=16,
-    image_size=16,
-    look=4,
-    components=2,
-    window=8,
-    encoder=(4, 4, 4),
-    decoder=(8, 4, 4, 4),
-    hidden=16,
-    transition=16,
-    canvas=16,
-    drawn=1.0,
-    drawn_first=0.25,
-)
+STATE = dataclasses.replace(TINY, drawn=1.0, drawn_first=0.25)
 STATE_CONFIG = training.TrainConfig(
     steps=6, batch_size=4, learning_rate=1e-2, log_every=1, checkpoint_every=2, beta_warmup=0.5
 )

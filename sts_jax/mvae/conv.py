@@ -156,7 +156,7 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
         return _unfold_kernel(folded, stride)
     wide = _cut(wide, -padding, h + size - 1, w + size - 1)
     if size > 2 or wide.shape[3] < _FEW:
-        sums = ("CHWN", "IHWO", "HWNC")  # the batch is what a convolution sums over
+        sums = ("CHWN", "IHWO", "HWNC")  # the convolution sums over the batch, as if it were the channels
         return jax.lax.conv_general_dilated(wide, narrow, (1, 1), "VALID", dimension_numbers=sums)
     flat = narrow.reshape(-1, channels)
     taps = [wide[:, a : a + h, b : b + w].reshape(len(flat), -1) for a in range(size) for b in range(size)]

@@ -1,8 +1,8 @@
-"""Trajectories in C MuJoCo, the engine of a CPU: what `roll` promises, for some trajectories of one body at once.
+"""Trajectories in C MuJoCo, the engine of a CPU. It keeps the promises of `roll`, for several trajectories of one body.
 
-Every vertex of the hull is a contact point of its own, as in `contact`. Of a mesh that stands on a face MuJoCo keeps
-four contacts, so that a round base would be a square to it. The mesh itself stays for the rims of pad and wall, where
-no vertex is.
+Every vertex of the hull is a contact point of its own, as in `contact`. MuJoCo keeps only four contacts of a mesh that
+stands on a face, and a round base would be a square. The mesh itself is there for the rims of pad and wall, which
+touch the hull between its vertices.
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,12 @@ from sts_jax.physics.scenarios import Start
 POINT = 1e-6  # m, radius of a vertex that is a contact
 MESH_GAP = 0.0001  # m; the mesh pushes only where it is this deep, deeper than vertices at rest
 BLOCK = 8  # frames that are rolled before worlds that have ended are dropped
-STILL_SPEED = 0.001  # m/s; slower than this ...
-STILL_TURN = 0.02  # rad/s; ... and this ...
-STILL_TIME = 0.5  # s; ... for this long, under a gravity that stays as it is, will not move again
+# An object that is slower than both speeds for this time, under constant gravity, does not move again.
+STILL_SPEED = 0.001  # m/s
+STILL_TURN = 0.02  # rad/s
+STILL_TIME = 0.5  # s
 
-FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # what is given anew for every step
+FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # the part of the state that is set at every step
 _PAD, _WALL = slice(0, 9), slice(11, 17)  # force, torque, place; force, torque
 _DEEPEST = slice(9, 11)  # whether there is any contact, and the distance of the deepest
 _SENSORS = """
@@ -41,7 +42,7 @@ _WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="
 
 
 class Ends(NamedTuple):
-    """What trajectories have come to; the fields are those of `roll.State`."""
+    """The ends of trajectories. The fields are those of `roll.State`."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -51,11 +52,11 @@ class Ends(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """What is handed on from step to step, beside MuJoCo's own state."""
+    """The counts that are carried from step to step, beside MuJoCo's own state."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
-    still: Int[np.ndarray, "n"]  # consecutive steps below the speeds of what will not move again
+    still: Int[np.ndarray, "n"]  # consecutive steps slower than STILL_SPEED and STILL_TURN
     apart: Int[np.ndarray, "n"]
     touches: Int[np.ndarray, "n"]
     sunk: Float[np.ndarray, "n"]
@@ -177,7 +178,8 @@ def roll(
         points: m, of the hull, mesh frame.
         start: n of them.
         gravity: m/s^2, sensor frame, for every step of every frame's interval.
-        freeze: what is STILL is not rolled on: it stays where it is, and its velocity becomes 0.
+        freeze: whether a trajectory ends once the object has been still for STILL_TIME. The object then stays where it
+            is, and its velocity becomes 0.
 
     Returns:
         How each ended, and one record per trajectory and frame.

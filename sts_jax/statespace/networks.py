@@ -23,7 +23,7 @@ IMAGES = ("visual", "tactile")
 INPUTS = (*IMAGES, "pose")
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
-_NEAREST = 0.2  # of the camera's distance; what is nearer to the pinhole is drawn as if it were there
+_NEAREST = 0.2  # of the camera's distance: an object nearer to the pinhole is drawn at this distance
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
 
 
