@@ -234,10 +234,12 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
     """
     keys = [
         key
-        for key in ("loss", "kl", "visual", "tactile", "pose")
+        for key in ("loss", "kl", "look", "visual", "tactile", "state", "outcome", "pose")
         if any(key in e for log in logs.values() for e in log)
     ]
-    units = {"pose": "squared error (scaled pose)"}
+    # A state-space model has a density of the final pose; its squared error is that of the first pose, the state.
+    squared = "state" if any("state" in entry for log in logs.values() for entry in log) else "pose"
+    units = {squared: "squared error (scaled pose)"}
     figure, axes = plt.subplots(1, len(keys), figsize=(3.6 * len(keys), 3.2), squeeze=False)
     for axis, key in zip(axes[0], keys, strict=True):
         for name, log in logs.items():
