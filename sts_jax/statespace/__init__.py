@@ -2,7 +2,21 @@
 
 from sts_jax.statespace.networks import IMAGES, INPUTS, Config, Model, init
 from sts_jax.statespace.objective import loss
-from sts_jax.statespace.poses import CODE
+from sts_jax.statespace.poses import CODE as POSE_CODE
 from sts_jax.statespace.predict import Samples, sample
+from sts_jax.statespace.state import CODE as STATE_CODE
+from sts_jax.statespace.state import encode
 
-__all__ = ["CODE", "IMAGES", "INPUTS", "Config", "Model", "Samples", "init", "loss", "sample"]
+__all__ = [
+    "IMAGES",
+    "INPUTS",
+    "POSE_CODE",
+    "STATE_CODE",
+    "Config",
+    "Model",
+    "Samples",
+    "encode",
+    "init",
+    "loss",
+    "sample",
+]

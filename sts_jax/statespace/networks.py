@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import poses, window
+from sts_jax.statespace import harmonics, poses, state, window
 
 IMAGES = ("visual", "tactile")
 INPUTS = (*IMAGES, "pose")
@@ -43,15 +44,20 @@ class Config:
     camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
     view: float = 0.15  # m, side of the square on the gel's face that an image shows
     position_scale: float = 0.05  # m, see `training.Preprocessing`
-    look: int = 64  # numbers that describe the look
+    traits: int = 32  # numbers of the look that do not turn with the object
+    own: int = 4  # functions on the sphere of the look, in the object's frame
+    shown: int = 4  # functions on the sphere of the look, as the object is turned at present
+    degree: int = 3  # of their harmonics
+    directions: int = 24  # in which their values are features
+    support: int = 64  # directions in which the values of the support function are features
     components: int = 6  # Gaussians of the final pose, of each outcome
     window: int = 32  # pixels, side of the magnified part of an image
     encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window
-    decoder: tuple[int, ...] = (128, 64, 32, 16)  # channels at 1/8, 1/4, 1/2 and all of the canvas
+    decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas
     hidden: int = 384  # width of the encoders' fully connected layers
     transition: int = 512  # width of the transition's layers
     canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
-    canvas_side: float = 0.18  # m, its side on the gel's face
+    canvas_side: float = 0.15  # m, its side on the gel's face
     tactile_weight: float = 4.0  # of the tactile image's nats in the loss
     state_weight: float = 16.0  # of the squared error of the first pose, as each image's expert has it
     pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
@@ -69,13 +75,18 @@ class Config:
         for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
             if getattr(self, name) % part or getattr(self, name) < part:
                 raise ValueError(f"{name} is {getattr(self, name)} pixels; it takes a multiple of {part}")
-        if len(self.encoder) != 3 or len(self.decoder) != 4:
-            raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths; give 3 and 4")
+        if len(self.encoder) != 3 or len(self.decoder) != 3:
+            raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths; give 3 and 3")
         if self.condition < 0 or self.condition == 1:
             raise ValueError(f"condition is {self.condition} numbers; give 0, or at least the 2 of a vector")
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}; it takes a share of a batch, above 0 and at most 1")
+
+    @property
+    def look(self) -> int:
+        """Numbers that describe the look."""
+        return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
 
     def to_json(self) -> dict[str, Any]:
         """Plain dictionaries and lists."""
@@ -89,12 +100,12 @@ class Config:
 
 
 class FinalPose(NamedTuple):
-    """The density of the final pose: a mixture of Gaussians over its code, in the frame of a heading."""
+    """The density of the final pose: a mixture of Gaussians over its code and its turn, in the frame of a heading."""
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
     weight: Float[Array, "n outcomes k"]  # log weight of each component of an outcome
-    mean: Float[Array, "n outcomes k 12"]
-    log_var: Float[Array, "n outcomes k 12"]
+    mean: Float[Array, "n outcomes k 21"]  # code of the pose, and the rotation from the present to the final one
+    log_var: Float[Array, "n outcomes k 21"]
     heading: Float[Array, "n 2"]  # of the frame, see `poses.heading`
 
 
@@ -119,6 +130,40 @@ class _ResidualDense(nnx.Module):
 
     def __call__(self, x: Array) -> Array:
         return x + self.second(jax.nn.swish(self.first(jax.nn.swish(self.norm(x)))))
+
+
+def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
+    """Traits, functions in the object's frame and functions of its present turn: (n, traits), (n, c, k), (n, c, k)."""
+    count = harmonics.number(config.degree)
+    traits, own, shown = jnp.split(look, [config.traits, config.traits + config.own * count], axis=-1)
+    return traits, own.reshape(len(look), -1, count), shown.reshape(len(look), -1, count)
+
+
+def _shapes(
+    config: Config, known: state.State, look: Array, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
+) -> list[Array]:
+    """Traits and the values of all functions on the sphere, those of the object's frame turned and those shown."""
+    traits, own, shown = parts(config, look)
+    many, few = _directions(config.support), _directions(config.directions)
+    return [
+        traits,
+        harmonics.values(known.own[:, None], own_turn, many),
+        harmonics.values(known.shown[:, None], shown_turn, many),
+        harmonics.values(own, own_turn, few),
+        harmonics.values(shown, shown_turn, few),
+    ]
+
+
+def _joined(*features: Float[Array, "n ..."]) -> Float[Array, "n k"]:
+    return jnp.concatenate([x.reshape(len(x), -1) for x in features], axis=-1)
+
+
+def _directions(count: int) -> np.ndarray:
+    """Directions that are spread evenly over the sphere (Fibonacci's lattice)."""
+    step = np.arange(count) + 0.5
+    z, angle = 1 - 2 * step / count, np.pi * (1 + 5**0.5) * step
+    level = np.sqrt(1 - z**2)
+    return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=-1).astype(np.float32)
 
 
 def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h//2 w//2 4*c"]:
@@ -149,7 +194,7 @@ class Encoder(nnx.Module):
         self.dense = nnx.Linear((config.window // 8) ** 2 * eighth + 64, config.hidden, rngs=rngs)
         self.residual = _ResidualDense(config.hidden, rngs)
         self.norm = nnx.LayerNorm(config.hidden, rngs=rngs)
-        self.last = nnx.Linear(config.hidden, 2 * (poses.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
+        self.last = nnx.Linear(config.hidden, 2 * (state.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, change: Float[Array, "n size size 3"]) -> Gaussian:
         """The expert of each image.
@@ -178,11 +223,14 @@ class Encoder(nnx.Module):
         mean, log_var = jnp.split(x, 2, axis=-1)
         log_var = _LOG_VAR_LIMIT * jnp.tanh(log_var / _LOG_VAR_LIMIT)
         mean = mean.at[:, :2].add(centre)  # an object is where it is seen
-        pose, look = jnp.split(mean, [poses.CODE], axis=-1)
-        doubt = poses.turn_variance(place.angle, jnp.exp(log_var[:, : poses.CODE]))
+        variance = jnp.exp(log_var)
+        traits, own, shown = parts(config, mean[:, state.CODE :])
+        blur = parts(config, variance[:, state.CODE :])
+        found = state.turn(place.angle, state.split(mean[:, : state.CODE]))
+        doubt = state.turn_variance(place.angle, state.split(variance[:, : state.CODE]))
         return Gaussian(
-            jnp.concatenate([poses.turn_code(place.angle, pose), look], axis=-1),
-            jnp.concatenate([jnp.log(doubt), log_var[:, poses.CODE :]], axis=-1),
+            _joined(*found, traits, own, harmonics.turn(place.angle, shown)),
+            jnp.log(_joined(*doubt, *blur[:2], harmonics.turn_variance(place.angle, blur[2]))),
         )
 
 
@@ -191,42 +239,57 @@ class Transition(nnx.Module):
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.first = nnx.Linear(2 * poses.CODE + config.look + 4 + 2 * config.condition, config.transition, rngs=rngs)
+        shapes = 2 * config.support + (config.own + config.shown) * config.directions
+        number = 2 * poses.CODE + 7 + 5 + config.traits + shapes + 4 + 2 * config.condition
+        self.first = nnx.Linear(number, config.transition, rngs=rngs)
         self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(3)])
         self.norm = nnx.LayerNorm(config.transition, rngs=rngs)
         self.outcome = nnx.Linear(config.transition, config.outcomes, kernel_init=_SMALL, rngs=rngs)
-        components = config.outcomes * config.components * (1 + 2 * poses.CODE)
+        components = config.outcomes * config.components * (1 + 2 * poses.MOVE)
         self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
         """The density, from the means and variances of the fused posterior.
 
         Args:
-            belief: over pose code and look, `(n, 12 + look)`.
+            belief: over state code and look, `(n, code + look)`.
             condition: each number divided by its usual size; None where the model has none.
 
         Returns:
             The density in the frame of the heading of the belief's mean.
         """
         config = self.config
-        pose, look = jnp.split(belief.mean, [poses.CODE], axis=-1)
-        doubt = jnp.clip(belief.log_var[:, : poses.CODE], -_LOG_VAR_LIMIT, 2) / 4
-        heading = poses.heading(pose)
-        own = poses.turn_code_back(heading, pose)
-        features = [own, doubt, look, heading, pose[:, :2]]
+        mean, look = jnp.split(belief.mean, [state.CODE], axis=-1)
+        known = state.split(mean)
+        doubt = jnp.clip(belief.log_var[:, : state.CODE], -_LOG_VAR_LIMIT, 2) / 4
+        heading = state.heading(known)
+        here = poses.turn_code_back(heading, known.pose)
+        level = jnp.swapaxes(poses.about_vertical(heading), -1, -2)
+        features = [
+            here,
+            *_shapes(config, known, look, poses.matrix(here), level),
+            jnp.einsum("nij,nj->ni", poses.matrix(here), known.com),
+            jnp.einsum("nij,nj->ni", level, known.low),
+            known.mass,
+            state.split(doubt).pose,
+            *(jnp.mean(part, axis=-1, keepdims=True) for part in state.split(doubt)[1:]),
+            heading,
+            known.pose[:, :2],
+        ]
         if condition is not None:
             features += [condition, poses.turn_back(heading, condition[:, :2]), condition[:, 2:]]
-        x = self.first(jnp.concatenate(features, axis=-1))
+        x = self.first(_joined(*features))
         for layer in self.layers:
             x = layer(x)
         x = jax.nn.swish(self.norm(x))
-        parts = self.mixture(x).reshape(len(x), config.outcomes, config.components, -1)
+        mixture = self.mixture(x).reshape(len(x), config.outcomes, config.components, -1)
         middle, reach = _FINAL_LOG_VAR
+        stays = jnp.broadcast_to(jnp.eye(3).reshape(9), (len(x), 9))
         return FinalPose(
             outcome=jax.nn.log_softmax(self.outcome(x)),
-            weight=jax.nn.log_softmax(parts[..., 0]),
-            mean=own[:, None, None] + parts[..., 1 : 1 + poses.CODE],
-            log_var=middle + reach * jnp.tanh(parts[..., 1 + poses.CODE :] / reach),
+            weight=jax.nn.log_softmax(mixture[..., 0]),
+            mean=_joined(here, stays)[:, None, None] + mixture[..., 1 : 1 + poses.MOVE],
+            log_var=middle + reach * jnp.tanh(mixture[..., 1 + poses.MOVE :] / reach),
             heading=heading,
         )
 
@@ -240,22 +303,21 @@ class Decoder(nnx.Module):
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
-        eighth, quarter, half, full = config.decoder
-        self.first = nnx.Linear(config.look + poses.CODE + 4, 512, rngs=rngs)
+        eighth, quarter, half = config.decoder
+        shapes = 2 * config.support + (config.own + config.shown) * config.directions
+        self.first = nnx.Linear(poses.CODE + 4 + config.traits + shapes, 512, rngs=rngs)
         self.residual = _ResidualDense(512, rngs)
         self.core = nnx.Linear(512, (config.canvas // 8) ** 2 * (eighth // 2), rngs=rngs)
         self.widen = nnx.Linear(eighth // 2, eighth, rngs=rngs)
         self.layers = nnx.List([_Residual(width, rngs) for width in (eighth, quarter, half)])
-        pairs = ((eighth, quarter), (quarter, half), (half, full))
-        self.enlarge = nnx.List([nnx.Linear(a, 4 * b, rngs=rngs) for a, b in pairs])
-        self.canvas = nnx.Linear(full, 12, rngs=rngs)
-        self.light = nnx.Linear(4, 12, kernel_init=_SMALL, rngs=rngs)
-        self.view = nnx.Conv(12, 12, (3, 3), rngs=rngs)
-        self.last = nnx.Conv(12, 7, (3, 3), kernel_init=_SMALL, rngs=rngs)
+        self.enlarge = nnx.List([nnx.Linear(a, 4 * b, rngs=rngs) for a, b in ((eighth, quarter), (quarter, half))])
+        self.last = nnx.Conv(half, 4 * 8, (3, 3), kernel_init=_SMALL, rngs=rngs)
 
     def __call__(
         self,
         pose: Float[Array, "n 12"],
+        turn: Float[Array, "n 3 3"],
+        known: Float[Array, "n code"],
         look: Float[Array, "n look"],
         empty: dict[str, Float[Array, "size size 3"]],
     ) -> dict[str, Float[Array, "n size size 3"]]:
@@ -263,7 +325,9 @@ class Decoder(nnx.Module):
 
         Args:
             pose: pose codes.
-            look: the looks.
+            turn: rotations since the present moment.
+            known: present state codes, of which the shapes are drawn.
+            look: present looks.
             empty: both images of the untouched sensor, of the size that is predicted.
 
         Returns:
@@ -271,21 +335,21 @@ class Decoder(nnx.Module):
         """
         config = self.config
         heading = poses.heading(pose)
-        place = jnp.concatenate([heading, pose[:, :2]], axis=-1)
-        x = jnp.concatenate([poses.turn_code_back(heading, pose), place, look], axis=-1)
+        here = poses.turn_code_back(heading, pose)
+        level = jnp.swapaxes(poses.about_vertical(heading), -1, -2)
+        shapes = _shapes(config, state.split(known), look, poses.matrix(here), level @ turn)
+        x = _joined(here, heading, pose[:, :2], *shapes)
         x = self.core(jax.nn.swish(self.residual(self.first(x))))
         x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
-        for layer, enlarge in zip(self.layers, self.enlarge, strict=True):
+        for layer, enlarge in zip(self.layers, self.enlarge, strict=False):
             x = _unfold(enlarge(layer(x)))
-        x = window.sample(self.canvas(jax.nn.swish(x)), _on_canvas(config, pose, heading))
+        x = _unfold(self.last(jax.nn.swish(self.layers[-1](x))))
+        x = window.sample(x, _on_canvas(config, pose, heading))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
-        x = x * (1 + self.light(place)[:, None, None])
-        x = x + self.view(jax.nn.swish(x))
-        x = self.last(jax.nn.swish(x))
         covered = jax.nn.sigmoid(x[..., 3:4] - 3)  # at first, hardly at all
         visual = covered * jax.nn.sigmoid(x[..., :3]) + (1 - covered) * empty["visual"]
         grey = jnp.clip(empty["tactile"], 0.01, 0.99)
-        tactile = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + x[..., 4:])
+        tactile = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + x[..., 4:7])
         return {"visual": visual, "tactile": tactile}
 
 

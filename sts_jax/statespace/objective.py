@@ -15,6 +15,7 @@ look is drawn for each sample, among those with an image.
 
 import itertools
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +23,11 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
-from sts_jax.statespace import poses
+from sts_jax.statespace import poses, state
 from sts_jax.statespace.networks import IMAGES, FinalPose, Model
 
-POSE_LOG_VAR = -9.2  # of the expert of a pose that is given: 0.5 mm
-UNKNOWN_LOG_VAR = 30.0  # of the same expert about the look: no precision at all
+EXACT_LOG_VAR = -9.2  # of a pose that is given: 0.5 mm
+UNKNOWN_LOG_VAR = 30.0  # of the rest, of the expert of a pose: no precision at all
 _LEAST = 1 / 1020  # predicted images are kept this far from 0 and 1
 
 
@@ -49,8 +50,8 @@ def experts(
     found = {name: model.encoders[name](x) for name, x in change.items()}
     if "pose" in inputs:
         code = _counted(counts["pose"], inputs["pose"])
-        nothing = jnp.zeros((len(code), model.config.look))
-        log_var = [jnp.full_like(code, POSE_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
+        nothing = jnp.zeros((len(code), state.CODE - poses.CODE + model.config.look))
+        log_var = [jnp.full_like(code, EXACT_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
         found["pose"] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
     return found
 
@@ -67,7 +68,7 @@ def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[A
 
 
 def log_density(
-    final: FinalPose, code: Float[Array, "n 12"], outcome: Int[Array, "n"]
+    final: FinalPose, code: Float[Array, "n 12"], turn: Float[Array, "n 3 3"], outcome: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
     """The log probability of an outcome, and the log density of the pose code given the outcome."""
 
@@ -75,7 +76,10 @@ def log_density(
         return jnp.take_along_axis(x, outcome.reshape(-1, *(1,) * (x.ndim - 1)), axis=1)[:, 0]
 
     weight, mean, log_var = (of_outcome(x) for x in (final.weight, final.mean, final.log_var))
-    error = poses.turn_code_back(final.heading, code)[:, None] - mean
+    heading = poses.about_vertical(final.heading)
+    level = (jnp.swapaxes(heading, -1, -2) @ turn @ heading).reshape(-1, 9)
+    move = jnp.concatenate([poses.turn_code_back(final.heading, code), level], axis=-1)
+    error = move[:, None] - mean
     each = -0.5 * jnp.sum(error**2 * jnp.exp(-log_var) + log_var + math.log(2 * math.pi), axis=-1)
     return of_outcome(final.outcome), jax.nn.logsumexp(weight + each, axis=-1)
 
@@ -96,6 +100,27 @@ def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n siz
     return jnp.mean(blocks, axis=(-4, -2))
 
 
+class _Ends(NamedTuple):
+    """Beliefs about first moments, with the ends that followed."""
+
+    belief: Gaussian  # over state code and look
+    state: Float[Array, "n code"]
+    pose: Float[Array, "n 12"]  # the final one
+    outcome: Int[Array, "n"]
+    condition: Float[Array, "n c"] | None
+    counts: Bool[Array, "n"]
+
+
+class _Pictures(NamedTuple):
+    """Objects to be drawn, with the images that should come of it."""
+
+    pose: Float[Array, "n 12"]
+    turn: Float[Array, "n 3 3"]  # since the moment of the belief
+    belief: Gaussian
+    images: dict[str, Float[Array, "n size size 3"]]
+    counts: dict[str, Bool[Array, "n"]]
+
+
 def loss(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,
@@ -106,6 +131,8 @@ def loss(
     *,
     present: dict[str, Bool[Array, "n"]] | None = None,
     condition: Float[Array, "n c"] | None = None,
+    views: dict[str, Array] | None = None,
+    falls: dict[str, Array] | None = None,
     beta: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of one batch (module docstring).
@@ -115,12 +142,16 @@ def loss(
         params: its parameters.
         key: consumed.
         inputs: as of `experts`: all that the model takes.
-        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], of the size that is predicted; the codes `state`
-            and `pose` `(n, 12)` of the first and the last pose; `outcome` `(n,)`, an index into the scenario's.
+        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], of the size that is predicted; the state code
+            `state` `(n, code)` of the first moment; the pose code `pose` `(n, 12)` of the last; `outcome` `(n,)`, an
+            index into the scenario's.
         empty: as of `experts`.
         present: which inputs count, by name; all where not given. Each sample needs one. The values of those that do
             not count, NaN among them, have no influence.
         condition: as of `Transition`.
+        views: further first moments without an end: `visual` `(m, size, size, 3)` and `state` `(m, code)`.
+        falls: further trajectories without images: `state`, `pose`, `outcome` and, where the model has one,
+            `condition`, as above.
         beta: weight of the look's divergence.
 
     Returns:
@@ -131,42 +162,55 @@ def loss(
     config = model.config
     number = len(targets["pose"])
     counts = {name: jnp.ones(number, bool) for name in config.inputs} | (present or {})
-    choice, noise = jax.random.split(key)
+    choice, noise, blur, other = jax.random.split(key, 4)
     found = experts(model, inputs, counts, empty)
     images = [name for name in IMAGES if name in found]
-    state, doubt = zip(*(_state_error(found[name], targets["state"], counts[name]) for name in images), strict=True)
-    terms = {"state": jnp.sum(jnp.stack(state)), "doubt": jnp.sum(jnp.stack(doubt))}
+    seen = {} if views is None else {"visual": model.encoders["visual"](views["visual"] - empty["visual"])}
+    terms = _state_terms(found, targets["state"], counts, seen, views)
 
     subsets = [s for size in range(1, len(config.inputs) + 1) for s in itertools.combinations(config.inputs, size)]
     members = [{name: counts[name] & (name in subset) for name in config.inputs} for subset in subsets]
     beliefs = [fuse(found, own) for own in members]
-    some = jnp.concatenate([jnp.any(jnp.stack(list(own.values())), axis=0) for own in members])
-    weights = some / jnp.maximum(jnp.sum(some), 1)
-    belief = jax.tree.map(lambda *x: jnp.concatenate(x), *beliefs)
-    many = len(subsets)
-    final = model.transition(belief, None if condition is None else jnp.tile(condition, (many, 1)))
-    outcome, pose = log_density(final, jnp.tile(targets["pose"], (many, 1)), jnp.tile(targets["outcome"], many))
-    terms |= {"outcome": -jnp.sum(weights * outcome), "pose": -jnp.sum(weights * pose)}
+    ends = [
+        _Ends(
+            belief,
+            targets["state"],
+            targets["pose"],
+            targets["outcome"],
+            condition,
+            jnp.any(jnp.stack(list(own.values())), axis=0),
+        )
+        for belief, own in zip(beliefs, members, strict=True)
+    ]
+    if falls is not None:
+        ends.append(_known_ends(blur, falls, config.look))
+    terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
 
-    seen = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
-    chosen = jax.random.categorical(choice, jnp.where(seen, 0.0, -jnp.inf))
-    looks = jax.tree.map(lambda *x: jnp.stack(x, axis=1)[..., poses.CODE :], *beliefs)
-    look = jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], looks)
-    terms["look"] = jnp.mean(kl_standard_normal(look))
-    drawn = look.mean + jnp.exp(0.5 * look.log_var) * jax.random.normal(noise, look.mean.shape)
-
-    last, first = (math.ceil(share * number) for share in (config.drawn, config.drawn_first))
-    code = jnp.concatenate([targets["pose"][:last], targets["state"][:first]])
-    shown = {name: reduced(x, config.image_size) for name, x in empty.items()}
-    pictures = model.decoder(code, jnp.concatenate([drawn[:last], drawn[:first]]), shown)
-    for name in IMAGES:
-        terms[name] = jnp.mean(excess(pictures[name][:last], targets[name][:last]))
-    terms["first"] = jnp.zeros(())
-    for name in images:
-        known = counts[name][:first]
-        before = reduced(_counted(known, inputs[name][:first]), config.image_size)
-        wrong = jnp.where(known, excess(pictures[name][last:], before), 0)
-        terms["first"] += jnp.sum(wrong) / jnp.maximum(jnp.sum(known), 1)
+    # A picture is drawn of the belief of one subset with an image.
+    usable = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
+    chosen = jax.random.categorical(choice, jnp.where(usable, 0.0, -jnp.inf))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
+    belief = jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
+    terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE :], belief)))
+    last = math.ceil(config.drawn * number)
+    turn = _turn(targets["state"], targets["pose"])
+    after = _Pictures(
+        *jax.tree.map(lambda x: x[:last], (targets["pose"], turn, belief, {name: targets[name] for name in IMAGES})),
+        counts={name: jnp.ones(last, bool) for name in IMAGES},
+    )
+    first = math.ceil(config.drawn_first * number)
+    if views is None:
+        before = _present_pictures(
+            targets["state"][:first],
+            jax.tree.map(lambda x: x[:first], belief),
+            {name: inputs[name][:first] for name in images},
+            {name: counts[name][:first] for name in images},
+        )
+    else:
+        known = {"visual": jnp.ones(len(views["state"][:first]), bool)}
+        own = fuse(jax.tree.map(lambda x: x[:first], seen), known)
+        before = _present_pictures(views["state"][:first], own, {"visual": views["visual"][:first]}, known)
+    terms |= _picture_terms(model, (noise, other), after, before, empty)
     total = (
         terms["visual"]
         + config.tactile_weight * terms["tactile"]
@@ -179,15 +223,122 @@ def loss(
     return total, terms
 
 
-def _state_error(expert: Gaussian, state: Float[Array, "n 12"], counts: Bool[Array, "n"]) -> tuple[Array, Array]:
-    """Squared error of an expert's first pose, and the nats of its variance, means over the samples that it counts for.
+def _turn(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
+    """The rotation from a state to a final pose."""
+    return poses.matrix(pose) @ jnp.swapaxes(poses.matrix(code[:, : poses.CODE]), -1, -2)
+
+
+def _state_terms(
+    found: dict[str, Gaussian],
+    truth: Float[Array, "n code"],
+    counts: dict[str, Bool[Array, "n"]],
+    seen: dict[str, Gaussian],
+    views: dict[str, Array] | None,
+) -> dict[str, Float[Array, ""]]:
+    """`state` and `doubt` of all images' experts, at the first moments and at the views."""
+    errors, doubts = [], []
+    for name in (name for name in IMAGES if name in found):
+        expert, code, valid = found[name], truth, counts[name]
+        if views is not None and name in seen:
+            expert = jax.tree.map(lambda *x: jnp.concatenate(x), expert, seen[name])
+            code = jnp.concatenate([code, views["state"]])
+            valid = jnp.concatenate([valid, jnp.ones(len(views["state"]), bool)])
+        error, doubt = _state_error(expert, code, valid)
+        errors.append(error)
+        doubts.append(doubt)
+    return {"state": jnp.sum(jnp.stack(errors)), "doubt": jnp.sum(jnp.stack(doubts))}
+
+
+def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Array, "n"]) -> tuple[Array, Array]:
+    """Squared error of an expert's state, and the nats of its variance, means over the samples that it counts for.
 
     The mean is learnt from the squared error alone. The nats of a Gaussian would weigh each component by its precision,
     and the rotation, the hardest part, would wait until the position is learnt.
     """
-    mean, log_var = (x[:, : poses.CODE] for x in expert)
-    error = jnp.sum((state - mean) ** 2, axis=-1)
-    scatter = jax.lax.stop_gradient(state - mean) ** 2 * jnp.exp(-log_var)
+    mean, log_var = (x[:, : state.CODE] for x in expert)
+    error = jnp.sum((code - mean) ** 2, axis=-1)
+    scatter = jax.lax.stop_gradient(code - mean) ** 2 * jnp.exp(-log_var)
     nats = 0.5 * jnp.sum(scatter + log_var + math.log(2 * math.pi), axis=-1)
     number = jnp.maximum(jnp.sum(counts), 1)
     return jnp.sum(counts * error) / number, jnp.sum(counts * nats) / number
+
+
+def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], look: int) -> _Ends:
+    """Trajectories whose first state is known: half of them exactly, half with an uncertain shape and mass.
+
+    The uncertain ones have noise of known size added, as an expert has it.
+    """
+    code = falls["state"]
+    number = len(code)
+    size, noise = jax.random.split(key)
+    log_std = jax.random.uniform(size, (number, 3), minval=math.log(0.02), maxval=math.log(1.0))
+    shape, centre, mass = jnp.split(log_std, 3, axis=-1)
+    exact = jnp.full((number, poses.CODE), EXACT_LOG_VAR / 2)
+    doubt = state.join(
+        state.State(
+            exact,
+            jnp.tile(shape, state.SUPPORT),
+            jnp.tile(centre, 3),
+            mass,
+            jnp.tile(shape, state.SUPPORT),
+            jnp.tile(centre, 3),
+        )
+    )
+    doubt = jnp.where(jnp.arange(number)[:, None] % 2 == 0, EXACT_LOG_VAR / 2, doubt)
+    noisy = code + jnp.exp(doubt) * jax.random.normal(noise, code.shape)
+    mean = jnp.concatenate([code[:, : poses.CODE], noisy[:, poses.CODE :], jnp.zeros((number, look))], axis=-1)
+    expert = Gaussian(mean, jnp.concatenate([2 * doubt, jnp.full((number, look), UNKNOWN_LOG_VAR)], axis=-1))
+    known = jnp.ones(number, bool)
+    belief = fuse({"state": expert}, {"state": known})
+    return _Ends(belief, code, falls["pose"], falls["outcome"], falls.get("condition"), known)
+
+
+def _end_terms(model: Model, ends: _Ends) -> dict[str, Float[Array, ""]]:
+    """The nats of the outcomes and of the final poses."""
+    weights = ends.counts / jnp.maximum(jnp.sum(ends.counts), 1)
+    final = model.transition(ends.belief, ends.condition)
+    outcome, pose = log_density(final, ends.pose, _turn(ends.state, ends.pose), ends.outcome)
+    return {"outcome": -jnp.sum(weights * outcome), "pose": -jnp.sum(weights * pose)}
+
+
+def _present_pictures(
+    code: Float[Array, "n code"],
+    belief: Gaussian,
+    images: dict[str, Array],
+    counts: dict[str, Bool[Array, "n"]],
+) -> _Pictures:
+    """Pictures of the moment of the belief itself."""
+    stays = jnp.broadcast_to(jnp.eye(3), (len(code), 3, 3))
+    return _Pictures(code[:, : poses.CODE], stays, belief, images, counts)
+
+
+def _picture_terms(
+    model: Model,
+    keys: tuple[PRNGKeyArray, PRNGKeyArray],
+    after: _Pictures,
+    before: _Pictures,
+    empty: dict[str, Float[Array, "size size 3"]],
+) -> dict[str, Float[Array, ""]]:
+    """The nats of the last moment's images, by name, and of the first moment's, summed over the names."""
+    size = model.config.image_size
+
+    def looks(key: PRNGKeyArray, belief: Gaussian) -> Float[Array, "n look"]:
+        mean, log_var = (x[:, state.CODE :] for x in belief)
+        return mean + jnp.exp(0.5 * log_var) * jax.random.normal(key, mean.shape)
+
+    drawn = model.decoder(
+        jnp.concatenate([after.pose, before.pose]),
+        jnp.concatenate([after.turn, before.turn]),
+        # Pictures do not teach the shape: it has a truth.
+        jax.lax.stop_gradient(jnp.concatenate([x.belief.mean[:, : state.CODE] for x in (after, before)])),
+        jnp.concatenate([looks(key, x.belief) for key, x in zip(keys, (after, before), strict=True)]),
+        {name: reduced(x, size) for name, x in empty.items()},
+    )
+    number = len(after.pose)
+    terms = {name: jnp.mean(excess(drawn[name][:number], after.images[name])) for name in IMAGES}
+    terms["first"] = jnp.zeros(())
+    for name, image in before.images.items():
+        counts = before.counts[name]
+        wrong = excess(drawn[name][number:], reduced(_counted(counts, image), size))
+        terms["first"] += jnp.sum(jnp.where(counts, wrong, 0)) / jnp.maximum(jnp.sum(counts), 1)
+    return terms

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from sts_jax import geometry
 
 CODE = 12  # numbers in a pose code
+MOVE = CODE + 9  # numbers in a final pose code and the rotation to it
 LEVEL = 0.85  # an axis whose horizontal part is longer than this gives the heading
 
 
@@ -32,6 +33,28 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     length = jnp.linalg.norm(chosen, axis=-1, keepdims=True)
     # A belief without information about the rotation has no heading.
     return jnp.where(length > 1e-3, chosen / jnp.maximum(length, 1e-3), jnp.array([1.0, 0.0]))
+
+
+def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
+    """Length of the longest horizontal part of an axis: at least 0.8 for a rotation, 0 for no knowledge of it."""
+    return jnp.max(jnp.linalg.norm(matrix(code)[..., :2, :], axis=-2), axis=-1)
+
+
+def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
+    """The nine numbers as a matrix."""
+    return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
+
+
+def about_vertical(angle: Float[Array, "*n 2"]) -> Float[Array, "*n 3 3"]:
+    """Rotation matrices about z by angles that are given as cosine and sine."""
+    cos, sin, zero = angle[..., 0], angle[..., 1], jnp.zeros_like(angle[..., 0])
+    rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def nearest(turn: Float[Array, "*n 9"]) -> Float[Array, "*n 3 3"]:
+    """The rotations nearest to nine numbers."""
+    return geometry.quat_to_matrix(geometry.quat_from_matrix(turn.reshape(*turn.shape[:-1], 3, 3)))
 
 
 def rigid(code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:

@@ -8,7 +8,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import poses
+from sts_jax.statespace import poses, state
 from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import experts, fuse, reduced
 
@@ -16,7 +16,7 @@ from sts_jax.statespace.objective import experts, fuse, reduced
 class Samples(NamedTuple):
     """Samples of the last moment: k final poses of each of n items, and both images of the first few of them."""
 
-    belief: Gaussian  # over the present pose code and the look, (n, 12 + look)
+    belief: Gaussian  # over the present state code and the look, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
     pose: Float[Array, "k n 12"]  # codes of final poses
     images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first `drawn` poses
@@ -51,25 +51,35 @@ def sample(
     belief = fuse(experts(model, inputs, present, empty), present)
     final = model.transition(belief, condition)
     end, appearance = jax.random.split(key)
-    codes = jax.vmap(lambda key: _final_code(key, final))(jax.random.split(end, num))
-    mean, log_var = (x[:, poses.CODE :] for x in belief)
+    codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
+    known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))
+    mean, log_var = (x[:, state.CODE :] for x in belief)
     looks = mean + jnp.exp(0.5 * log_var) * jax.random.normal(appearance, (drawn, *mean.shape))
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    flat = model.decoder(codes[:drawn].reshape(-1, poses.CODE), looks.reshape(-1, looks.shape[-1]), shown)
+    flat = model.decoder(
+        codes[:drawn].reshape(-1, poses.CODE),
+        turns[:drawn].reshape(-1, 3, 3),
+        known.reshape(-1, state.CODE),
+        looks.reshape(-1, looks.shape[-1]),
+        shown,
+    )
     images = {name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in flat.items()}
     return Samples(belief, jnp.exp(final.outcome), codes, images)
 
 
-def _final_code(key: PRNGKeyArray, final: FinalPose) -> Float[Array, "n 12"]:
+def _final_pose(key: PRNGKeyArray, final: FinalPose) -> tuple[Float[Array, "n 12"], Float[Array, "n 3 3"]]:
+    """The code of a final pose, and the rotation from the present to it."""
     which, noise = jax.random.split(key)
     number = len(final.outcome)
     joint = (final.outcome[:, :, None] + final.weight).reshape(number, -1)
     chosen = jax.random.categorical(which, joint)
 
     def of_chosen(x: Array) -> Array:
-        flat = x.reshape(number, -1, poses.CODE)
+        flat = x.reshape(number, -1, poses.MOVE)
         return jnp.take_along_axis(flat, chosen[:, None, None], axis=1)[:, 0]
 
     mean, log_var = of_chosen(final.mean), of_chosen(final.log_var)
-    code = mean + jnp.exp(0.5 * log_var) * jax.random.normal(noise, mean.shape)
-    return poses.turn_code(final.heading, poses.rigid(code))
+    move = mean + jnp.exp(0.5 * log_var) * jax.random.normal(noise, mean.shape)
+    heading = poses.about_vertical(final.heading)
+    turn = heading @ poses.nearest(move[:, poses.CODE :]) @ jnp.swapaxes(heading, -1, -2)
+    return poses.turn_code(final.heading, poses.rigid(move[:, : poses.CODE])), turn

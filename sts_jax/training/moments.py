@@ -2,14 +2,18 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sts_jax import mvae, optics, physics, statespace
-from sts_jax.dataset import Pairs, reduced
+from sts_jax.dataset import Ends, Pairs, Views, reduced
 from sts_jax.sensor import Sensor
 from sts_jax.training.preprocess import Preprocessing
 from sts_jax.training.train import Arrays
+
+
+SOME = 512  # items that are encoded at once
 
 
 def moments(
@@ -55,6 +59,9 @@ def state_moments(
     scenario: physics.Scenario,
     preprocessing: Preprocessing,
     empty: dict[str, np.ndarray],
+    *,
+    views: Views | None = None,
+    falls: Ends | None = None,
 ) -> Arrays:
     """The arrays that train a state-space model.
 
@@ -64,34 +71,65 @@ def state_moments(
         scenario: whose outcomes the trajectories have.
         preprocessing: how the networks see measurements.
         empty: the images of the untouched sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
+        views: further pictures of the start, from `dataset.Dataset.views`; used if the model takes `visual`.
+        falls: further trajectories without images, from `dataset.Dataset.ends`.
 
     Raises:
         ValueError: a trajectory has an outcome that the scenario does not have.
     """
-    numbers = np.array([int(outcome) for outcome in scenario.outcomes])
-    if not np.isin(pairs.outcome, numbers).all():
-        raise ValueError(
-            f"pairs have the outcomes {np.unique(pairs.outcome).tolist()}; those of {type(scenario).__name__} are "
-            f"{numbers.tolist()}: give the scenario of the collection"
-        )
+    ends = [pairs] if falls is None else [pairs, falls]
+    outcome, *other_outcomes = (_outcome_index(own.outcome, scenario) for own in ends)
+    condition, *other_conditions = (np.asarray(preprocessing.encode_condition(jnp.asarray(x.condition))) for x in ends)
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     last = reduced(pairs._replace(visual=pairs.visual[:, 1:], tactile=pairs.tactile[:, 1:]), model.image_size)
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
-    condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
     touched = {"tactile": _touched(pairs, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
+    further: dict[str, dict[str, np.ndarray]] = {"views": {}, "falls": {}}
+    if views is not None and len(views.pose) and "visual" in model.inputs:
+        further["views"] = {"visual": views.visual, "state": _states(preprocessing, views.pose, views)}
+    if falls is not None and len(falls.pose):
+        further["falls"] = {
+            "state": _states(preprocessing, falls.pose[:, 0], falls),
+            "pose": np.asarray(preprocessing.encode_pose(jnp.asarray(falls.pose[:, 1]))),
+            "outcome": other_outcomes[0],
+        }
+        if condition.shape[1]:
+            further["falls"]["condition"] = other_conditions[0]
     return Arrays(
         inputs={name: np.ascontiguousarray(inputs[name]) for name in model.inputs},
         targets={
             "visual": last.visual[:, 0],
             "tactile": last.tactile[:, 0],
-            "state": code[:, 0],
+            "state": _states(preprocessing, pairs.pose[:, 0], pairs),
             "pose": code[:, 1],
-            "outcome": (pairs.outcome[:, None] == numbers).argmax(1).astype(np.int32),
+            "outcome": outcome,
         },
         present=touched,
         condition=condition if condition.shape[1] else None,
         empty=empty,
+        **further,
     )
+
+
+def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarray:
+    numbers = np.array([int(known) for known in scenario.outcomes])
+    if not np.isin(outcome, numbers).all():
+        raise ValueError(
+            f"pairs have the outcomes {np.unique(outcome).tolist()}; those of {type(scenario).__name__} are "
+            f"{numbers.tolist()}: give the scenario of the collection"
+        )
+    return (outcome[:, None] == numbers).argmax(1).astype(np.int32)
+
+
+def _states(preprocessing: Preprocessing, pose: np.ndarray, solid: Pairs | Ends | Views) -> np.ndarray:
+    """The state codes of poses (n, 7) of objects; some at a time, which bounds the memory."""
+    encode = jax.jit(statespace.encode)
+    parts = []
+    for start in range(0, len(pose), SOME):
+        rows = slice(start, start + SOME)
+        code = preprocessing.encode_pose(jnp.asarray(pose[rows]))
+        parts.append(np.asarray(encode(code, solid.support[rows], solid.mass[rows], solid.com[rows])))
+    return np.concatenate(parts)
 
 
 def state_model(

@@ -32,6 +32,10 @@ class TrainConfig:
     steps: int | None = None  # gradient steps; None: `epochs` decide
     epochs: int = 200  # paper
     batch_size: int = 64  # paper
+    # Of a state-space model: first moments without an end, and trajectories without images, in each batch; where the
+    # data has some
+    views: int = 16
+    falls: int = 96
     learning_rate: float = 1e-3  # not in the paper
     schedule: Literal["constant", "cosine"] = "constant"  # cosine ends at 0
     warmup: int = 0  # steps over which the learning rate rises from 0
@@ -68,6 +72,10 @@ class Arrays:
     target_present: dict[str, np.ndarray] = field(default_factory=dict)
     condition: np.ndarray | None = None  # (samples, condition)
     empty: dict[str, np.ndarray] = field(default_factory=dict)  # images of the untouched sensor, for state-space models
+    # For state-space models: first moments without an end, `visual` and the code `state`, (views, *shape)
+    views: dict[str, np.ndarray] = field(default_factory=dict)
+    # and trajectories without images, with the codes `state` and `pose`, `outcome` and perhaps `condition`
+    falls: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sizes = {len(x) for x in jax.tree.leaves(self._tree())}
@@ -77,14 +85,16 @@ class Arrays:
     def __len__(self) -> int:
         return len(next(iter(self.targets.values())))
 
-    def take(self, index: np.ndarray) -> Batch:
-        """These samples."""
-        return jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
+    def take(self, index: np.ndarray, **further: np.ndarray) -> Batch:
+        """These samples, and these of `views` and of `falls` where they are given."""
+        batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
+        return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
 
     def checksum(self) -> int:
         """Changes when the data do."""
         value = 0
-        for path, x in jax.tree_util.tree_leaves_with_path(self._tree() | {"empty": self.empty}):
+        further = {"empty": self.empty, "views": self.views, "falls": self.falls}
+        for path, x in jax.tree_util.tree_leaves_with_path(self._tree() | further):
             value = zlib.crc32(f"{path}{x.shape}{x.dtype}".encode(), value)
             value = zlib.crc32(np.ascontiguousarray(x).data, value)
         return value
@@ -316,9 +326,15 @@ def train(
             log = workdir / "metrics.jsonl"
             record = _truncate(log, start)
             compiled = jax.jit(lambda state, batch: step(task, graphdef, config, total, state, batch), donate_argnums=0)
+            further = {
+                name: order(config.seed + 1, len(own["state"]), size, start, total)
+                for name, own, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
+                if own and size
+            }
             recent: list[Terms] = []
             for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
-                state, terms = compiled(state, arrays.take(index))
+                rows = {name: next(batches) for name, batches in further.items()}
+                state, terms = compiled(state, arrays.take(index, **rows))
                 recent.append(jax.block_until_ready(terms))
                 if done % config.log_every == 0 or done == total:
                     record = _record(done, recent)
@@ -439,9 +455,9 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
             f"model takes masks of its inputs {list(model.inputs)}, and every target"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
-    codes, images = {name: (statespace.CODE,) for name in ("state", "pose")}, statespace.IMAGES
+    codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES
     expected = {
-        "inputs": {name: (statespace.CODE,) if name == "pose" else (*size, 3) for name in model.inputs},
+        "inputs": {name: (statespace.POSE_CODE,) if name == "pose" else (*size, 3) for name in model.inputs},
         "targets": {**{name: (*small, 3) for name in images}, **codes, "outcome": ()},
     }
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):

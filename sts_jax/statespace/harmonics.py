@@ -1,0 +1,89 @@
+"""Functions on the sphere as real spherical harmonics, which turn with an object.
+
+A function is a vector of coefficients, of degree 0, 1, 2, ..., each degree l with the orders 0, 1, -1, ..., l, -l. Turned by
+a rotation R, it has at direction d the value that it had at R' d. The harmonics are homogeneous polynomials of the
+direction, and their mean square over the sphere is 1.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def number(degree: int) -> int:
+    """Coefficients of a function up to a degree."""
+    return (degree + 1) ** 2
+
+
+def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
+    """The harmonics up to a degree at some directions.
+
+    Args:
+        direction: unit vectors. For shorter ones, harmonics of degree l shrink with the length to the power l.
+        degree: the largest.
+    """
+    x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
+    square = x**2 + y**2 + z**2
+    cosine, sine = [jnp.ones_like(x)], [jnp.zeros_like(x)]
+    for _ in range(degree):
+        cosine.append(x * cosine[-1] - y * sine[-1])
+        sine.append(x * sine[-1] + y * cosine[-2])
+    polar: dict[tuple[int, int], Float[Array, "*n"]] = {}
+    for m in range(degree + 1):
+        polar[m, m] = jnp.full_like(x, float(math.prod(range(1, 2 * m, 2))))
+        for l in range(m + 1, degree + 1):
+            before = polar.get((l - 2, m), jnp.zeros_like(x))
+            polar[l, m] = ((2 * l - 1) * z * polar[l - 1, m] - (l + m - 1) * square * before) / (l - m)
+    found = []
+    for l, m in _orders(degree):
+        scale = math.sqrt((2 - (m == 0)) * (2 * l + 1) * math.factorial(l - abs(m)) / math.factorial(l + abs(m)))
+        found.append(scale * polar[l, abs(m)] * (cosine[m] if m >= 0 else sine[-m]))
+    return jnp.stack(found, axis=-1)
+
+
+def values(
+    coefficients: Float[Array, "n c k"], rotation: Float[Array, "n 3 3"], directions: Float[np.ndarray, "j 3"]
+) -> Float[Array, "n c j"]:
+    """Turned functions at fixed directions.
+
+    Args:
+        coefficients: c functions of each of n objects.
+        rotation: of each object; a mean of rotations, which is shorter than one, gives about the mean of the values.
+        directions: unit vectors.
+    """
+    degree = math.isqrt(coefficients.shape[-1]) - 1
+    return jnp.einsum("nck,njk->ncj", coefficients, basis(directions @ rotation, degree))
+
+
+def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
+    """Functions turned about the vertical by an angle that is given as cosine and sine."""
+    cosine, sine, partner = _about_vertical(angle, coefficients.shape[-1])
+    return cosine * coefficients + sine * coefficients[..., partner]
+
+
+def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
+    """The variances of turned coefficients, where those of the coefficients are independent."""
+    cosine, sine, partner = _about_vertical(angle, variance.shape[-1])
+    return cosine**2 * variance + sine**2 * variance[..., partner]
+
+
+def _orders(degree: int) -> list[tuple[int, int]]:
+    return [(l, m) for l in range(degree + 1) for m in (0, *(s * a for a in range(1, l + 1) for s in (1, -1)))]
+
+
+def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Array, np.ndarray]:
+    """Factors of a coefficient and of the one of the opposite order, (n, 1, k), and the latter's index."""
+    orders = _orders(math.isqrt(count) - 1)
+    partner = np.array([orders.index((l, -m)) for l, m in orders])
+    powers = [jnp.stack([jnp.ones_like(angle[:, 0]), jnp.zeros_like(angle[:, 0])], axis=-1)]
+    for _ in range(orders[-1][0]):
+        cos, sin = powers[-1][:, 0], powers[-1][:, 1]
+        powers.append(
+            jnp.stack([angle[:, 0] * cos - angle[:, 1] * sin, angle[:, 0] * sin + angle[:, 1] * cos], axis=-1)
+        )
+    cosine = jnp.stack([powers[abs(m)][:, 0] for _, m in orders], axis=-1)
+    # The partner of a cosine is a sine, which enters with a minus.
+    sine = jnp.stack([powers[abs(m)][:, 1] * (-1 if m > 0 else 1 if m < 0 else 0) for _, m in orders], axis=-1)
+    return cosine[:, None], sine[:, None], partner
