@@ -136,5 +136,14 @@ def with_meshes(
     say(f"{len(meshes.names)} objects can be used; {path} has them and what was left out")
     if len(meshes.names) < LEAST_OBJECTS:
         raise ValueError(f"{folder}: {len(meshes.names)} objects are too few to hold some out: give {LEAST_OBJECTS}")
-    each = max(collection.num_per_object, round(collection.num_trajectories / len(meshes.names)))
-    return dataclasses.replace(collection, meshes=meshes, num_objects=len(meshes.names), num_per_object=each)
+    each, rendered = (
+        max(count, round(collection.num_objects * count / len(meshes.names)))
+        for count in (collection.num_per_object, collection.rendered_per_object)
+    )
+    return dataclasses.replace(
+        collection,
+        meshes=meshes,
+        num_objects=len(meshes.names),
+        num_per_object=each,
+        num_rendered=None if collection.num_rendered is None else rendered,
+    )

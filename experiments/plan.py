@@ -31,7 +31,13 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
         spent: dict[str, list[float]] = {"trajectories": [], "frames": []}
         for seed in (0, 1):
             little = dataclasses.replace(
-                dataset.head(collection, many), num_per_object=num // many, num_full=0, symmetries=True, seed=seed
+                dataset.head(collection, many),
+                num_per_object=num // many,
+                num_rendered=None,
+                num_views=0,
+                num_full=0,
+                symmetries=True,
+                seed=seed,
             )
             stamps = {"start": time.perf_counter()}
 
@@ -43,9 +49,10 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
             spent["trajectories"].append(stamps["trajectories"] - stamps["start"])
             spent["frames"].append(stamps["frames"] - stamps["trajectories"])
         last, seen = collection.scenario.frames, len(dataset.symmetries_of(collection))
-        ends = collection.num_trajectories * 2 * seen
-        rerolled = min(config.num_rerolled, round(collection.shares[2] * collection.num_trajectories)) * config.rerolls
-        frames = ends + min(collection.num_full, collection.num_trajectories) * (last - 2)
+        rendered = collection.num_objects * collection.rendered_per_object
+        rerolled = min(config.num_rerolled, round(collection.shares[2] * rendered)) * config.rerolls
+        frames = rendered * 2 * seen + min(collection.num_full, rendered) * (last - 2)
+        frames += collection.num_objects * collection.num_views
         rerolling = 0.0
         for stage, total, measured in (
             ("trajectories", collection.num_trajectories, num),
@@ -63,7 +70,7 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
         data = dataset.load(Path(name) / "0")
         tiny = dataclasses.replace(config, collection=dataset.head(collection, many), splits=("trajectory",), rerolls=2)
         pairs = data.pairs(np.arange(num), symmetries=True)
-        samples = round(stages.train_share(collection.shares, config.splits[0]) * collection.num_trajectories) * seen
+        samples = round(stages.train_share(collection.shares, config.splits[0]) * rendered) * seen
         for job in stages.jobs(config, sensor, pairs):
             stamps_of_steps = [time.perf_counter()]
 

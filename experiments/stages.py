@@ -82,6 +82,7 @@ def smoke(default: Config) -> Config:
         default.collection,
         num_objects=16,
         num_per_object=2,
+        num_rendered=None,
         num_full=4,
         objects_per_shard=8,
         symmetries=False,
@@ -111,6 +112,8 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
             num_objects=num_objects,
             num_per_object=num_per_object,
             num_full=num_objects * num_per_object,  # of about 60 frames of both streams
+            num_rendered=None,
+            num_views=0,
             symmetries=False,
             resolution=(64, 64),
             crop=True,
@@ -185,12 +188,13 @@ def train_share(shares: Sequence[float], split: str) -> float:
 
 
 def rows_of(data: dataset.Dataset, split: str) -> dict[str, np.ndarray]:
-    """Which trajectories train, validate and test."""
+    """Which of the trajectories with images train, validate and test."""
     if split == "object":
         return {name: data.members(name) for name in ("train", "validation", "test")}
     if split != "trajectory":
         raise ValueError(f"unknown split {split!r}: hold out by 'object' or by 'trajectory'.")
-    order = np.random.default_rng(data.collection["seed"]).permutation(len(data.trajectory["outcome"]))
+    rendered = data.rendered()
+    order = rendered[np.random.default_rng(data.collection["seed"]).permutation(len(rendered))]
     cut = round(train_share(data.collection["shares"], split) * len(order))
     # Without a validation part the outcome's threshold is chosen on training trajectories.
     return {"train": np.sort(order[:cut]), "validation": np.sort(order[:cut]), "test": np.sort(order[cut:])}

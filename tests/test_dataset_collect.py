@@ -249,7 +249,7 @@ def test_a_split_that_is_none_is_refused(copied, change, message):
         ("collection.json", b"[]", r"collection\.json holds no collection"),
         (
             "collection.json",
-            b'{"format": 3}',
+            b'{"format": 4}',
             r"collection\.json: num_objects must be a whole number of at least 1, got N",
         ),
     ],
@@ -279,7 +279,7 @@ def test_an_older_dataset_must_be_collected_again(copied):
     path.write_text(json.dumps(content))
     for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
         with pytest.raises(
-            ValueError, match=r"is a dataset of format 1, and this version reads format 3: delete .* and"
+            ValueError, match=r"is a dataset of format 1, and this version reads format 4: delete .* and"
         ):
             use(copied)
 

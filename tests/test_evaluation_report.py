@@ -25,6 +25,9 @@ def pairs(grey, condition):
         outcome=np.arange(num, dtype=np.int32),
         object=np.arange(num),
         trajectory=np.arange(num),
+        support=np.zeros((num, 128), np.float32),
+        mass=np.ones(num, np.float32),
+        com=np.zeros((num, 3), np.float32),
     )
 
 

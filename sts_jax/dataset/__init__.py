@@ -18,7 +18,9 @@ from sts_jax.dataset.collect import split_objects as split_objects
 from sts_jax.dataset.collect import survey_meshes as survey_meshes
 from sts_jax.dataset.collect import symmetries_of as symmetries_of
 from sts_jax.dataset.load import Dataset as Dataset
+from sts_jax.dataset.load import Ends as Ends
 from sts_jax.dataset.load import Pairs as Pairs
+from sts_jax.dataset.load import Views as Views
 from sts_jax.dataset.load import load as load
 from sts_jax.dataset.load import reduced as reduced
 from sts_jax.dataset.load import reduced_images as reduced_images
@@ -29,12 +31,14 @@ __all__ = [
     "Collected",
     "Collection",
     "Dataset",
+    "Ends",
     "Images",
     "LockedError",
     "Meshes",
     "Pairs",
     "Progress",
     "TornFileError",
+    "Views",
     "claim",
     "class_names",
     "collect",

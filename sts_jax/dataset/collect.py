@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float, PRNGKeyArray, UInt8
 from scipy import spatial
 
 from sts_jax import geometry, objects, physics
@@ -22,8 +22,9 @@ from sts_jax.dataset import records
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
 
-# Frames rendered by one compiled call.
+# Frames rendered by one compiled call, the last one of an object padded. A CPU renders them one after the other.
 RENDER_BATCH = 32
+CPU_RENDER_BATCH = 8
 SAME = 1e-5  # m, by which files of one mesh in several formats differ at most
 PARTS = ("train", "validation", "test")  # of the objects
 
@@ -51,7 +52,9 @@ class Collection:
     parts: bool = False  # what a hull fits badly collides as convex parts (package coacd, ten seconds an object)
     num_objects: int = 160
     num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
-    num_full: int = 20  # trajectories with every frame rendered; of the others the first and the last
+    num_full: int = 20  # trajectories with every frame rendered; of the other rendered ones the first and the last
+    num_rendered: int | None = None  # of each object's trajectories, the first ones, that have images; None: all
+    num_views: int = 0  # pictures of each object at further starts, without a trajectory
     symmetries: bool = True  # see each trajectory in all `scenario.symmetries`, or only as it is
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
@@ -64,6 +67,11 @@ class Collection:
     def num_trajectories(self) -> int:
         """Trajectories in the whole dataset."""
         return self.num_objects * self.num_per_object
+
+    @property
+    def rendered_per_object(self) -> int:
+        """Trajectories of each object that have images."""
+        return self.num_per_object if self.num_rendered is None else self.num_rendered
 
     @property
     def num_shards(self) -> int:
@@ -277,8 +285,8 @@ def collect(
 
     Raises:
         ValueError: The sensor cannot be (`Sensor.check`); the folder holds another collection, the message names the
-            field, or one of an older format; or the pad does not have the scenario's symmetries; or no object of a
-            shard can be simulated.
+            field, or one of an older format; or the pad does not have the scenario's symmetries; or `num_rendered` or
+            `num_views` is out of range; or no object of a shard can be simulated.
         LockedError: Another process collects into the folder.
         TornFileError: A file in the folder is damaged, or belongs to another dataset or shard; names it.
         OSError: The disk is full, or the folder cannot be written to.
@@ -292,8 +300,19 @@ def collect(
         raise ValueError(f"shares is {collection.shares}; the shares of the objects must be at least 0 and have sum 1")
     if collection.meshes is not None and collection.num_objects != len(collection.meshes.names):
         raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)}")
+    _check_counts(collection)
     with lock(folder):
         return _collect(collection, sensor, folder, progress)
+
+
+def _check_counts(collection: Collection) -> None:
+    rendered, views, most = collection.num_rendered, collection.num_views, collection.num_per_object
+    if rendered is not None and not (type(rendered) is int and 1 <= rendered <= most):
+        raise ValueError(
+            f"num_rendered must be a whole number from 1 to num_per_object={most}, or None for all, got {rendered!r}"
+        )
+    if not (type(views) is int and views >= 0):
+        raise ValueError(f"num_views must be a whole number of at least 0, got {views!r}")
 
 
 def _collect(
@@ -364,12 +383,18 @@ def _make_shard(
             left_out.append(f"{_named(collection, number)}: {str(error).partition(': ')[2]}")
     trajectory = jax.tree.map(np.asarray, trajectory)
     frames = _frames_of(collection, members, trajectory)
-    report = _report(progress, 0, len(frames), "frames")
+    views = _views_of(collection, key, list(bodies.values()), sensor)
+    report = _report(progress, 0, len(frames) + len(views["body"]), "frames")
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
     arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
+    solid = _solid(list(bodies.values()), trajectory.body, trajectory.hidden)
+    mirrored = np.stack([objects.support(objects.mirror(body)) for body in bodies.values()])
+    arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()} | {"solid/mirrored": mirrored[trajectory.body]}
+    arrays |= {f"view/{name}": leaf for name, leaf in views.items()}
+    arrays["view/body"] = members[views["body"]].astype(np.int32)
     arrays |= {"frames": frames, "left_out": np.array(left_out, str)}
-    images = _render(collection, sensor, list(bodies.values()), trajectory, frames, report)
+    images = _render(collection, sensor, list(bodies.values()), trajectory, frames, views, report)
     records.write_shard(shard_path(folder, collection.num_shards, index), images, arrays, identity)
 
 
@@ -392,10 +417,12 @@ def _named(collection: Collection, number: int) -> str:
 def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
     """Which frames are rendered: rows of (trajectory, frame, symmetry), trajectory counted in the shard."""
     num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
-    rows = []
+    rows: list[tuple[int, int, int]] = []
     for i in range(num):
         # The full ones are spread over the objects: the first trajectory of each, then the second of each, ...
         place, repeat = divmod(i, collection.num_per_object)
+        if repeat >= collection.rendered_per_object:
+            continue
         rank = repeat * collection.num_objects + members[place]
         full = rank < collection.num_full
         rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
@@ -405,41 +432,74 @@ def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.
     return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
 
 
+def _solid(bodies: list[objects.Body], which: np.ndarray, hidden: physics.Hidden) -> dict[str, np.ndarray]:
+    """The true shape, mass (kg) and centre of mass (m, mesh frame) of each draw, float32."""
+    rigid = physics.rigids(bodies, which, hidden)
+    support = np.stack([objects.support(body) for body in bodies])
+    return {"support": support[which], "mass": rigid.mass.astype(np.float32), "com": rigid.com.astype(np.float32)}
+
+
+def _views_of(
+    collection: Collection, key: PRNGKeyArray, bodies: list[objects.Body], sensor: Sensor
+) -> dict[str, np.ndarray]:
+    """The further starts of which pictures are taken: pose, number of the body in the shard, and `_solid`."""
+    if not collection.num_views:
+        shapes = {"pose": (0, 7), "support": (0, len(objects.DIRECTIONS)), "mass": (0,), "com": (0, 3)}
+        return {"body": np.zeros(0, np.int32)} | {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    starts = physics.starts(key, bodies, sensor, collection.scenario, collection.num_views)
+    starts = jax.tree.map(np.asarray, starts)
+    return {"pose": starts.pose, "body": starts.body, **_solid(bodies, starts.body, starts.hidden)}
+
+
+class _Job(NamedTuple):
+    """What one compiled call renders."""
+
+    body: objects.Body
+    pose: np.ndarray  # (n, 7)
+    wrench: np.ndarray  # (n, 6)
+    is_view: bool  # of which the visual image alone is kept
+
+
 def _render(
     collection: Collection,
     sensor: Sensor,
     bodies: list[objects.Body],
     trajectory: physics.Trajectory,
     frames: np.ndarray,
+    views: dict[str, np.ndarray],
     report: Callable[[int], None],
-) -> Iterator[records.Images]:
-    """Render `frames` in order, a fixed number a call; one thread a core, since a call keeps one core busy."""
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Render `frames`, then `views`, in order, a fixed number a call; one thread a core: a call keeps one core busy."""
+    size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
     turned = {
         q: [np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench))]
         for q in symmetries_of(collection)
     }
     mirrored = [objects.mirror(body) for body in bodies] if max(turned) >= 4 else bodies
 
-    def batches() -> Iterator[tuple[objects.Body, np.ndarray, np.ndarray, int]]:
+    def jobs() -> Iterator[_Job]:
         owner = np.stack([trajectory.body[frames[:, 0]], frames[:, 2] >= 4], 1)
         for body_index, flip in np.unique(owner, axis=0):
             rows = frames[(owner == [body_index, flip]).all(1)]
-            for start in range(0, len(rows), RENDER_BATCH):
-                part = rows[start : start + RENDER_BATCH]
-                padded = np.concatenate([part, np.repeat(part[-1:], RENDER_BATCH - len(part), 0)])
-                pose = np.stack([turned[q][0][i, t] for i, t, q in padded])
-                wrench = np.stack([turned[q][1][i, t] for i, t, q in padded])
-                yield (mirrored if flip else bodies)[body_index], pose, wrench, len(part)
+            for part in np.split(rows, range(size, len(rows), size)):
+                pose = np.stack([turned[q][0][i, t] for i, t, q in part])
+                wrench = np.stack([turned[q][1][i, t] for i, t, q in part])
+                yield _Job((mirrored if flip else bodies)[body_index], pose, wrench, False)
+        for body_index in np.unique(views["body"]):
+            poses = views["pose"][views["body"] == body_index]
+            for pose in np.split(poses, range(size, len(poses), size)):
+                yield _Job(bodies[body_index], pose, np.zeros((len(pose), 6), np.float32), True)
 
-    def work(job: tuple[objects.Body, np.ndarray, np.ndarray, int]) -> records.Images:
-        body, pose, wrench, count = job
-        images = render_uint8(sensor, body, pose, wrench, resolution=collection.resolution, crop=collection.crop)
-        return records.Images(*(np.asarray(leaf)[:count] for leaf in images))
+    def work(job: _Job) -> tuple[np.ndarray, ...]:
+        pose, wrench = (np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in (job.pose, job.wrench))
+        images = render_uint8(sensor, job.body, pose, wrench, resolution=collection.resolution, crop=collection.crop)
+        kept = images[:1] if job.is_view else images
+        return tuple(np.asarray(leaf)[: len(job.pose)] for leaf in kept)
 
     done = 0
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        for images in pool.map(work, batches()):
-            done += len(images.visual)
+        for images in pool.map(work, jobs()):
+            done += len(images[0])
             report(done)
             yield images
 

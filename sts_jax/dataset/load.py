@@ -24,6 +24,33 @@ class Pairs(NamedTuple):
     outcome: np.ndarray  # int32 (n,), physics.Outcome
     object: np.ndarray  # int64 (n,), index of the object in the collection
     trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
+    support: np.ndarray  # float32 (n, 128), m: `objects.support` of the body, the mirrored one where it is mirrored
+    mass: np.ndarray  # float32 (n,), kg, with the trajectory's hidden values
+    com: np.ndarray  # float32 (n, 3), m, centre of mass in the mesh frame; mirrored like the body
+
+
+class Ends(NamedTuple):
+    """First and last poses of some trajectories, with the true shape and mass, and without images."""
+
+    pose: np.ndarray  # float32 (n, 2, 7): first, last
+    condition: np.ndarray  # float32 (n, c): the scenario's input, SI units
+    outcome: np.ndarray  # int32 (n,), physics.Outcome
+    support: np.ndarray  # float32 (n, 128), m: `objects.support` of the body
+    mass: np.ndarray  # float32 (n,), kg, with the trajectory's hidden values
+    com: np.ndarray  # float32 (n, 3), m, centre of mass in the mesh frame
+    object: np.ndarray  # int64 (n,), index of the object in the collection
+    trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
+
+
+class Views(NamedTuple):
+    """Pictures of some objects at starts without a trajectory, in memory."""
+
+    visual: np.ndarray  # uint8 (m, height, width, 3)
+    pose: np.ndarray  # float32 (m, 7)
+    support: np.ndarray  # float32 (m, 128), m: `objects.support` of the body
+    mass: np.ndarray  # float32 (m,), kg, with hidden values drawn for the view
+    com: np.ndarray  # float32 (m, 3), m, centre of mass in the mesh frame
+    object: np.ndarray  # int64 (m,), index of the object in the collection
 
 
 def reduced(pairs: Pairs, size: int) -> Pairs:
@@ -66,10 +93,14 @@ class Dataset:
     split: dict[str, np.ndarray]  # name -> object indices
     trajectory: dict[str, np.ndarray]  # physics.Trajectory's leaves, all shards: (num, ...)
     hidden: dict[str, np.ndarray]  # physics.Hidden's leaves, (num,)
+    solid: dict[str, np.ndarray]  # support, mirrored (the mirrored body's support), mass, com of each: (num, ...)
+    view: dict[str, np.ndarray]  # pose, body, support, mass, com of each view: (k, ...)
     frames: np.ndarray  # int (m, 3): trajectory, frame, symmetry of every stored image, in order of the shards
     shards: tuple[Path, ...]
     shard_of: np.ndarray  # int (m,): which shard holds it
     record_of: np.ndarray  # int (m,): where in it
+    view_shard_of: np.ndarray  # int (k,): which shard holds the picture of each view
+    view_record_of: np.ndarray  # int (k,): where in it
 
     def images(self, rows: np.ndarray) -> records.Images:
         """Read the images of some rows of `frames`, in the order asked for."""
@@ -85,11 +116,18 @@ class Dataset:
                 self.shards[shard],
                 self.record_of[rows[here]],
                 resolution=(height, width),
-                total=int((self.shard_of == shard).sum()),
+                total=self._records_in(shard),
             )
             for whole, piece in zip(out, part, strict=True):
                 whole[here] = piece
         return out
+
+    def _records_in(self, shard: int) -> int:
+        return int((self.shard_of == shard).sum() + (self.view_shard_of == shard).sum())
+
+    def rendered(self) -> np.ndarray:
+        """Indices of the trajectories that have images."""
+        return np.unique(self.frames[:, 0]).astype(np.int64)
 
     def full_trajectories(self) -> np.ndarray:
         """Indices of the trajectories that have every frame rendered."""
@@ -102,11 +140,80 @@ class Dataset:
         rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
         return self.images(rows[np.argsort(self.frames[rows, 1])])
 
-    def members(self, part: str) -> np.ndarray:
-        """Indices of the trajectories of `train`, `validation` or `test`."""
+    def members(self, part: str, *, rendered: bool = True) -> np.ndarray:
+        """Indices of the trajectories of `train`, `validation` or `test`.
+
+        Args:
+            part: Its name.
+            rendered: Those with images only, which `pairs` loads; False: all, which `ends` loads.
+
+        Raises:
+            ValueError: There is no such part.
+        """
+        found = np.flatnonzero(np.isin(self.trajectory["body"], self._part(part)))
+        return found[np.isin(found, self.rendered())] if rendered else found
+
+    def _part(self, part: str) -> np.ndarray:
         if part not in self.split:
             raise ValueError(f"unknown part {part!r} of the dataset: one of {', '.join(self.split)}.")
-        return np.flatnonzero(np.isin(self.trajectory["body"], self.split[part]))
+        return self.split[part]
+
+    def ends(self, trajectories: np.ndarray) -> Ends:
+        """First and last poses of some trajectories, with images or without. No image is read.
+
+        Args:
+            trajectories: Their indices.
+
+        Raises:
+            ValueError: An index is no whole number or out of range.
+        """
+        index = self._checked(trajectories)
+        return Ends(
+            pose=self.trajectory["pose"][index][:, [0, -1]],
+            condition=self.trajectory["condition"][index],
+            outcome=self.trajectory["outcome"][index],
+            support=self.solid["support"][index],
+            mass=self.solid["mass"][index],
+            com=self.solid["com"][index],
+            object=self.trajectory["body"][index].astype(np.int64),
+            trajectory=index,
+        )
+
+    def views(self, part: str) -> Views:
+        """Pictures of the objects of `train`, `validation` or `test` at further starts; there may be none.
+
+        Args:
+            part: Its name.
+
+        Raises:
+            ValueError: There is no such part.
+        """
+        rows = np.flatnonzero(np.isin(self.view["body"], self._part(part)))
+        height, width = self.collection["resolution"]
+        visual = np.empty((len(rows), height, width, 3), np.uint8)
+        for shard in np.unique(self.view_shard_of[rows]):
+            here = np.flatnonzero(self.view_shard_of[rows] == shard)
+            visual[here] = records.read_views(
+                self.shards[shard],
+                self.view_record_of[rows[here]],
+                resolution=(height, width),
+                total=self._records_in(shard),
+            )
+        pose, support, mass, com = (self.view[name][rows] for name in ("pose", "support", "mass", "com"))
+        return Views(visual, pose, support, mass, com, self.view["body"][rows].astype(np.int64))
+
+    def _checked(self, trajectories: Any) -> np.ndarray:
+        """Indices of trajectories as int64, or a ValueError where they are none."""
+        trajectories, count = np.asarray(trajectories), len(self.trajectory["outcome"])
+        if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
+            raise ValueError(
+                f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}; it takes a list "
+                "of indices (np.flatnonzero turns a mask into one)."
+            )
+        outside = trajectories[(trajectories < 0) | (trajectories >= count)]
+        if outside.size:
+            raise ValueError(f"trajectories holds {outside[0]}; the dataset has trajectories 0 to {count - 1}.")
+        return trajectories.astype(np.int64)
 
     def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
         """First and last frame of some trajectories.
@@ -116,18 +223,15 @@ class Dataset:
             symmetries: Each also turned and mirrored, as the collection rendered it.
 
         Raises:
-            ValueError: An index is no whole number or out of range.
+            ValueError: An index is no whole number or out of range, or of a trajectory without images.
         """
-        trajectories = np.asarray(trajectories)
-        count = len(self.trajectory["outcome"])
-        if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
+        trajectories = self._checked(trajectories)
+        without = trajectories[~np.isin(trajectories, self.rendered())]
+        if without.size:
             raise ValueError(
-                f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}; it takes a list "
-                "of indices (np.flatnonzero turns a mask into one)."
+                f"trajectories holds {without[0]}, which has no images (num_rendered="
+                f"{self.collection['num_rendered']}): use `ends`, or take indices from `members` or `rendered`."
             )
-        outside = trajectories[(trajectories < 0) | (trajectories >= count)]
-        if outside.size:
-            raise ValueError(f"trajectories holds {outside[0]}; the dataset has trajectories 0 to {count - 1}.")
         last = self.trajectory["pose"].shape[1] - 1
         kinds = np.unique(self.frames[:, 2]).tolist() if symmetries else [0]
         row_of = {tuple(row): i for i, row in enumerate(self.frames.tolist())}
@@ -139,6 +243,8 @@ class Dataset:
         turned = np.stack([np.asarray(turn(ends, kind)) for kind in kinds])
         conditions = np.stack([np.asarray(turn_condition(input, kind)) for kind in kinds])
         place = np.tile(np.arange(len(kinds)), len(trajectories))
+        mirrored = np.array(kinds)[place, None] >= 4
+        com = self.solid["com"][index]
         return Pairs(
             visual=images[0],
             tactile=images[1],
@@ -149,6 +255,9 @@ class Dataset:
             outcome=self.trajectory["outcome"][index],
             object=self.trajectory["body"][index],
             trajectory=index,
+            support=np.where(mirrored, self.solid["mirrored"][index], self.solid["support"][index]),
+            mass=self.solid["mass"][index],
+            com=np.where(mirrored, com * np.array([1, -1, 1], np.float32), com),
         )
 
 
@@ -180,17 +289,22 @@ def load(folder: str | Path) -> Dataset:
     starts = np.cumsum([0] + [len(part["trajectory/outcome"]) for part in parts])
     leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
     sizes = [len(part["frames"]) for part in parts]
+    views = [len(part["view/body"]) for part in parts]
     contents = [sha256(shard.with_suffix(".npz")) for shard in shards]  # each holds the hash of its images
     return Dataset(
         collection=collection,
         identity=digest([made_of, seen_by, {name: part.tolist() for name, part in split.items()}, contents]),
         split=split,
-        trajectory={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("trajectory/")},
-        hidden={k.split("/")[1]: v for k, v in leaves.items() if k.startswith("hidden/")},
+        **{
+            group: {k.split("/")[1]: v for k, v in leaves.items() if k.startswith(f"{group}/")}
+            for group in ("trajectory", "hidden", "solid", "view")
+        },
         frames=np.concatenate([p["frames"] + np.array([s, 0, 0]) for p, s in zip(parts, starts[:-1], strict=True)]),
         shards=tuple(shards),
         shard_of=np.repeat(np.arange(count), sizes),
         record_of=np.concatenate([np.arange(size) for size in sizes]),
+        view_shard_of=np.repeat(np.arange(count), views),
+        view_record_of=np.concatenate([size + np.arange(k) for size, k in zip(sizes, views, strict=True)]),
     )
 
 

@@ -1,7 +1,8 @@
 """Shards on disk: whole files or none, the same bytes from the same inputs.
 
 A shard is two files. `NAME.array_record` holds one record per rendered frame: the visual image, the tactile image
-(`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. `NAME.npz` holds everything small as
+(`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. Behind the frames it holds one record per
+view, the visual image alone. `NAME.npz` holds everything small as
 named arrays and is written last: a shard without it does not exist. It also holds the shard's `Identity` and the
 SHA-256 of its record file, so that neither file can be exchanged for one of another shard or dataset.
 """
@@ -17,10 +18,12 @@ from array_record.python.array_record_module import ArrayRecordReader, ArrayReco
 from sts_jax import physics
 from sts_jax._files import TornFileError, sha256, write_bytes, write_whole
 
-FORMAT = 3  # of a dataset's files; one more whenever older files can no longer be read
+FORMAT = 4  # of a dataset's files; one more whenever older files can no longer be read
 ARRAYS = {  # the names that a shard's .npz holds beside its identity
     *(f"trajectory/{name}" for name in physics.Trajectory._fields if name != "hidden"),
     *(f"hidden/{name}" for name in physics.Hidden._fields),
+    *(f"solid/{name}" for name in ("support", "mirrored", "mass", "com")),
+    *(f"view/{name}" for name in ("pose", "body", "support", "mass", "com")),
     "frames",
     "left_out",
 }
@@ -61,12 +64,14 @@ def check_format(content: Any, folder: Path) -> None:
         )
 
 
-def write_shard(path: Path, frames: Iterable[Images], arrays: dict[str, np.ndarray], identity: Identity) -> None:
+def write_shard(
+    path: Path, frames: Iterable[tuple[np.ndarray, ...]], arrays: dict[str, np.ndarray], identity: Identity
+) -> None:
     """Write both files of a shard.
 
     Args:
         path: The `.array_record` file.
-        frames: The images, batch by batch.
+        frames: The records, batch by batch: `Images` of frames, then of views `(visual,)`.
         arrays: Everything else, with the names ARRAYS.
         identity: Which shard this is.
 
@@ -124,15 +129,15 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def write_images(path: Path, frames: Iterable[Images]) -> None:
-    """Write the frames of each batch in order to an array_record file, whole or not at all."""
+def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
+    """Write the images of each batch in order to an array_record file, whole or not at all."""
 
     def write(temporary: Path) -> None:
         writer = _or_os_error(ArrayRecordWriter, str(temporary), WRITER_OPTIONS)
         for batch in frames:
-            for visual, tactile, segmentation in zip(*batch, strict=True):
-                record = visual.tobytes() + tactile.tobytes() + np.packbits(segmentation).tobytes()
-                _or_os_error(writer.write, record)
+            for images in zip(*batch, strict=True):
+                record = [np.packbits(image) if image.dtype == bool else image for image in images]
+                _or_os_error(writer.write, b"".join(image.tobytes() for image in record))
         _or_os_error(writer.close)
 
     write_whole(path, write)
@@ -175,6 +180,25 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
         FileNotFoundError: No such file.
         TornFileError: The file is truncated or holds another number of records.
     """
+    height, width = resolution
+    size = height * width * 3
+    data = _read_records(path, indices, total)
+    return Images(
+        visual=data[:, :size].reshape(-1, height, width, 3),
+        tactile=data[:, size : 2 * size].reshape(-1, height, width, 3),
+        segmentation=np.unpackbits(data[:, 2 * size :], axis=1, count=height * width)
+        .reshape(-1, height, width)
+        .astype(bool),
+    )
+
+
+def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
+    """Read some views of a shard, `uint8 (n, height, width, 3)`; as `read_images`."""
+    return _read_records(path, indices, total).reshape(-1, *resolution, 3)
+
+
+def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
+    """Read some records of equal length, `uint8 (n, length)`."""
     if not path.is_file():
         raise _missing(path)
     torn = f"{path} is torn; delete it and {path.with_suffix('.npz').name} and start the collection again"
@@ -186,17 +210,8 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
     except (RuntimeError, ValueError, IndexError) as error:
         raise TornFileError(f"{torn}: {error}.") from error
     if count != total:
-        raise TornFileError(f"{torn}: it holds {count} frames instead of {total}.")
-    height, width = resolution
-    size = height * width * 3
-    data = np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
-    return Images(
-        visual=data[:, :size].reshape(-1, height, width, 3),
-        tactile=data[:, size : 2 * size].reshape(-1, height, width, 3),
-        segmentation=np.unpackbits(data[:, 2 * size :], axis=1, count=height * width)
-        .reshape(-1, height, width)
-        .astype(bool),
-    )
+        raise TornFileError(f"{torn}: it holds {count} records instead of {total}.")
+    return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
 
 
 def _missing(path: Path) -> FileNotFoundError:

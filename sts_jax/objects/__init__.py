@@ -15,10 +15,11 @@ from sts_jax.objects.body import (
 from sts_jax.objects.libraries import HOLLOW, Entry, Item, Library, bodies, describe, facts, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import decompose, gaps, hull_gap, rest_poses
+from sts_jax.objects.solids import DIRECTIONS, decompose, gaps, hull_gap, rest_poses, support
 
 __all__ = [
     "CATEGORIES",
+    "DIRECTIONS",
     "FACE_CLASSES",
     "HOLLOW",
     "HULL_CLASSES",
@@ -43,5 +44,6 @@ __all__ = [
     "rest_poses",
     "rigid",
     "stack",
+    "support",
     "survey",
 ]

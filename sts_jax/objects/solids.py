@@ -23,6 +23,18 @@ SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull that lean less against o
 REST_GRAIN = 2e-5  # m, points of a hull this near a face's plane belong to it
 REST_MARGIN = 5e-4  # m, how far inside the outline of a face the centre of mass must lie for the object to rest on it
 
+NUM_DIRECTIONS = 128
+
+
+def _lattice(num: int) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+    step = np.arange(num) + 0.5
+    z, angle = 1 - 2 * step / num, np.pi * (1 + np.sqrt(5)) * step
+    return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+
+
+DIRECTIONS = _lattice(NUM_DIRECTIONS).astype(np.float32)  # (128, 3) unit vectors, at which `support` is evaluated
+
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
@@ -108,6 +120,24 @@ def convex_hull(
         chosen.append(furthest)
     corners = candidates[chosen]
     return corners[np.sort(ConvexHull(corners).vertices)]
+
+
+def support(body: Body) -> Float[np.ndarray, "128"]:
+    """The support function of the convex hull of what collides, about the mesh origin: h(d) = max over vertices v . d.
+
+    Args:
+        body: one body.
+
+    Returns:
+        float32, m, at DIRECTIONS in the mesh frame.
+
+    Raises:
+        ValueError: `body` has leading axes.
+    """
+    if np.ndim(body.hulls) != 3:
+        raise ValueError(f"hulls has the shape {np.shape(body.hulls)}; one body has (p, h, 3): take one of the bodies")
+    points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
+    return (points @ DIRECTIONS.T.astype(np.float64)).max(axis=0).astype(np.float32)
 
 
 def rest_poses(

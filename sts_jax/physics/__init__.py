@@ -1,5 +1,6 @@
 """Physics: objects fall, slide and topple on the pad in MuJoCo (`simulate`), or lie there at rest (`place`)."""
 
+from sts_jax.physics.draws import Starts, starts
 from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
 from sts_jax.physics.scenarios import (
     Freefall,
@@ -13,7 +14,7 @@ from sts_jax.physics.scenarios import (
     variant,
 )
 from sts_jax.physics.scene import Contact
-from sts_jax.physics.simulate import BodyError, Engine, Trajectory, refusal, simulate
+from sts_jax.physics.simulate import BodyError, Engine, Rigid, Trajectory, refusal, rigids, simulate
 
 __all__ = [
     "BodyError",
@@ -25,15 +26,19 @@ __all__ = [
     "Outcome",
     "Perturbed",
     "Placement",
+    "Rigid",
     "Scenario",
     "StableFaces",
+    "Starts",
     "Trajectory",
     "Variant",
     "fell_off",
     "place",
     "refusal",
+    "rigids",
     "simulate",
     "stable_faces",
+    "starts",
     "variant",
     "weight",
 ]

@@ -267,8 +267,8 @@ def _check_hidden(hidden: Hidden, count: int) -> Hidden:
     return Hidden(**jax.tree.map(jnp.asarray, arrays))
 
 
-class _Rigid(NamedTuple):
-    """What is rigid of each draw, float64."""
+class Rigid(NamedTuple):
+    """Mass properties and friction of draws, float64."""
 
     mass: Float[np.ndarray, "n"]  # kg
     com: Float[np.ndarray, "n 3"]  # m, mesh frame
@@ -276,8 +276,17 @@ class _Rigid(NamedTuple):
     friction: Float[np.ndarray, "n"]
 
 
-def _rigids(bodies: Sequence[Body], which: np.ndarray, hidden: Hidden) -> _Rigid:
-    """Mass properties and friction of each draw; `which`, the index of its body, never falls."""
+def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
+    """Mass properties (`objects.rigid`) and friction of draws.
+
+    Args:
+        bodies: the bodies.
+        which: index of the body of each draw, in ascending order.
+        hidden: the hidden values of each draw.
+
+    Returns:
+        (n,) each, in the order of the draws.
+    """
     values = jax.tree.map(np.asarray, hidden)
     found = []
     for index in np.unique(which).tolist():
@@ -287,10 +296,10 @@ def _rigids(bodies: Sequence[Body], which: np.ndarray, hidden: Hidden) -> _Rigid
             own = Hidden(*(x[np.resize(rows, RIGIDS)] for x in values))
             rigid = _rigid(bodies[index], own.fill, own.shell_scale, own.up)
             found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])
-    return _Rigid(*(np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True)))
+    return Rigid(*(np.concatenate(parts).astype(np.float64) for parts in zip(*found, strict=True)))
 
 
-def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: _Rigid, row: int) -> None:
+def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rigid, row: int) -> None:
     try:
         scene.set_rigid(model, data, *(x[row] for x in rigid))
     except ValueError as error:
@@ -304,7 +313,7 @@ def _draws(
     original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
     data = mujoco.MjData(model)
-    rigid = _rigids(bodies, which, hidden)
+    rigid = rigids(bodies, which, hidden)
     fields = []
     for row, body in enumerate(which.tolist()):
         _set_rigid(model, data, body, rigid, row)
@@ -349,7 +358,7 @@ def _in_mjx(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _R
 def _in_c(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _Run:
     """As `_in_mjx`; the trajectories of one call are of one body."""
     bodies, which, _, scenario, pad, time = trajectories
-    rigid = _rigids(bodies, which, hidden)
+    rigid = rigids(bodies, which, hidden)
     starts = jax.tree.map(np.asarray, starts)
 
     @functools.lru_cache(maxsize=COMPILED)
