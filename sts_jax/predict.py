@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib.resources
 import math
 import operator
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from sts_jax import _files, mvae, statespace, training
 
 MODALITIES = ("visual", "tactile", "pose")
+MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # the models of the library, a folder each
 _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
 _FARTHEST = 10.0  # m, of a position: beyond it the numbers are no metres
 _LARGEST_CONDITION = 100.0  # in units of the condition's usual size
@@ -200,7 +202,8 @@ def _flat(
 class Predictor:
     """A trained model as a function: `predictor(visual=image)` gives a `Prediction`.
 
-    It is pure, and works inside `jax.jit`, `jax.vmap` and `jax.grad`.
+    It is pure, and works inside `jax.jit`, `jax.vmap` and `jax.grad`. `Predictor.load("freefall")` loads a model that
+    comes with the library, and `Predictor.load("runs/freefall/models/statespace")` one that you trained.
     """
 
     def __init__(
@@ -236,23 +239,26 @@ class Predictor:
         resolution: tuple[int, int] | None = None,
         crop: bool | None = None,
     ) -> "Predictor":
-        """Read a model's folder, such as `runs/freefall/models/mvae`.
+        """Read a trained model.
 
         Args:
-            folder: The `workdir` of a training, or the folder of `save`.
+            folder: The `workdir` of a training, or the folder of `save`, such as `runs/freefall/models/mvae`. Or the
+                name of a model that comes with the library, such as `freefall`: it is loaded unless the current
+                directory has a folder of this name with a `config.json`.
             resolution: The images that will be given; refused if the model was trained on another.
             crop: The view that will be given (True: the square around the object); refused likewise.
 
         Raises:
-            FileNotFoundError: There is no model in the folder.
+            FileNotFoundError: There is no model in the folder, nor one of this name in the library.
             OSError: A file is damaged, missing or not listed in `manifest.json`.
             ValueError: The model was trained on another view, by another version of sts_jax, or has no manifest.
         """
-        model = training.load(folder)
+        path = _located(folder)
+        model = training.load(path)
         try:
             preprocessing = training.preprocessing_from_json(model.settings.get("preprocessing", {}))
         except ValueError as error:
-            raise ValueError(f"{Path(folder) / 'config.json'}, preprocessing: {error}") from error
+            raise ValueError(f"{path / 'config.json'}, preprocessing: {error}") from error
         for field, asked in (("resolution", resolution and tuple(resolution)), ("crop", crop)):
             there = getattr(preprocessing, field)
             if asked is not None and asked != there:
@@ -262,19 +268,21 @@ class Predictor:
                 )
         if isinstance(model.config, statespace.Config):
             _check_view(str(folder), model.config, preprocessing)
-        blank = training.load_blank(Path(folder))
+        blank = training.load_blank(path)
         if any(image.shape[:2] != preprocessing.resolution for image in blank):
             raise ValueError(
-                f"{Path(folder) / 'blank.npz'} has images of {blank[0].shape[:2]}, the model takes "
-                f"{preprocessing.resolution}: it is of another model; delete {folder} and train again."
+                f"{path / 'blank.npz'} has images of {blank[0].shape[:2]}, the model takes "
+                f"{preprocessing.resolution}: it is of another model; delete {path} and train again."
             )
         return cls(model, preprocessing, blank, str(folder))
 
-    def save(self, folder: str | Path) -> None:
+    def save(self, folder: str | Path, *, compact: bool = False) -> None:
         """Write a folder that `load` reads. Training cannot go on from it: it lacks the optimiser's state.
 
         Args:
             folder: A new or an empty folder.
+            compact: Round the weights to a third of their size. A weight changes by at most 1/512 of the root mean
+                square of its output channel, and predictions change slightly.
 
         Raises:
             FileExistsError: The folder is not empty.
@@ -287,7 +295,7 @@ class Predictor:
         params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
         training.save_blank(folder, *self._images)
         _files.write_json(folder / "config.json", settings)
-        training.save(folder, training.Weights(params, stats, jnp.int32(self.model.step)))
+        training.save(folder, training.Weights(params, stats, jnp.int32(self.model.step)), compact=compact)
 
     def __repr__(self) -> str:
         config, view = self.model.config, self.preprocessing
@@ -457,6 +465,20 @@ class Predictor:
                 "usual; are these SI units?"
             )
         return condition, None
+
+
+def _located(folder: str | Path) -> Path:
+    """The folder of a model, given this folder, or the name of a model of the library."""
+    path, name = Path(folder), str(folder)
+    if name != path.name or (path / "config.json").exists():
+        return path
+    names = sorted(config.parent.name for config in MODELS.glob("*/config.json"))
+    if name not in names:
+        raise FileNotFoundError(
+            f"{name!r} is neither a folder with a config.json nor one of the trained models that come with sts_jax "
+            f"({', '.join(names) or 'none'}): give one of these names, or the folder of a trained model."
+        )
+    return MODELS / name
 
 
 def _check_view(name: str, config: statespace.Config, preprocessing: training.Preprocessing) -> None:

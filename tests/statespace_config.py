@@ -1,6 +1,12 @@
-"""The smallest state-space model, which compiles in seconds."""
+"""The smallest state-space models, which compile in seconds."""
 
-from sts_jax import statespace
+import dataclasses
+
+import jax
+import numpy as np
+
+import sts_jax as sts
+from sts_jax import statespace, training
 
 TINY = statespace.Config(
     input_size=16,
@@ -14,3 +20,16 @@ TINY = statespace.Config(
     transition=16,
     canvas=16,
 )
+
+STATE = dataclasses.replace(TINY, inputs=statespace.INPUTS, outcomes=3, condition=3, input_size=32)
+
+
+def state_model(**changes):
+    """A predictor with a state-space model before its training."""
+    size = STATE.input_size
+    view = {"resolution": (size, size), "condition_scale": (10.0, 10.0, 0.1)} | changes
+    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
+    settings = {"kind": "statespace", "model": STATE.to_json()}
+    model = training.Model(STATE, graphdef, params, 0, settings)
+    grey = np.full((size, size, 3), 178, np.uint8)
+    return sts.Predictor(model, training.Preprocessing(**view), (grey, grey), "new")

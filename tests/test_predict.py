@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from statespace_config import TINY
+from statespace_config import STATE, state_model
 
 import sts_jax as sts
 from sts_jax import mvae, statespace, training
-from sts_jax.predict import predict
+from sts_jax.predict import MODELS, predict
 
 SIDE = 32
 # As its users call it: without the tests' own checks of types and shapes.
@@ -388,19 +388,6 @@ def test_floats_of_any_precision_are_taken(predictor, dtype):
     close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))
 
 
-STATE = dataclasses.replace(TINY, inputs=statespace.INPUTS, outcomes=3, condition=3, input_size=SIDE)
-
-
-def state_model(**changes):
-    """A state-space model before its training."""
-    view = {"resolution": (SIDE, SIDE), "condition_scale": (10.0, 10.0, 0.1)} | changes
-    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
-    settings = {"kind": "statespace", "model": STATE.to_json()}
-    model = training.Model(STATE, graphdef, params, 0, settings)
-    grey = np.full((SIDE, SIDE, 3), 178, np.uint8)
-    return sts.Predictor(model, training.Preprocessing(**view), (grey, grey), "new")
-
-
 @pytest.fixture(scope="module")
 def state_predictor(tmp_path_factory):
     folder = tmp_path_factory.mktemp("statespace") / "saved"
@@ -486,3 +473,81 @@ def test_a_state_space_model_of_another_view_is_refused(tmp_path, change):
     state_model(**change).save(tmp_path / "model")
     with pytest.raises(ValueError, match=f"needs preprocessing with {next(iter(change))}="):
         sts.Predictor.load(tmp_path / "model")
+
+
+@pytest.fixture(scope="module")
+def compact(state_predictor, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compact") / "falls"
+    state_predictor.save(folder, compact=True)
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["predictor", "state_predictor"])
+def test_a_compact_copy_predicts_nearly_the_same(kind, request, tmp_path):
+    original = request.getfixturevalue(kind)
+    original.save(tmp_path / "copy", compact=True)
+    again = sts.Predictor.load(tmp_path / "copy")
+    assert (again.preprocessing, again.model.config) == (original.preprocessing, original.model.config)
+    assert (again.model.step, again.model.graphdef) == (original.model.step, original.model.graphdef)
+
+    def check(rounded, exact):
+        assert (rounded.shape, rounded.dtype) == (exact.shape, exact.dtype)
+        size = np.sqrt(np.mean(np.square(exact), axis=tuple(range(exact.ndim - 1)))) if exact.ndim > 1 else 0.0
+        assert np.all(np.abs(rounded - exact) <= 1.001 * size / 512)
+
+    jax.tree.map(check, again.model.state, original.model.state)
+    more = {"condition": CONDITION} if original.model.config.condition else {}
+    given = measurement(2)
+    out, want = again(**given, **more), original(**given, **more)
+    for name in ("visual", "tactile", "mean", "log_var"):
+        np.testing.assert_allclose(getattr(out, name), getattr(want, name), atol=5e-3)
+
+
+def test_any_flipped_bit_in_compact_weights_is_found_and_named(compact, tmp_path):
+    folder, rng = shutil.copytree(compact, tmp_path / "copy"), np.random.default_rng(0)
+    (weights,) = folder.rglob("weights.npz")
+    whole = weights.read_bytes()
+    for place in (0, *rng.integers(len(whole), size=5)):
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << rng.integers(8)
+        weights.write_bytes(flipped)
+        with pytest.raises(OSError, match=r"weights\.npz is not the file that manifest\.json lists"):
+            sts.Predictor.load(folder)
+    weights.write_bytes(whole[:1000])
+    (folder / "manifest.json").unlink()
+    training.seal(folder)
+    with pytest.raises(ValueError, match=r"00000000 cannot be read \(BadZipFile.*damaged before its checksums"):
+        sts.Predictor.load(folder)
+    weights.unlink()
+    with pytest.raises(OSError, match=r"weights\.npz is missing"):
+        sts.Predictor.load(folder)
+
+
+def test_a_model_of_the_library_is_loaded_by_its_name(compact, predictor, tmp_path, monkeypatch):
+    monkeypatch.setattr("sts_jax.predict.MODELS", compact.parent)
+    monkeypatch.chdir(tmp_path)
+    assert repr(sts.Predictor.load("falls")).startswith("Predictor('falls': takes visual, tactile, pose; ")
+    (tmp_path / "falls").mkdir()  # no model is in it
+    assert sts.Predictor.load(pathlib.Path("falls")).model.config == STATE
+    for unknown in ("freefal", ".."):
+        with pytest.raises(FileNotFoundError, match=rf"'{unknown}' is neither .* come with sts_jax \(falls\)"):
+            sts.Predictor.load(unknown)
+    with pytest.raises(FileNotFoundError, match=r"falls: has no config\.json"):
+        sts.Predictor.load(tmp_path / "falls")
+    predictor.save("falls")
+    assert sts.Predictor.load("falls").model.config == predictor.model.config
+
+
+# Shipped by experiments.ship, which also checks the size.
+@pytest.mark.parametrize("name", sorted(path.parent.name for path in MODELS.glob("*/config.json")))
+def test_each_model_of_the_library_predicts_from_vision(name, tmp_path, monkeypatch):
+    assert sum(path.stat().st_size for path in (MODELS / name).rglob("*") if path.is_file()) <= 12e6
+    monkeypatch.chdir(tmp_path)
+    predictor = sts.Predictor.load(name)
+    visual = training.load_blank(MODELS / name)[0].astype(np.float32) / 255
+    visual[40:80, 50:70] *= 0.3  # something dark
+    condition = np.array(predictor.preprocessing.condition_scale) / 2
+    out = predictor(visual=visual, condition=condition if condition.size else None)
+    size = predictor.model.config.image_size
+    assert out.visual.shape == out.tactile.shape == (size, size, 3)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(out))

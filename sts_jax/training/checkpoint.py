@@ -2,7 +2,8 @@
 
 A model's folder holds `config.json` (the model, the run and the caller's preprocessing), `metrics.jsonl`,
 `checkpoints/STEP/` and `manifest.json`, which names the checkpoint that counts and holds the checksums of its files
-(`sts_jax.training.manifest`). A kill while a checkpoint is written leaves the one before.
+(`sts_jax.training.manifest`). A kill while a checkpoint is written leaves the one before. A checkpoint is written by
+Orbax, or is one small file (`sts_jax.training.rounded`).
 """
 
 import contextlib
@@ -20,7 +21,7 @@ from jaxtyping import Array, Int
 from orbax.checkpoint import v1 as ocp
 
 from sts_jax import _files
-from sts_jax.training import manifest
+from sts_jax.training import manifest, rounded
 
 
 class TrainState(NamedTuple):
@@ -43,8 +44,13 @@ class Weights(NamedTuple):
 State = TypeVar("State", TrainState, Weights)
 
 
-def save(folder: Path, state: TrainState | Weights) -> None:
+def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) -> None:
     """Write `folder/checkpoints/STEP` and its checksums, then delete older checkpoints.
+
+    Args:
+        folder: the model's folder.
+        state: what is written.
+        compact: round the weights, and write one small file, see `training.rounded`.
 
     Raises:
         OSError: the disk is full or the folder is not writable. The checkpoint before is still valid.
@@ -58,9 +64,13 @@ def save(folder: Path, state: TrainState | Weights) -> None:
     try:
         _keep_only(folder, kept)  # a kill may have left a checkpoint that the manifest does not name
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with _quiet_orbax():
-                ocp.save(str(path.absolute()), _plain(state))
+            if compact:
+                path.mkdir(parents=True)
+                rounded.write(path / rounded.NAME, _plain(state))
+            else:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with _quiet_orbax():
+                    ocp.save(str(path.absolute()), _plain(state))
         except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
             left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
@@ -109,26 +119,40 @@ def read(path: Path, like: State) -> State:
     Raises:
         ValueError: it lacks one of them, or has it with another shape.
     """
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    abstract = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), _plain(like))
-    context = ocp.Context()
-    context.pytree.loading.partial_load = True
+    wanted = _plain(like)
     try:
-        with _quiet_orbax():
-            there = ocp.metadata(str(path.absolute())).metadata
-        # Compared first: Orbax cuts or pads arrays of another shape, or prints thousands of lines.
-        for name, x in abstract.items():
-            if name not in there or (there[name].shape, there[name].dtype) != (x.shape, x.dtype):
-                raise ValueError(f"{name} is missing or has another shape")
-        with context, _quiet_orbax():
-            loaded = ocp.load(str(path.absolute()), abstract)
-    except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
+        loaded = (_read_rounded if (path / rounded.NAME).exists() else _read_orbax)(path, wanted)
+    except Exception as error:  # Orbax, TensorStore and zipfile raise many kinds, some with pages of their own traces
         raise ValueError(
             f"{path} cannot be read ({type(error).__name__}: {_first_line(error)}): it was damaged before its "
             "checksums were taken, or belongs to another model, or was saved by Predictor.save, which leaves out the "
             "optimiser's state that training needs. Give another folder, or delete this one and train again."
         ) from None
-    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
+    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in wanted])
+
+
+def _read_orbax(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    abstract = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in wanted.items()}
+    context = ocp.Context()
+    context.pytree.loading.partial_load = True
+    with _quiet_orbax():
+        # Compared first: Orbax cuts or pads arrays of another shape, or prints thousands of lines.
+        _compare(ocp.metadata(str(path.absolute())).metadata, wanted)
+        with context:
+            return ocp.load(str(path.absolute()), abstract)
+
+
+def _read_rounded(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
+    there = rounded.read(path / rounded.NAME)
+    _compare(there, wanted)
+    return jax.device_put({name: there[name] for name in wanted}, jax.devices()[0])
+
+
+def _compare(there: dict[str, Any], wanted: dict[str, Any]) -> None:
+    for name, x in wanted.items():
+        if name not in there or (there[name].shape, there[name].dtype) != (x.shape, x.dtype):
+            raise ValueError(f"{name} is missing or has another shape")
 
 
 def seal(folder: str | os.PathLike[str]) -> None:

@@ -1,0 +1,94 @@
+"""Put the trained model of a work directory into the library, where `sts.Predictor.load` finds it by its name.
+
+    python -m experiments.ship runs/freefall                    # writes sts_jax/models/freefall
+    python -m experiments.ship runs/long --name freefall
+
+Takes `models/statespace`, rounds its weights and leaves out the optimiser's state. Prints the size and the largest
+differences between predictions of the original and of the rounded model. Refuses a model of more than 12 MB. An earlier
+model of the same name is replaced when the new one is complete.
+"""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from experiments import command, errors
+from sts_jax.predict import MODELS
+
+LIMIT = 12e6  # bytes, of a model's folder
+NUM = 16  # bottles whose ends are predicted to compare the models
+LIFT = 0.04  # m, of every second bottle: models of freefall predict from objects in the air
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Which model is shipped."""
+
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment
+    name: str | None = None  # of the model; if not given: that of the work directory
+
+
+def ship(workdir: Path, name: str) -> str:
+    """Write the model to `sts_jax/models/NAME` and return a line on its size and on how its predictions differ.
+
+    Raises:
+        ValueError: the model is too large, or the name is no word.
+        OSError: a file of the model is damaged or missing, or the library is not writable.
+    """
+    if not name.isidentifier():
+        raise ValueError(f"name is {name!r}; it takes letters, digits and underscores: give --name freefall")
+    original = sts.Predictor.load(workdir / "models" / "statespace")
+    MODELS.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=MODELS, prefix=".") as temporary:
+        new, old = Path(temporary) / "new", Path(temporary) / "old"
+        original.save(new, compact=True)
+        size = sum(path.stat().st_size for path in new.rglob("*") if path.is_file())
+        if size > LIMIT:
+            raise ValueError(
+                f"the model of {workdir} takes {size / 1e6:.1f} MB, the limit is {LIMIT / 1e6:g} MB: train a smaller "
+                "model"
+            )
+        line = f"{name}: {size / 1e6:.1f} MB of at most {LIMIT / 1e6:g}; {compare(original, sts.Predictor.load(new))}"
+        if (MODELS / name).exists():
+            (MODELS / name).rename(old)
+        new.rename(MODELS / name)
+    return line
+
+
+def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
+    """Differences between the predictions of two models from vision, in words."""
+    visual = bottles(original.preprocessing)
+    half = np.array(original.preprocessing.condition_scale, np.float32) / 2
+    condition = np.tile(half, (len(visual), 1)) if half.size else None
+    a, b = (predictor(visual=visual, condition=condition) for predictor in (original, rounded))
+    image = np.abs(np.asarray(a.visual) - np.asarray(b.visual)).max()
+    apart = 1e3 * np.linalg.norm(np.asarray(a.pose)[:, :3] - np.asarray(b.pose)[:, :3], axis=-1)
+    return (
+        f"largest difference of predictions from {len(visual)} visual images: {image:.4f} in the visual image, "
+        f"{apart.max():.3f} mm in position (median {np.median(apart):.3f} mm)"
+    )
+
+
+def bottles(view: sts.training.Preprocessing) -> np.ndarray:
+    """Visual images of bottles at rest on the pad and in the air, `(NUM, height, width, 3)`."""
+    sensor, images = sts.Sensor(), []
+    for number in range(NUM):
+        body = sts.objects.make(jax.random.key(number), "bottle")
+        lift = LIFT * (number % 2)
+        pose, wrench = sts.physics.place(body, sensor, yaw=float(number))
+        pose, wrench = pose + np.array([0, 0, lift, 0, 0, 0, 0], np.float32), wrench * (lift == 0)
+        images.append(sts.sense(sensor, body, pose, wrench, resolution=view.resolution, crop=view.crop).visual)
+    return np.stack(images)
+
+
+if __name__ == "__main__":
+    args = tyro.cli(Args, description=__doc__)
+    with errors.on_one_line():
+        sts.enable_compilation_cache()
+        print(ship(args.workdir, args.name or args.workdir.resolve().name))
