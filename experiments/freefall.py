@@ -20,7 +20,9 @@ from sts_jax.training import TrainConfig
 COLLECTION = dataset.Collection(
     physics.Freefall(),
     num_objects=2000,
-    num_per_object=4,
+    num_per_object=12,
+    num_rendered=4,
+    num_views=8,
     num_full=20,
     symmetries=False,
     resolution=(128, 128),

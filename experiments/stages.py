@@ -216,20 +216,28 @@ class Job(NamedTuple):
     empty: dict[str, np.ndarray]  # images of the untouched sensor, uint8
 
 
-def jobs(config: Config, sensor: sts.Sensor, pairs: dataset.Pairs) -> Iterator[Job]:
+def jobs(
+    config: Config,
+    sensor: sts.Sensor,
+    pairs: dataset.Pairs,
+    views: dataset.Views | None = None,
+    falls: dataset.Ends | None = None,
+) -> Iterator[Job]:
     """The trainings of an experiment.
 
     Args:
         config: The experiment.
         sensor: That of the collection.
         pairs: The training trajectories, with images as they were collected.
+        views: Further pictures of the training objects, for the state-space model.
+        falls: Further trajectories of the training objects, for the state-space model.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
     empty = {"visual": frame.visual, "tactile": frame.tactile}
     if config.model == "statespace":
         state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty)
-        arrays = training.state_moments(pairs, state, scenario, own, empty)
+        arrays = training.state_moments(pairs, state, scenario, own, empty, views=views, falls=falls)
         yield Job("statespace", config.state_training, state, arrays, own, empty)
         return
     pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
@@ -244,7 +252,11 @@ def jobs(config: Config, sensor: sts.Sensor, pairs: dataset.Pairs) -> Iterator[J
 def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
     """Train the models of an experiment on one split, each with a progress bar."""
     pairs = data.pairs(rows_of(data, split)["train"], symmetries=True)
-    for job in jobs(config, sensor, pairs):
+    views, falls = None, None
+    if config.model == "statespace":
+        views = data.views("train")
+        falls = data.ends(np.setdiff1d(data.members("train", rendered=False), data.rendered()))
+    for job in jobs(config, sensor, pairs, views, falls):
         with Bar() as bar:
 
             def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = job.name) -> None:

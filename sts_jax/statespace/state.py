@@ -12,6 +12,7 @@ A state code has these parts, in this order:
 The last two follow from the others. An image shows them directly, however uncertain the rotation is.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -19,10 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sts_jax import objects
 from sts_jax.statespace import harmonics, poses
 
-_n=np.arange(128)+.5; _z=1-2*_n/128; _a=np.pi*(1+5**.5)*_n
-DIRECTIONS=np.stack([np.sqrt(1-_z**2)*np.cos(_a),np.sqrt(1-_z**2)*np.sin(_a),_z],-1).astype(np.float32)
 DEGREE = 6  # of the support function's harmonics
 SUPPORT = harmonics.number(DEGREE)
 LENGTH = 0.01  # m, unit of the support function and of the centre of mass
@@ -30,7 +30,6 @@ MEAN = 3.0  # of the support function, in this unit
 MASS = 0.05  # kg, unit of the mass
 SIZES = (poses.CODE, SUPPORT, 3, 1, SUPPORT, 3)
 CODE = sum(SIZES)  # numbers in a state code
-_FIT = np.linalg.pinv(np.asarray(harmonics.basis(jnp.asarray(DIRECTIONS), DEGREE))).T
 
 
 class State(NamedTuple):
@@ -42,6 +41,13 @@ class State(NamedTuple):
     mass: Float[Array, "n 1"]
     shown: Float[Array, "n k"]
     low: Float[Array, "n 3"]
+
+
+@functools.cache
+def _fit() -> np.ndarray:
+    """From values in `objects.DIRECTIONS` to harmonics, least squares, (128, k)."""
+    with jax.ensure_compile_time_eval():
+        return np.linalg.pinv(np.asarray(harmonics.basis(jnp.asarray(objects.DIRECTIONS), DEGREE))).T
 
 
 def split(code: Float[Array, "n code"]) -> State:
@@ -64,13 +70,13 @@ def encode(
 
     Args:
         pose: pose codes.
-        support: m, of the hull in `DIRECTIONS`, see `objects.support`.
+        support: m, of the hull in `objects.DIRECTIONS`, see `objects.support`.
         mass: kg.
         com: m, mesh frame.
     """
-    own = (support / LENGTH - MEAN) @ _FIT
+    own = (support / LENGTH - MEAN) @ _fit()
     rotation = poses.matrix(pose)
-    shown = harmonics.values(own[:, None], rotation, DIRECTIONS)[:, 0] @ _FIT
+    shown = harmonics.values(own[:, None], rotation, objects.DIRECTIONS)[:, 0] @ _fit()
     com = com / LENGTH
     low = jnp.einsum("nij,nj->ni", rotation, com)
     return join(State(pose, own, com, jnp.log(mass / MASS)[:, None], shown, low))
