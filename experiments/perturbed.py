@@ -20,8 +20,9 @@ from sts_jax.training import TrainConfig
 COLLECTION = dataset.Collection(
     physics.Perturbed(),
     categories=("bottle",),
-    num_objects=1000,
-    num_per_object=4,
+    num_objects=1600,
+    num_per_object=10,
+    num_rendered=4,
     num_full=20,
     symmetries=False,
     resolution=(128, 128),
@@ -36,7 +37,7 @@ DEFAULT = stages.Config(
 )
 LONG = dataclasses.replace(
     DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=5000, shares=(0.98, 0.008, 0.012)),
+    collection=dataclasses.replace(COLLECTION, num_objects=8000, shares=(0.98, 0.008, 0.012)),
     state_training=dataclasses.replace(stages.STATE_TRAINING, steps=26000),
 )
 SMOKE = stages.smoke(DEFAULT)

@@ -137,8 +137,8 @@ def predict_samples(
     images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in found.images.items()}
     mean, log_var = (x.reshape(*lead, -1) for x in found.belief)
     result = Prediction(
-        visual=images["visual"].mean(0),
-        tactile=images["tactile"].mean(0),
+        visual=found.mean["visual"].reshape(*lead, *found.mean["visual"].shape[1:]),
+        tactile=found.mean["tactile"].reshape(*lead, *found.mean["tactile"].shape[1:]),
         pose=_central(poses).reshape(*lead, 7),
         mean=mean,
         log_var=log_var,

@@ -1,7 +1,7 @@
 """Functions on the sphere as real spherical harmonics, which turn with an object.
 
-A function is a vector of coefficients, of degree 0, 1, 2, ..., each degree l with the orders 0, 1, -1, ..., l, -l. Turned by
-a rotation R, it has at direction d the value that it had at R' d. The harmonics are homogeneous polynomials of the
+A function is a vector of coefficients, of degree 0, 1, 2, ..., each degree n with the orders 0, 1, -1, ..., n, -n.
+Turned by a rotation R, it has at direction d the value that it had at R' d. The harmonics are homogeneous polynomials of the
 direction, and their mean square over the sphere is 1.
 """
 
@@ -21,7 +21,7 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
     """The harmonics up to a degree at some directions.
 
     Args:
-        direction: unit vectors. For shorter ones, harmonics of degree l shrink with the length to the power l.
+        direction: unit vectors. For shorter ones, harmonics of degree n shrink with the length to the power n.
         degree: the largest.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
@@ -33,13 +33,13 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
     polar: dict[tuple[int, int], Float[Array, "*n"]] = {}
     for m in range(degree + 1):
         polar[m, m] = jnp.full_like(x, float(math.prod(range(1, 2 * m, 2))))
-        for l in range(m + 1, degree + 1):
-            before = polar.get((l - 2, m), jnp.zeros_like(x))
-            polar[l, m] = ((2 * l - 1) * z * polar[l - 1, m] - (l + m - 1) * square * before) / (l - m)
+        for n in range(m + 1, degree + 1):
+            before = polar.get((n - 2, m), jnp.zeros_like(x))
+            polar[n, m] = ((2 * n - 1) * z * polar[n - 1, m] - (n + m - 1) * square * before) / (n - m)
     found = []
-    for l, m in _orders(degree):
-        scale = math.sqrt((2 - (m == 0)) * (2 * l + 1) * math.factorial(l - abs(m)) / math.factorial(l + abs(m)))
-        found.append(scale * polar[l, abs(m)] * (cosine[m] if m >= 0 else sine[-m]))
+    for n, m in _orders(degree):
+        scale = math.sqrt((2 - (m == 0)) * (2 * n + 1) * math.factorial(n - abs(m)) / math.factorial(n + abs(m)))
+        found.append(scale * polar[n, abs(m)] * (cosine[m] if m >= 0 else sine[-m]))
     return jnp.stack(found, axis=-1)
 
 
@@ -70,13 +70,13 @@ def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -
 
 
 def _orders(degree: int) -> list[tuple[int, int]]:
-    return [(l, m) for l in range(degree + 1) for m in (0, *(s * a for a in range(1, l + 1) for s in (1, -1)))]
+    return [(n, m) for n in range(degree + 1) for m in (0, *(s * a for a in range(1, n + 1) for s in (1, -1)))]
 
 
 def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Array, np.ndarray]:
     """Factors of a coefficient and of the one of the opposite order, (n, 1, k), and the latter's index."""
     orders = _orders(math.isqrt(count) - 1)
-    partner = np.array([orders.index((l, -m)) for l, m in orders])
+    partner = np.array([orders.index((n, -m)) for n, m in orders])
     powers = [jnp.stack([jnp.ones_like(angle[:, 0]), jnp.zeros_like(angle[:, 0])], axis=-1)]
     for _ in range(orders[-1][0]):
         cos, sin = powers[-1][:, 0], powers[-1][:, 1]

@@ -25,6 +25,7 @@ INPUTS = (*IMAGES, "pose")
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
 _NEAREST = 0.2  # of the camera's distance: an object nearer to the pinhole is drawn at this distance
+_CONTRAST = 6.0  # of the outline of a sample, against that of the mean
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
 
 
@@ -57,7 +58,7 @@ class Config:
     hidden: int = 384  # width of the encoders' fully connected layers
     transition: int = 512  # width of the transition's layers
     canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
-    canvas_side: float = 0.15  # m, its side on the gel's face
+    canvas_side: float = 0.165  # m, its side on the gel's face
     tactile_weight: float = 4.0  # of the tactile image's nats in the loss
     state_weight: float = 16.0  # of the squared error of the first pose, as each image's expert has it
     pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
@@ -107,6 +108,14 @@ class FinalPose(NamedTuple):
     mean: Float[Array, "n outcomes k 21"]  # code of the pose, and the rotation from the present to the final one
     log_var: Float[Array, "n outcomes k 21"]
     heading: Float[Array, "n 2"]  # of the frame, see `poses.heading`
+
+
+class Layers(NamedTuple):
+    """What is drawn of an object in the view, over the images of the empty sensor."""
+
+    covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
+    colour: Float[Array, "n size size 3"]  # of the object, [0, 1]
+    touch: Float[Array, "n size size 3"]  # change of the tactile image, in logits
 
 
 class _Residual(nnx.Module):
@@ -295,10 +304,10 @@ class Transition(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Both streams of an object of a look in a pose, over the images of the empty sensor.
+    """Draws an object of a look in a pose.
 
     A picture of the object is drawn on a canvas that follows its heading, and is then placed in the view where the
-    camera sees the object's origin. Colours come from a further layer in the view: light does not turn with the object.
+    camera sees the object's origin. `compose` puts it over the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -319,19 +328,14 @@ class Decoder(nnx.Module):
         turn: Float[Array, "n 3 3"],
         known: Float[Array, "n code"],
         look: Float[Array, "n look"],
-        empty: dict[str, Float[Array, "size size 3"]],
-    ) -> dict[str, Float[Array, "n size size 3"]]:
-        """Draw both images of each object.
+    ) -> Layers:
+        """Draw each object.
 
         Args:
             pose: pose codes.
             turn: rotations since the present moment.
             known: present state codes, of which the shapes are drawn.
             look: present looks.
-            empty: both images of the untouched sensor, of the size that is predicted.
-
-        Returns:
-            `visual` and `tactile`, in [0, 1].
         """
         config = self.config
         heading = poses.heading(pose)
@@ -346,11 +350,37 @@ class Decoder(nnx.Module):
         x = _unfold(self.last(jax.nn.swish(self.layers[-1](x))))
         x = window.sample(x, _on_canvas(config, pose, heading))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
-        covered = jax.nn.sigmoid(x[..., 3:4] - 3)  # at first, hardly at all
-        visual = covered * jax.nn.sigmoid(x[..., :3]) + (1 - covered) * empty["visual"]
-        grey = jnp.clip(empty["tactile"], 0.01, 0.99)
-        tactile = jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + x[..., 4:7])
-        return {"visual": visual, "tactile": tactile}
+        # At first, hardly anything is covered.
+        return Layers(covered=x[..., 3:4] - 3, colour=jax.nn.sigmoid(x[..., :3]), touch=x[..., 4:7])
+
+
+def compose(
+    layers: Layers,
+    empty: dict[str, Float[Array, "size size 3"]],
+    level: Float[Array, "n"] | None = None,
+) -> dict[str, Float[Array, "n size size 3"]]:
+    """Both images of each object.
+
+    Args:
+        layers: from the decoder.
+        empty: both images of the untouched sensor, of the same size.
+        level: the probability of being covered, from 0 to 1, above which a pixel of a sample is covered. Over uniform
+            levels, each pixel is covered as often as its probability says, and every outline is sharp. None draws the
+            mean.
+
+    Returns:
+        `visual` and `tactile`, in [0, 1].
+    """
+    logit = layers.covered
+    if level is not None:
+        level = jnp.clip(level, 0.01, 0.99).reshape(-1, 1, 1, 1)
+        logit = _CONTRAST * (logit - jnp.log(level / (1 - level)))
+    covered = jax.nn.sigmoid(logit)
+    grey = jnp.clip(empty["tactile"], 0.01, 0.99)
+    return {
+        "visual": covered * layers.colour + (1 - covered) * empty["visual"],
+        "tactile": jax.nn.sigmoid(jnp.log(grey / (1 - grey)) + layers.touch),
+    }
 
 
 def _on_canvas(config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"]) -> Float[Array, "n m 2"]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state
-from sts_jax.statespace.networks import IMAGES, FinalPose, Model
+from sts_jax.statespace.networks import IMAGES, FinalPose, Model, compose
 
 EXACT_LOG_VAR = -9.2  # of a pose that is given: 0.5 mm
 UNKNOWN_LOG_VAR = 30.0  # of the rest, of the expert of a pose: no precision at all
@@ -326,14 +326,14 @@ def _picture_terms(
         mean, log_var = (x[:, state.CODE :] for x in belief)
         return mean + jnp.exp(0.5 * log_var) * jax.random.normal(key, mean.shape)
 
-    drawn = model.decoder(
+    layers = model.decoder(
         jnp.concatenate([after.pose, before.pose]),
         jnp.concatenate([after.turn, before.turn]),
         # Pictures do not teach the shape: it has a truth.
         jax.lax.stop_gradient(jnp.concatenate([x.belief.mean[:, : state.CODE] for x in (after, before)])),
         jnp.concatenate([looks(key, x.belief) for key, x in zip(keys, (after, before), strict=True)]),
-        {name: reduced(x, size) for name, x in empty.items()},
     )
+    drawn = compose(layers, {name: reduced(x, size) for name, x in empty.items()})
     number = len(after.pose)
     terms = {name: jnp.mean(excess(drawn[name][:number], after.images[name])) for name in IMAGES}
     terms["first"] = jnp.zeros(())

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import poses, state
-from sts_jax.statespace.networks import FinalPose, Model
+from sts_jax.statespace.networks import FinalPose, Model, compose
 from sts_jax.statespace.objective import experts, fuse, reduced
 
 
@@ -19,7 +19,8 @@ class Samples(NamedTuple):
     belief: Gaussian  # over the present state code and the look, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
     pose: Float[Array, "k n 12"]  # codes of final poses
-    images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first `drawn` poses
+    images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first `drawn` poses, with sharp outlines
+    mean: dict[str, Float[Array, "n size size 3"]]  # of the images
 
 
 def sample(
@@ -50,21 +51,29 @@ def sample(
     model = nnx.merge(graphdef, params)
     belief = fuse(experts(model, inputs, present, empty), present)
     final = model.transition(belief, condition)
-    end, appearance = jax.random.split(key)
+    end, appearance, outline = jax.random.split(key, 3)
     codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
     known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))
     mean, log_var = (x[:, state.CODE :] for x in belief)
     looks = mean + jnp.exp(0.5 * log_var) * jax.random.normal(appearance, (drawn, *mean.shape))
-    shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    flat = model.decoder(
+    layers = model.decoder(
         codes[:drawn].reshape(-1, poses.CODE),
         turns[:drawn].reshape(-1, 3, 3),
         known.reshape(-1, state.CODE),
         looks.reshape(-1, looks.shape[-1]),
-        shown,
     )
-    images = {name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in flat.items()}
-    return Samples(belief, jnp.exp(final.outcome), codes, images)
+    shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
+    # Levels at equal distances, in another order for each item.
+    order = jax.vmap(lambda key: jax.random.permutation(key, drawn))(jax.random.split(outline, len(mean)))
+    sharp = compose(layers, shown, (order.T.reshape(-1) + 0.5) / drawn)
+    soft = compose(layers, shown)
+    return Samples(
+        belief=belief,
+        outcome=jnp.exp(final.outcome),
+        pose=codes,
+        images={name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in sharp.items()},
+        mean={name: x.reshape(drawn, -1, *x.shape[1:]).mean(0) for name, x in soft.items()},
+    )
 
 
 def _final_pose(key: PRNGKeyArray, final: FinalPose) -> tuple[Float[Array, "n 12"], Float[Array, "n 3 3"]]:

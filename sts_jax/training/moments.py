@@ -12,7 +12,6 @@ from sts_jax.sensor import Sensor
 from sts_jax.training.preprocess import Preprocessing
 from sts_jax.training.train import Arrays
 
-
 SOME = 512  # items that are encoded at once
 
 
