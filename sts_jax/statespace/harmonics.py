@@ -1,8 +1,8 @@
 """Functions on the sphere as real spherical harmonics, which turn with an object.
 
 A function is a vector of coefficients, of degree 0, 1, 2, ..., each degree n with the orders 0, 1, -1, ..., n, -n.
-Turned by a rotation R, it has at direction d the value that it had at R' d. The harmonics are homogeneous polynomials of the
-direction, and their mean square over the sphere is 1.
+The function turned by a rotation R has, in direction d, the value that the function has in direction R' d. The
+harmonics are homogeneous polynomials of the direction, and their mean square over the sphere is 1.
 """
 
 import math
