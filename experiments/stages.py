@@ -36,6 +36,7 @@ TITLES = {
 }
 # The main table shows the main model from the first five of these inputs that it can be given.
 MAIN_SUBSETS = ("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose")
+KNOWN = "visual and the true state"  # pose, shape and mass of the simulation
 JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # whose outcome probabilities are drawn
 CHUNK = 64  # items predicted by one call
 
@@ -230,7 +231,7 @@ def jobs(
         sensor: That of the collection.
         pairs: The training trajectories, with images as they were collected.
         views: Further pictures of the training objects, for the state-space model.
-        falls: Further trajectories of the training objects, for the state-space model.
+        falls: Trajectories of the training objects that are used without their images, for the state-space model.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
@@ -255,7 +256,7 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
     views, falls = None, None
     if config.model == "statespace":
         views = data.views("train")
-        falls = data.ends(np.setdiff1d(data.members("train", rendered=False), data.rendered()))
+        falls = data.ends(data.members("train", rendered=False))
     for job in jobs(config, sensor, pairs, views, falls):
         with Bar() as bar:
 
@@ -392,7 +393,7 @@ def main_rows(model: str, titles: Sequence[str]) -> list[str]:
         model: Title of the main model.
         titles: Of the models' rows, in the order of `queries`.
     """
-    first = [f"{model}, from {given}" for given in MAIN_SUBSETS]
+    first = [f"{model}, from {given}" for given in (*MAIN_SUBSETS, KNOWN)]
     return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in first if title in titles][:5]]
 
 
@@ -467,6 +468,8 @@ def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, st
             else:
                 given = "from all inputs" if subset == usable else f"from {' and '.join(subset)}"
             yield f"{TITLES[name]}, {given}", predictor, subset
+        if config.model == "statespace" and "visual" in usable:
+            yield f"{TITLES[name]}, from {KNOWN}", predictor, ("visual", "state")
 
 
 def predict(
@@ -524,6 +527,7 @@ def _asked(
             tactile=pairs.tactile[rows, 0] / 255 if "tactile" in names else None,
             pose=pairs.pose[rows, 0] if "pose" in names else None,
             condition=condition,
+            state=_true_states(predictor, pairs, rows) if "state" in names else None,
             key=jax.random.key(seed) if num_samples else None,
             num_samples=num_samples,
         )
@@ -537,6 +541,12 @@ def _asked(
         drawn, felt = (None if leaf is None else np.round(255 * np.asarray(leaf)).astype(np.uint8) for leaf in images)
         samples = evaluation.Predicted(drawn, felt, None if out.samples.pose is None else np.asarray(out.samples.pose))
     return evaluation.Predicted(visual, tactile, pose, samples=samples, outcome_probability=probability)
+
+
+def _true_states(predictor: sts.Predictor, pairs: dataset.Pairs, rows: np.ndarray) -> np.ndarray:
+    return training.state_codes(
+        predictor.preprocessing, pairs.pose[rows, 0], pairs.support[rows], pairs.mass[rows], pairs.com[rows]
+    )
 
 
 def _read_log(folder: Path) -> list[dict[str, float]]:

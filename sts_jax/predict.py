@@ -312,6 +312,7 @@ class Predictor:
         tactile: ArrayLike | None = None,
         pose: ArrayLike | None = None,
         condition: ArrayLike | None = None,
+        state: ArrayLike | None = None,
         present: dict[str, ArrayLike] | None = None,
         key: PRNGKeyArray | None = None,
         num_samples: int = 0,
@@ -327,6 +328,8 @@ class Predictor:
             pose: `(*n, 7)` m and unit quaternion, mesh frame in the sensor frame.
             condition: `(*n, c)`, the scenario's input in SI units, for models that have one. For a jerk: acceleration
                 of the pad along x and y (m/s^2) and its duration (s).
+            state: `(*n, code)`, the true pose, shape and mass, from `statespace.encode`. A simulation knows them, and a
+                state-space model then shows how much of its error is not due to its senses.
             present: By name, which items of a modality count, bool `(*n,)`; what does not count may be NaN.
             key: For `num_samples`; consumed.
             num_samples: Draw this many predictions. A state-space model's images are then the means over them.
@@ -355,6 +358,8 @@ class Predictor:
                 valid = fine if valid is None else valid & fine
             else:
                 _check_values(name, np.asarray(array if mask is None else array[mask]))
+        if state is not None:
+            arrays["state"] = self._checked_state(state, lead)
         condition, plausible = self._checked_condition(condition, lead)
         if plausible is not None:
             valid = plausible if valid is None else valid & plausible
@@ -438,6 +443,17 @@ class Predictor:
             )
         if math.prod(array.shape) == 0:
             raise ValueError(f"{name} has shape {array.shape}: there is no item in it.")
+        return _float32(array)
+
+    def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
+        """The state code as float32."""
+        if isinstance(self.model.config, mvae.Config):
+            raise ValueError(f"{self.name} takes no state: it is a model of the paper's kind, which has none.")
+        array = _checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
+        if array.shape != (*lead, statespace.STATE_CODE):
+            raise ValueError(f"state has shape {array.shape}; it needs {(*lead, statespace.STATE_CODE)}.")
+        if not _traced(array) and not np.isfinite(array).all():
+            raise ValueError("state has NaN or infinite values; every item needs its true state.")
         return _float32(array)
 
     def _checked_condition(

@@ -41,18 +41,20 @@ def experts(
 
     Args:
         model: the networks.
-        inputs: some of `visual` and `tactile` `(n, size, size, 3)` in [0, 1], and `pose` `(n, 12)`, a code.
+        inputs: some of `visual` and `tactile` `(n, size, size, 3)` in [0, 1], and `pose` `(n, 12)`, a code. Where the
+            true state is known, also `state` `(n, code)`.
         counts: which items of each input count. The values of the others, NaN among them, have no influence.
         empty: both images of the untouched sensor, of the same size.
     """
     # Replaced before the networks see them: neither the product of experts nor a gradient is safe from 0 * NaN.
     change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
     found = {name: model.encoders[name](x) for name, x in change.items()}
-    if "pose" in inputs:
-        code = _counted(counts["pose"], inputs["pose"])
-        nothing = jnp.zeros((len(code), state.CODE - poses.CODE + model.config.look))
-        log_var = [jnp.full_like(code, EXACT_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
-        found["pose"] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
+    for name in ("pose", "state"):
+        if name in inputs:
+            code = _counted(counts[name], inputs[name])
+            nothing = jnp.zeros((len(code), state.CODE - code.shape[1] + model.config.look))
+            log_var = [jnp.full_like(code, EXACT_LOG_VAR), nothing + UNKNOWN_LOG_VAR]
+            found[name] = Gaussian(jnp.concatenate([code, nothing], axis=-1), jnp.concatenate(log_var, axis=-1))
     return found
 
 

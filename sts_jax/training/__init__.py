@@ -1,7 +1,7 @@
 """Training of `sts_jax.statespace` and `sts_jax.mvae` models: arrays, loop, schedules, checkpoints."""
 
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
-from sts_jax.training.moments import moments, paper_model, state_model, state_moments
+from sts_jax.training.moments import moments, paper_model, state_codes, state_model, state_moments
 from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
 from sts_jax.training.train import (
     Arrays,
@@ -38,6 +38,7 @@ __all__ = [
     "save",
     "save_blank",
     "seal",
+    "state_codes",
     "state_model",
     "state_moments",
     "step",

@@ -85,10 +85,13 @@ def state_moments(
     touched = {"tactile": _touched(pairs, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
     further: dict[str, dict[str, np.ndarray]] = {"views": {}, "falls": {}}
     if views is not None and len(views.pose) and "visual" in model.inputs:
-        further["views"] = {"visual": views.visual, "state": _states(preprocessing, views.pose, views)}
+        further["views"] = {
+            "visual": views.visual,
+            "state": state_codes(preprocessing, views.pose, views.support, views.mass, views.com),
+        }
     if falls is not None and len(falls.pose):
         further["falls"] = {
-            "state": _states(preprocessing, falls.pose[:, 0], falls),
+            "state": state_codes(preprocessing, falls.pose[:, 0], falls.support, falls.mass, falls.com),
             "pose": np.asarray(preprocessing.encode_pose(jnp.asarray(falls.pose[:, 1]))),
             "outcome": other_outcomes[0],
         }
@@ -99,7 +102,7 @@ def state_moments(
         targets={
             "visual": last.visual[:, 0],
             "tactile": last.tactile[:, 0],
-            "state": _states(preprocessing, pairs.pose[:, 0], pairs),
+            "state": state_codes(preprocessing, pairs.pose[:, 0], pairs.support, pairs.mass, pairs.com),
             "pose": code[:, 1],
             "outcome": outcome,
         },
@@ -120,14 +123,24 @@ def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarra
     return (outcome[:, None] == numbers).argmax(1).astype(np.int32)
 
 
-def _states(preprocessing: Preprocessing, pose: np.ndarray, solid: Pairs | Ends | Views) -> np.ndarray:
-    """The state codes of poses (n, 7) of objects; some at a time, which bounds the memory."""
+def state_codes(
+    preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
+) -> np.ndarray:
+    """The true states (n, code) as a state-space model has them, see `statespace.encode`.
+
+    Args:
+        preprocessing: of the model.
+        pose: (n, 7), m and unit quaternion.
+        support: (n, 128), m; this and the following as in `dataset.Pairs`.
+        mass: (n,), kg.
+        com: (n, 3), m, mesh frame.
+    """
     encode = jax.jit(statespace.encode)
     parts = []
-    for start in range(0, len(pose), SOME):
+    for start in range(0, len(pose), SOME):  # bounds the memory
         rows = slice(start, start + SOME)
         code = preprocessing.encode_pose(jnp.asarray(pose[rows]))
-        parts.append(np.asarray(encode(code, solid.support[rows], solid.mass[rows], solid.com[rows])))
+        parts.append(np.asarray(encode(code, support[rows], mass[rows], com[rows])))
     return np.concatenate(parts)
 
 
