@@ -31,7 +31,7 @@ COLLECTION = dataset.Collection(
 )
 DEFAULT = stages.Config(
     collection=COLLECTION,
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=1700),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=2000),
     training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
