@@ -25,7 +25,7 @@ INPUTS = (*IMAGES, "pose")
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
 _NEAREST = 0.2  # of the camera's distance: an object nearer to the pinhole is drawn at this distance
-_CONTRAST = 6.0  # of the outline of a sample, against that of the mean
+_CONTRAST = 4.5  # of the outline of a sample, against that of the mean
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
 
 
