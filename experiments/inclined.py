@@ -1,7 +1,7 @@
 """Objects laid on the tilted pad, or let go just above: from the first moment to what the sensor sees at rest.
 
-    python -m experiments.inclined                    # about 15 to 20 minutes on two CPU cores
-    python -m experiments.inclined --preset long      # about 150 minutes; can be stopped and started again
+    python -m experiments.inclined                    # about 15 minutes on two CPU cores
+    python -m experiments.inclined --preset long      # at most 150 minutes; can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
     python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours; a GPU helps
@@ -37,8 +37,8 @@ DEFAULT = stages.Config(
 )
 LONG = dataclasses.replace(
     DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=8000, shares=(0.98, 0.008, 0.012)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=26000),
+    collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=25000),
 )
 SMOKE = stages.smoke(DEFAULT)
 PAPER = stages.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories

@@ -1,7 +1,7 @@
 """A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to what the sensor sees at rest.
 
     python -m experiments.perturbed                    # about 15 minutes on two CPU cores
-    python -m experiments.perturbed --preset long      # about 150 minutes; can be stopped and started again
+    python -m experiments.perturbed --preset long      # at most 150 minutes; can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
     python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours; a GPU helps
@@ -37,8 +37,8 @@ DEFAULT = stages.Config(
 )
 LONG = dataclasses.replace(
     DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=8000, shares=(0.98, 0.008, 0.012)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=26000),
+    collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=25000),
 )
 SMOKE = stages.smoke(DEFAULT)
 PAPER = stages.paper(COLLECTION, num_objects=500, num_per_object=5)  # 2,500 trajectories
