@@ -4,7 +4,8 @@
 
 The step is that of freefall (three modalities, touch absent, every subset asked for all). Beside it stands the
 same step in the plain way: XLA's own convolutions and transposed convolutions, and all seven subsets enumerated.
-Medians, alternated, after one unmeasured call each. A few minutes on two CPU cores.
+Then a step of the state-space model as freefall trains it, and its prediction with 16 samples. Medians, alternated,
+after one unmeasured call each. A few minutes on two CPU cores; `taskset -c 0` measures one core.
 """
 
 import statistics
@@ -18,7 +19,8 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array
 
-from sts_jax import mvae, training
+import sts_jax as sts
+from sts_jax import mvae, statespace, training
 from sts_jax.mvae import networks
 
 MODEL = mvae.Config(
@@ -77,6 +79,55 @@ def predictor(size: int) -> Callable[[], None]:
     return lambda: jax.block_until_ready(run(state, x)) and None
 
 
+def state_stepper(size: int) -> Callable[[], None]:
+    """A training step of the state-space model of freefall on random data, compiled."""
+    rng, model = np.random.default_rng(0), statespace.Config()
+    config = training.TrainConfig(batch_size=size)
+
+    def images(count: int, side: int) -> np.ndarray:
+        return rng.integers(0, 256, (count, side, side, 3), dtype=np.uint8)
+
+    def codes(count: int, width: int) -> np.ndarray:
+        return rng.normal(size=(count, width)).astype(np.float32)
+
+    def ends(count: int) -> dict[str, np.ndarray]:
+        outcome = rng.integers(0, 2, count).astype(np.int32)
+        state, pose = codes(count, statespace.STATE_CODE), codes(count, statespace.POSE_CODE)
+        return {"state": state, "pose": pose, "outcome": outcome}
+
+    large, small = model.input_size, model.image_size
+    arrays = training.Arrays(
+        inputs={"visual": images(size, large), "pose": codes(size, statespace.POSE_CODE)},
+        targets={"visual": images(size, small), "tactile": images(size, small), **ends(size)},
+        empty={name: images(1, large)[0] for name in statespace.IMAGES},
+        views={"visual": images(config.views, large), "state": codes(config.views, statespace.STATE_CODE)},
+        falls=ends(config.falls),
+    )
+    batch = arrays.take(np.arange(size), views=np.arange(config.views), falls=np.arange(config.falls))
+    learner = training.learner(model)
+    graphdef, state = training.initial(config, learner, 100)
+    run = jax.jit(lambda s, b: training.step(learner, graphdef, config, 100, s, b), donate_argnums=0)
+
+    def call() -> None:
+        nonlocal state
+        state, _ = jax.block_until_ready(run(state, batch))
+
+    return call
+
+
+def state_predictor(num_samples: int) -> Callable[[], None]:
+    """A prediction from vision by a state-space model of random weights, compiled."""
+    config = statespace.Config()
+    graphdef, params, _ = statespace.init(jax.random.key(0), config)
+    view = training.Preprocessing(resolution=(config.input_size, config.input_size))
+    blank = np.full((config.input_size, config.input_size, 3), 128, np.uint8)
+    predict = sts.Predictor(training.Model(config, graphdef, params, 0, {}), view, (blank, blank), "random weights")
+    image = np.full(blank.shape, 0.5, np.float32)
+    image[40:80, 30:90] = 0.2
+    key = jax.random.key(0)
+    return lambda: jax.block_until_ready(predict(visual=image, key=key, num_samples=num_samples)) and None
+
+
 def medians(calls: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
     """Seconds per call, alternated."""
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -102,6 +153,8 @@ def main() -> None:
     visual = medians({"": stepper(VISUAL, 64, ())}, 5)[""]
     print(f"training step, visual only, batch 64: {visual:.3f} s")
     print(f"prediction, batch 1: {1e3 * medians({'': predictor(1)}, 50)['']:.1f} ms")
+    print(f"state-space model, training step, batch 32: {medians({'': state_stepper(32)}, 11)['']:.3f} s")
+    print(f"state-space model, prediction with 16 samples: {1e3 * medians({'': state_predictor(16)}, 50)['']:.1f} ms")
 
 
 if __name__ == "__main__":
