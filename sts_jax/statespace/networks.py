@@ -64,7 +64,7 @@ class Config:
     state_weight: float = 16.0  # of the squared error of the first pose, as each image's expert has it
     pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
     outcome_weight: float = 8.0  # of the outcome's nats
-    covered_weight: float = 0.5  # of the nats of the object's outline
+    covered_weight: float = 0.15  # of the nats of the object's outline
     first_weight: float = 0.5  # of the nats of the first moment's images
     look_weight: float = 0.3  # of the look's divergence: below 1, samples are sharper
     drawn: float = 0.4375  # share of a batch whose last moment is drawn; every sample trains the rest
