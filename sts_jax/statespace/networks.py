@@ -24,7 +24,6 @@ IMAGES = ("visual", "tactile")
 INPUTS = (*IMAGES, "pose")
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
-_NEAREST = 0.2  # of the camera's distance: an object nearer to the pinhole is drawn at this distance
 _CONTRAST = 4.5  # of the outline of a sample, against that of the mean
 _OUTSIDE = 8.0  # by how much less the outside of the canvas is covered, in logits
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
@@ -308,8 +307,8 @@ class Transition(nnx.Module):
 class Decoder(nnx.Module):
     """Draws an object of a look in a pose.
 
-    A picture of the object is drawn on a canvas that follows its heading, and is then placed in the view where the
-    camera sees the object's origin. `compose` puts it over the images of the empty sensor.
+    A picture of the object is drawn on a canvas that follows its heading. It is placed in the view below the object's
+    origin, at the height of the object's lowest point, which the camera sees from below. `compose` puts it over the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -343,14 +342,16 @@ class Decoder(nnx.Module):
         heading = poses.heading(pose)
         here = poses.turn_code_back(heading, pose)
         level = jnp.swapaxes(poses.about_vertical(heading), -1, -2)
-        shapes = _shapes(config, state.split(known), look, poses.matrix(here), level @ turn)
+        shape = state.split(known)
+        shapes = _shapes(config, shape, look, poses.matrix(here), level @ turn)
         x = _joined(here, heading, pose[:, :2], *shapes)
         x = self.core(jax.nn.swish(self.residual(self.first(x))))
         x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
         for layer, enlarge in zip(self.layers, self.enlarge, strict=False):
             x = _unfold(enlarge(layer(x)))
         x = _unfold(self.last(jax.nn.swish(self.layers[-1](x)))).at[..., 3].add(_OUTSIDE)
-        x = window.sample(x, _on_canvas(config, pose, heading))
+        depth = config.camera_distance + jnp.maximum(pose[:, 2] * config.position_scale - state.reach(shape, turn), 0)
+        x = window.sample(x, _on_canvas(config, pose, heading, depth))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
         # At first, hardly anything is covered.
         return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=jax.nn.sigmoid(x[..., :3]), touch=x[..., 4:7])
@@ -385,14 +386,22 @@ def compose(
     }
 
 
-def _on_canvas(config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"]) -> Float[Array, "n m 2"]:
-    """Where on the canvas each pixel of the view lies: column and row, whole numbers at pixel centres."""
-    position = pose[:, :3] * config.position_scale
-    depth = jnp.maximum(config.camera_distance + position[:, 2], _NEAREST * config.camera_distance)
+def _on_canvas(
+    config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"], depth: Float[Array, "n"]
+) -> Float[Array, "n m 2"]:
+    """Where on the canvas each pixel of the view lies: column and row, whole numbers at pixel centres.
+
+    Args:
+        config: of the model.
+        pose: pose codes.
+        heading: of the canvas.
+        depth: m, of the canvas below the object's origin, from the pinhole.
+    """
+    position = pose[:, :2] * config.position_scale
     shrunk = (config.camera_distance / depth)[:, None]
     place = ((jnp.arange(config.image_size) + 0.5) / config.image_size - 0.5) * config.view
     pixels = jnp.stack(jnp.meshgrid(place, place), axis=-1).reshape(1, -1, 2)
-    apart = (pixels - (position[:, :2] * shrunk)[:, None]) / (shrunk * config.canvas_side)[:, None]
+    apart = (pixels - (position * shrunk)[:, None]) / (shrunk * config.canvas_side)[:, None]
     return (poses.turn_back(heading[:, None], apart) + 0.5) * config.canvas - 0.5
 
 

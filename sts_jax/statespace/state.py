@@ -101,6 +101,12 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
     )
 
 
+def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
+    """How far an object reaches below its origin (m), after it was turned from the present by a rotation."""
+    down = np.array([[0.0, 0.0, -1.0]], np.float32)
+    return LENGTH * (MEAN + harmonics.values(state.shown[:, None], rotation, down)[:, 0, 0])
+
+
 def heading(state: State) -> Float[Array, "n 2"]:
     """The direction of the object in the pad's plane, as cosine and sine of its angle from x.
 
