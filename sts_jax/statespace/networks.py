@@ -308,7 +308,8 @@ class Decoder(nnx.Module):
     """Draws an object of a look in a pose.
 
     A picture of the object is drawn on a canvas that follows its heading. It is placed in the view below the object's
-    origin, at the height of the object's lowest point, which the camera sees from below. `compose` puts it over the images of the empty sensor.
+    origin, at the height of the object's lowest point, which the camera sees from below. `compose` puts it over the
+    images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
