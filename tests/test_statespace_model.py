@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from flax import nnx
 from scipy import special, stats
-from statespace_config import TINY
+from statespace_config import TINY, random_codes, random_states
 
-from sts_jax import optics, statespace, training
+from sts_jax import optics, statespace
 from sts_jax.evaluation import metrics
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import networks, objective, poses
+from sts_jax.statespace import harmonics, networks, objective, poses, state
 
 CONFIG = dataclasses.replace(
     TINY, inputs=("visual", "tactile", "pose"), outcomes=3, condition=3, input_size=32, drawn=0.5, drawn_first=0.5
@@ -28,12 +28,8 @@ class Batch(NamedTuple):
     targets: dict
     present: dict
     condition: jax.Array
-
-
-def codes(rng, number):
-    quat = rng.normal(size=(number, 4))
-    pose = np.concatenate([0.02 * rng.normal(size=(number, 3)), quat / np.linalg.norm(quat, axis=1)[:, None]], axis=1)
-    return training.Preprocessing().encode_pose(jnp.asarray(pose, jnp.float32))
+    views: dict | None = None
+    falls: dict | None = None
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +46,22 @@ def batch(empty):
         for i in range(NUMBER):
             image[i, 5 + 2 * i : 20, 8 : 16 + 3 * i] = rng.uniform(0.1, 0.9, 3)
     small = {name: jnp.asarray(rng.uniform(0.2, 0.8, (NUMBER, 16, 16, 3)), jnp.float32) for name in images}
-    state = codes(rng, NUMBER)
+    code = random_states(rng, NUMBER)
     return Batch(
-        inputs={name: jnp.asarray(image) for name, image in images.items()} | {"pose": state},
-        targets=small | {"state": state, "pose": codes(rng, NUMBER), "outcome": jnp.array([0, 1, 2, 0])},
+        inputs={name: jnp.asarray(image) for name, image in images.items()} | {"pose": code[:, :12]},
+        targets=small | {"state": code, "pose": random_codes(rng, NUMBER), "outcome": jnp.array([0, 1, 2, 0])},
         present={name: jnp.ones(NUMBER, bool) for name in statespace.INPUTS},
         condition=jnp.asarray(rng.normal(size=(NUMBER, 3)), jnp.float32),
     )
+
+
+@pytest.fixture(scope="module")
+def complete(batch):
+    """The batch with first moments without an end and with trajectories without images."""
+    rng = np.random.default_rng(1)
+    falls = {"state": random_states(rng, 5), "pose": random_codes(rng, 5), "outcome": jnp.array([2, 1, 0, 1, 2])}
+    falls["condition"] = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
+    return batch._replace(views={"visual": batch.inputs["visual"][:3, ::-1], "state": random_states(rng, 3)}, falls=falls)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +72,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def loss(model, empty):
-    """The loss, its parts and its gradient, compiled once."""
+    """The loss, its parts and its gradient, compiled once with and once without views and falls."""
     graphdef, params = model
 
     @jax.jit
@@ -82,6 +87,8 @@ def loss(model, empty):
                 empty,
                 present=batch.present,
                 condition=batch.condition,
+                views=batch.views,
+                falls=batch.falls,
             )
 
         return jax.value_and_grad(total, has_aux=True)(params)
@@ -131,17 +138,19 @@ def test_the_log_density_is_that_of_a_mixture_in_the_turned_frame():
     final = networks.FinalPose(
         outcome=jnp.asarray(special.log_softmax(rng.normal(size=(2, 3)), axis=1), jnp.float32),
         weight=jnp.asarray(special.log_softmax(rng.normal(size=(2, 3, 2)), axis=2), jnp.float32),
-        mean=jnp.asarray(rng.normal(size=(2, 3, 2, 12)), jnp.float32),
-        log_var=jnp.asarray(rng.normal(size=(2, 3, 2, 12)), jnp.float32),
+        mean=jnp.asarray(rng.normal(size=(2, 3, 2, poses.MOVE)), jnp.float32),
+        log_var=jnp.asarray(rng.normal(size=(2, 3, 2, poses.MOVE)), jnp.float32),
         heading=jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1), jnp.float32),
     )
-    code, outcome = codes(rng, 2), jnp.array([2, 0])
-    chance, density = objective.log_density(final, code, outcome)
+    code, outcome = random_codes(rng, 2), jnp.array([2, 0])
+    since = poses.matrix(random_codes(rng, 2))
+    chance, density = objective.log_density(final, code, since, outcome)
     for i, j in enumerate([2, 0]):
         turn = np.eye(3)
         turn[:2, :2] = [[np.cos(angle[i]), np.sin(angle[i])], [-np.sin(angle[i]), np.cos(angle[i])]]
         position, matrix = np.asarray(code[i, :3]), np.asarray(code[i, 3:]).reshape(3, 3)
-        own = np.concatenate([turn @ position, (turn @ matrix).ravel()])
+        level = turn @ np.asarray(since[i]) @ turn.T
+        own = np.concatenate([turn @ position, (turn @ matrix).ravel(), level.ravel()])
         parts = [
             float(final.weight[i, j, k])
             + stats.multivariate_normal(final.mean[i, j, k], np.diag(np.exp(final.log_var[i, j, k]))).logpdf(own)
@@ -161,48 +170,55 @@ def test_an_expert_turns_with_the_picture(model, empty):
     change = inside[..., None] * np.random.default_rng(0).uniform(0.1, 0.5, (32, 32, 3))
     both = jnp.asarray(np.stack([change, np.rot90(change, -1)]), jnp.float32)  # rows count downwards: columns to rows
     expert = jax.jit(lambda params, x: nnx.merge(model[0], params).encoders["visual"](x))(params, both)
-    pose, look = jnp.split(expert.mean, [12], axis=1)
-    log_var = expert.log_var
-    np.testing.assert_allclose(pose[1], poses.turn_code(QUARTER, pose[0]), atol=1e-4)
-    np.testing.assert_allclose(jnp.exp(log_var[1, :12]), poses.turn_variance(QUARTER, jnp.exp(log_var[0, :12])), 1e-3)
-    np.testing.assert_allclose(look[1], look[0], atol=1e-4)
-    np.testing.assert_allclose(log_var[1, 12:], log_var[0, 12:], atol=1e-4)
-    assert np.abs(pose[1] - pose[0]).max() > 0.1
+    count = state.CODE + CONFIG.traits + CONFIG.own * harmonics.number(CONFIG.degree)
+    for values, turn_state, turn_shown in (
+        (expert.mean, state.turn, harmonics.turn),
+        (jnp.exp(expert.log_var), state.turn_variance, harmonics.turn_variance),
+    ):
+        known, still, shown = jnp.split(values, [state.CODE, count], axis=1)
+        expected = turn_state(QUARTER[None], state.split(known[:1]))
+        for found, part in zip(state.split(known[1:]), expected, strict=True):
+            np.testing.assert_allclose(found, part, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(still[1], still[0], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(shown[1], turn_shown(QUARTER[None], shown[:1, None])[0, 0], rtol=1e-3, atol=1e-4)
+    pose, _, _, _, shown, low = state.split(expert.mean[:, : state.CODE])
+    assert min(float(jnp.abs(x[1] - x[0]).max()) for x in (pose, shown, low)) > 0.01
 
 
 def test_the_final_pose_turns_with_state_and_condition(model):
     """Exact where the weights of the absolute heading, place and condition are zero, for doubts that are level."""
-    absolute = slice(2 * 12 + CONFIG.look, 2 * 12 + CONFIG.look + 4 + 2)
+    shapes = 2 * CONFIG.support + (CONFIG.own + CONFIG.shown) * CONFIG.directions
+    start = 2 * poses.CODE + 7 + 5 + CONFIG.traits + shapes
+    absolute = slice(start, start + 4 + 2)
     params = changed(model[1], ("transition", "first"), lambda kernel: kernel.at[absolute].set(0))
     rng = np.random.default_rng(0)
-    state, end, condition = codes(rng, 3), codes(rng, 3), jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
-    outcome, look = jnp.array([0, 1, 2]), jnp.asarray(rng.normal(size=(3, 4)), jnp.float32)
+    begin, end, condition = random_states(rng, 3), random_codes(rng, 3), jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
+    outcome = jnp.array([0, 1, 2])
+    traits, own, shown = networks.parts(CONFIG, jnp.asarray(rng.normal(size=(3, CONFIG.look)), jnp.float32))
     angle = jnp.stack([jnp.cos(jnp.array([0.4, 2.0, -1.3])), jnp.sin(jnp.array([0.4, 2.0, -1.3]))], axis=1)
 
     @jax.jit
-    def density(state, end, condition):
-        belief = Gaussian(jnp.concatenate([state, look], axis=1), jnp.full((3, 16), -3.0))
-        final = nnx.merge(model[0], params).transition(belief, condition)
-        return objective.log_density(final, end, outcome)
+    def density(begin, end, condition, shown):
+        mean = jnp.concatenate([begin, traits, own.reshape(3, -1), shown.reshape(3, -1)], axis=1)
+        final = nnx.merge(model[0], params).transition(Gaussian(mean, jnp.full_like(mean, -3.0)), condition)
+        since = poses.matrix(end) @ poses.matrix(begin[:, :12]).swapaxes(1, 2)
+        return objective.log_density(final, end, since, outcome)
 
-    before = density(state, end, condition)
+    before = density(begin, end, condition, shown)
     moved = jnp.concatenate([poses.turn(angle, condition[:, :2]), condition[:, 2:]], axis=1)
-    after = density(poses.turn_code(angle, state), poses.turn_code(angle, end), moved)
+    turned = state.join(state.turn(angle, state.split(begin)))
+    after = density(turned, poses.turn_code(angle, end), moved, harmonics.turn(angle, shown))
     for a, b in zip(before, after, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4)
-    alone = density(poses.turn_code(angle, state), end, condition)
+    alone = density(turned, end, condition, shown)
     assert np.abs(alone[1] - before[1]).min() > 1
 
 
 def test_a_picture_is_where_the_camera_sees_the_object(model):
-    """The drawing of one look, displaced and turned: absolute inputs and the neighbours' weights are zero here."""
+    """The drawing of one object, displaced and turned: weights of the absolute place and heading are zero here."""
     params = changed(model[1], ("decoder", "first"), lambda kernel: kernel.at[jnp.r_[0:2, 12:16]].set(0))
-    params = changed(params, ("decoder", "light"), jnp.zeros_like)
-    for name in ("view", "last"):
-        params = changed(
-            params, ("decoder", name), lambda kernel: jnp.zeros_like(kernel).at[1, 1].set(10 * kernel[1, 1])
-        )
-    code = codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 0.4]))
+    params = changed(params, ("decoder", "last"), lambda kernel: 30 * kernel)
+    code = random_codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 0.4]))
     step = CONFIG.view / 16 * (CONFIG.camera_distance + 0.4 * CONFIG.position_scale) / CONFIG.camera_distance
     there = code.at[:2].set(jnp.array([3 * step, -2 * step]) / CONFIG.position_scale)
     camera = optics.Camera()
@@ -212,8 +228,17 @@ def test_a_picture_is_where_the_camera_sees_the_object(model):
     np.testing.assert_allclose(pixels[1] - pixels[0], [3, -2], atol=1e-4)
     grey = {name: jnp.full((16, 16, 3), 0.4) for name in statespace.IMAGES}
     batch = jnp.stack([code, there, poses.turn_code(QUARTER, code)])
+    # All three come from one present moment.
+    since = poses.matrix(random_codes(np.random.default_rng(1), 1))[0]
+    turns = jnp.stack([since, since, poses.about_vertical(QUARTER) @ since])
+    known = jnp.tile(random_states(np.random.default_rng(2), 1), (3, 1))
     look = jnp.ones((3, CONFIG.look))
-    drawn = jax.jit(lambda code: nnx.merge(model[0], params).decoder(code, look, grey))(batch)
+
+    @jax.jit
+    def draw(code):
+        return networks.compose(nnx.merge(model[0], params).decoder(code, turns, known, look), grey)
+
+    drawn = draw(batch)
     for picture in drawn.values():
         here, moved, turned = np.asarray(picture)
         assert np.std(here[4:12, 4:12]) > 1e-3
@@ -232,7 +257,7 @@ def test_beliefs_are_products_of_the_single_ones(sample, batch):
     np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-3)
     np.testing.assert_allclose(fused.mean, mean, atol=1e-3)
     np.testing.assert_allclose(parts[2].mean[:, :12], batch.inputs["pose"], atol=1e-3)  # a pose is exact,
-    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and without a look
+    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and without a shape or a look
     same(belief(), jax.tree.map(jnp.zeros_like, fused))
 
 
@@ -261,7 +286,7 @@ def test_an_item_does_not_depend_on_its_neighbours(sample, batch):
     [
         ("visual", {"visual"}),
         ("tactile", {"tactile"}),
-        ("state", {"state", "doubt", "first"}),
+        ("state", {"state", "doubt", "first", "pose", "visual", "tactile"}),  # a final pose is also a turn since then
         ("pose", {"pose", "visual", "tactile"}),
         ("outcome", {"outcome", "pose"}),
     ],
@@ -301,7 +326,7 @@ def test_samples_are_poses_and_pictures(sample, batch):
 
 
 def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
-    code = codes(np.random.default_rng(0), 5)
+    code = random_codes(np.random.default_rng(0), 5)
     noisy = code.at[:, 3:].multiply(1.7) + 1e-3
     u, _, vt = np.linalg.svd(np.asarray(noisy[:, 3:]).reshape(-1, 3, 3).astype(np.float64))
     np.testing.assert_allclose(poses.rigid(noisy)[:, 3:].reshape(-1, 3, 3), u @ vt, atol=1e-5)
@@ -316,7 +341,7 @@ def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
         ({"inputs": ()}, "at least one of"),
         ({"window": 12}, "window is 12 pixels; it takes a multiple of 8"),
         ({"input_size": 24}, "input_size is 24 pixels; it takes a multiple of 16"),
-        ({"encoder": (4, 4)}, "encoder has 2 and decoder 4 widths; give 3 and 4"),
+        ({"encoder": (4, 4)}, "encoder has 2 and decoder 3 widths; give 3 and 3"),
         ({"condition": 1}, "condition is 1 numbers"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
     ],
