@@ -61,7 +61,8 @@ def complete(batch):
     rng = np.random.default_rng(1)
     falls = {"state": random_states(rng, 5), "pose": random_codes(rng, 5), "outcome": jnp.array([2, 1, 0, 1, 2])}
     falls["condition"] = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
-    return batch._replace(views={"visual": batch.inputs["visual"][:3, ::-1], "state": random_states(rng, 3)}, falls=falls)
+    views = {"visual": batch.inputs["visual"][:3, ::-1], "state": random_states(rng, 3)}
+    return batch._replace(views=views, falls=falls)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,7 @@ def loss(model, empty):
     graphdef, params = model
 
     @jax.jit
-    def run(batch, params=params):
+    def run(batch, params):
         def total(params):
             return statespace.loss(
                 graphdef,
@@ -93,7 +94,7 @@ def loss(model, empty):
 
         return jax.value_and_grad(total, has_aux=True)(params)
 
-    return run
+    return lambda batch, params=params: run(batch, params)
 
 
 @pytest.fixture(scope="module")
@@ -192,8 +193,8 @@ def test_the_final_pose_turns_with_state_and_condition(model):
     absolute = slice(start, start + 4 + 2)
     params = changed(model[1], ("transition", "first"), lambda kernel: kernel.at[absolute].set(0))
     rng = np.random.default_rng(0)
-    begin, end, condition = random_states(rng, 3), random_codes(rng, 3), jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
-    outcome = jnp.array([0, 1, 2])
+    begin, end, outcome = random_states(rng, 3), random_codes(rng, 3), jnp.array([0, 1, 2])
+    condition = jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
     traits, own, shown = networks.parts(CONFIG, jnp.asarray(rng.normal(size=(3, CONFIG.look)), jnp.float32))
     angle = jnp.stack([jnp.cos(jnp.array([0.4, 2.0, -1.3])), jnp.sin(jnp.array([0.4, 2.0, -1.3]))], axis=1)
 
@@ -244,6 +245,34 @@ def test_a_picture_is_where_the_camera_sees_the_object(model):
         assert np.std(here[4:12, 4:12]) > 1e-3
         np.testing.assert_allclose(moved[:-2, 3:], here[2:, :-3], atol=1e-4)
         np.testing.assert_allclose(turned, np.rot90(here, -1), atol=1e-4)
+
+
+def test_over_all_levels_a_pixel_is_covered_as_often_as_its_probability_says():
+    chance = np.linspace(0.02, 0.98, 25).reshape(1, 5, 5, 1)
+    logit = jnp.tile(jnp.asarray(np.log(chance / (1 - chance)), jnp.float32), (200, 1, 1, 1))
+    layers = networks.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
+    empty = {"visual": jnp.zeros((5, 5, 3)), "tactile": jnp.full((5, 5, 3), 0.4)}
+    soft = networks.compose(layers, empty)
+    np.testing.assert_allclose(soft["visual"][0], np.broadcast_to(chance[0], (5, 5, 3)), atol=1e-5)
+    np.testing.assert_allclose(soft["tactile"], 0.4, rtol=1e-5)
+    sharp = networks.compose(layers, empty, (jnp.arange(200) + 0.5) / 200)
+    np.testing.assert_allclose(np.mean(sharp["visual"], axis=0), soft["visual"][0], atol=0.02)
+    outlines = np.asarray(sharp["visual"])
+    assert np.mean((outlines < 0.05) | (outlines > 0.95)) > 0.7
+    np.testing.assert_array_equal(sharp["tactile"], soft["tactile"])
+
+
+def test_a_true_state_is_believed(model, empty, batch):
+    inputs = {"visual": batch.inputs["visual"], "state": batch.targets["state"]}
+    counts = {name: jnp.ones(NUMBER, bool) for name in inputs}
+
+    @jax.jit
+    def believe(inputs, counts):
+        return objective.fuse(objective.experts(nnx.merge(*model), inputs, counts, empty), counts)
+
+    belief, alone = believe(inputs, counts), believe(inputs, counts | {"state": jnp.zeros(NUMBER, bool)})
+    np.testing.assert_allclose(belief.mean[:, : state.CODE], batch.targets["state"], atol=2e-3)
+    np.testing.assert_allclose(belief.mean[:, state.CODE :], alone.mean[:, state.CODE :], atol=1e-5)
 
 
 def test_beliefs_are_products_of_the_single_ones(sample, batch):
@@ -300,6 +329,77 @@ def test_a_target_changes_its_own_parts_of_the_loss_alone(loss, batch, name, con
     assert {part for part in before if before[part] != after[part]} == concerned
 
 
+def test_views_and_falls_change_their_own_parts_of_the_loss_alone(loss, batch, complete):
+    (_, without), _ = loss(batch)
+    (_, before), gradient = loss(complete)
+    for part in before:  # two compiled programs round differently
+        alike = np.isclose(before[part], without[part], rtol=1e-5)
+        assert alike == (part not in {"state", "doubt", "first", "outcome", "pose"}), part
+
+    def changed_parts(kind, name):
+        values = getattr(complete, kind)[name]
+        new = (values + 1) % 3 if name == "outcome" else values[::-1]
+        (_, after), _ = loss(complete._replace(**{kind: getattr(complete, kind) | {name: new}}))
+        return {part for part in before if before[part] != after[part]}
+
+    for name in ("visual", "state"):
+        assert changed_parts("views", name) == {"state", "doubt", "first"}
+    assert changed_parts("falls", "pose") == {"pose"}
+    for name in ("state", "outcome", "condition"):
+        assert changed_parts("falls", name) == {"outcome", "pose"}
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_views_weigh_as_much_as_other_first_moments(loss, complete):
+    """Each of three views and of the pictures that count has the same share of the squared error."""
+
+    def squared(*counts):
+        present = {"visual": jnp.array(counts, bool), "tactile": jnp.zeros(NUMBER, bool)}
+        (_, terms), _ = loss(complete._replace(present=complete.present | present))
+        return (3 + sum(counts)) * terms["state"]
+
+    views = squared(0, 0, 0, 0)
+    each = [squared(*row) - views for row in np.eye(4, dtype=int).tolist()]
+    np.testing.assert_allclose(squared(1, 1, 1, 1), views + sum(each), rtol=1e-4)
+    assert min(each) > 0
+
+
+@pytest.mark.parametrize("shown", ["object", "nothing"])
+def test_the_gradient_is_finite_where_nothing_is_known_of_the_rotation(loss, complete, model, empty, shown):
+    """The pose counts nowhere, and the encoders' states are zero: headings are those of vectors of length 0."""
+    params = model[1]
+    for name in statespace.IMAGES:
+        params = changed(params, ("encoders", name, "last"), jnp.zeros_like)
+    inputs = dict(complete.inputs)
+    if shown == "nothing":
+        inputs |= {name: jnp.tile(image, (NUMBER, 1, 1, 1)) for name, image in empty.items()}
+    present = complete.present | {"pose": jnp.zeros(NUMBER, bool)}
+    (total, terms), gradient = loss(complete._replace(inputs=inputs, present=present), params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((total, terms, gradient)))
+    moved = nnx.to_pure_dict(gradient)["encoders"]["visual"]["last"]["kernel"]
+    assert np.abs(moved).max() > 0
+
+
+def test_the_states_of_falls_are_exact_or_have_noise_of_the_size_that_their_beliefs_have():
+    number = 400
+    code = jnp.tile(random_states(np.random.default_rng(0), 8), (number // 8, 1))
+    falls = {"state": code, "pose": code[:, :12], "outcome": jnp.zeros(number, jnp.int32)}
+    ends = objective._known_ends(jax.random.key(0), falls, CONFIG.look)
+    mean, variance = (np.asarray(x, np.float64) for x in (ends.belief.mean, jnp.exp(ends.belief.log_var)))
+    np.testing.assert_array_equal(mean[:, state.CODE :], 0)  # nothing is known of the look
+    np.testing.assert_allclose(variance[:, state.CODE :], 1, rtol=1e-5)
+    np.testing.assert_allclose(mean[:, :12], code[:, :12], atol=1e-3)
+    np.testing.assert_allclose(mean[::2, : state.CODE], code[::2], atol=1e-3)
+    # Without the prior, the belief is a Gaussian of this mean and variance.
+    mean, variance = mean[1::2, 12 : state.CODE], variance[1::2, 12 : state.CODE]
+    noise = variance / (1 - variance)
+    error = (mean * noise / variance - code[1::2, 12:]) / np.sqrt(noise)
+    np.testing.assert_allclose(error.mean(), 0, atol=0.03)
+    np.testing.assert_allclose(error.std(), 1, atol=0.03)
+    assert np.sqrt(noise).min() > 0.019
+    assert np.sqrt(noise).max() < 1.01
+
+
 def test_a_few_steps_lower_the_loss(loss, batch, model):
     params = jax.tree.map(np.asarray, model[1])  # in NumPy there is nothing to compile
     (first, _), gradient = loss(batch)
@@ -321,7 +421,8 @@ def test_samples_are_poses_and_pictures(sample, batch):
     np.testing.assert_allclose(matrix @ matrix.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(matrix), 1, atol=1e-5)
     np.testing.assert_allclose(found.outcome.sum(1), 1, rtol=1e-5)
-    assert all(((x >= 0) & (x <= 1)).all() for x in found.images.values())
+    assert all(((x >= 0) & (x <= 1)).all() for x in (*found.images.values(), *found.mean.values()))
+    np.testing.assert_allclose(found.mean["tactile"], found.images["tactile"].mean(0), atol=1e-6)
     assert np.std(found.pose, axis=0).min() > 0
 
 

@@ -197,7 +197,10 @@ def loss(
     last = math.ceil(config.drawn * number)
     turn = _turn(targets["state"], targets["pose"])
     after = _Pictures(
-        *jax.tree.map(lambda x: x[:last], (targets["pose"], turn, belief, {name: targets[name] for name in IMAGES})),
+        pose=targets["pose"][:last],
+        turn=turn[:last],
+        belief=jax.tree.map(lambda x: x[:last], belief),
+        images={name: targets[name][:last] for name in IMAGES},
         counts={name: jnp.ones(last, bool) for name in IMAGES},
     )
     first = math.ceil(config.drawn_first * number)
