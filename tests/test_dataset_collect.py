@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
+from experiments import stages
 from sts_jax import _files, dataset, geometry
 from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
@@ -23,6 +24,17 @@ SMALL = dataset.Collection(
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dataset")
     dataset.collect(SMALL, sts.Sensor(), folder)
+    return folder
+
+
+SPARSE = dataclasses.replace(SMALL, num_rendered=1, num_views=2)
+
+
+@pytest.fixture(scope="module")
+def sparse(tmp_path_factory):
+    """The same collection with images of half the trajectories, and with views."""
+    folder = tmp_path_factory.mktemp("sparse")
+    dataset.collect(SPARSE, sts.Sensor(), folder)
     return folder
 
 
@@ -67,6 +79,95 @@ def test_frames_are_those_that_sense_draws(folder):
             assert np.mean(difference > 1) < 0.01
     np.testing.assert_array_equal(pairs.trajectory, [5] * 8 + [0] * 8)
     np.testing.assert_array_equal(pairs.object, data.trajectory["body"][pairs.trajectory])
+
+
+def test_a_trajectory_without_images_is_that_of_a_collection_with_all_images(folder, sparse):
+    whole, data = dataset.load(folder), dataset.load(sparse)
+    for name in ("pose", "outcome", "wrench", "body"):
+        np.testing.assert_array_equal(data.trajectory[name], whole.trajectory[name])
+    np.testing.assert_array_equal(data.rendered(), [0, 2, 4, 6])
+    np.testing.assert_array_equal(data.full_trajectories(), [0])
+    assert len(data.frames) == 12 + 3 * 2 + 4 * 14
+    for part, objects in data.split.items():
+        np.testing.assert_array_equal(data.members(part), 2 * objects)
+        np.testing.assert_array_equal(data.members(part, rendered=False), whole.members(part))
+    for one, other in zip(data.pairs(np.array([4])), whole.pairs(np.array([4])), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match=r"trajectories holds 3, which has no images \(num_rendered=1\): use `ends`"):
+        data.pairs(np.array([2, 3]))
+    rows = stages.rows_of(data, "trajectory")
+    np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), data.rendered())
+    ends = data.ends(np.array([3, 0]))
+    np.testing.assert_array_equal(ends.pose, whole.trajectory["pose"][[3, 0]][:, [0, -1]])
+    np.testing.assert_array_equal(ends.object, [1, 0])
+    np.testing.assert_array_equal(ends.trajectory, [3, 0])
+    assert [leaf.shape for leaf in ends[1:6]] == [(2, 0), (2,), (2, 128), (2,), (2, 3)]
+
+
+def test_the_true_shape_and_mass_are_those_of_the_body_with_its_hidden_values(folder):
+    data = dataset.load(folder)
+    pairs, ends = data.pairs(np.arange(8), symmetries=True), data.ends(np.arange(8))
+    bodies, rigid = dataset.make_bodies(SMALL, np.arange(4)), jax.jit(sts.objects.rigid)
+    for row, (number, trajectory) in enumerate(zip(pairs.object, pairs.trajectory, strict=True)):
+        made = sts.objects.mirror(bodies[number]) if row % 8 >= 4 else bodies[number]
+        hidden = {name: leaf[trajectory] for name, leaf in data.hidden.items()}
+        up = hidden["up"] * (np.array([1, -1, 1], np.float32) if row % 8 >= 4 else 1)
+        mass, com, _ = rigid(made, hidden["fill"], hidden["shell_scale"], up)
+        np.testing.assert_array_equal(pairs.support[row], sts.objects.support(made))
+        np.testing.assert_allclose(pairs.mass[row], mass, rtol=1e-5)
+        np.testing.assert_allclose(pairs.com[row], com, atol=1e-7)
+    np.testing.assert_allclose(ends.pose, pairs.pose[::8], atol=1e-6)
+    for name in ("support", "mass", "com", "outcome", "object", "condition"):
+        np.testing.assert_array_equal(getattr(ends, name), getattr(pairs, name)[::8])
+    assert {leaf.dtype for leaf in (pairs.support, pairs.mass, pairs.com, pairs.pose)} == {np.dtype(np.float32)}
+
+
+def test_views_are_what_sense_draws_at_starts_of_no_trajectory(sparse):
+    data = dataset.load(sparse)
+    sense = jax.jit(lambda body, pose: sts.sense(sts.Sensor(), body, pose, jnp.zeros(6)).visual)
+    seen = 0
+    for part, members in data.split.items():
+        views = data.views(part)
+        np.testing.assert_array_equal(views.object, np.repeat(members, 2))
+        assert views.visual.shape == (len(views.object), 64, 64, 3)
+        for visual, pose, support, mass, com, number in zip(*views, strict=True):
+            (body,) = dataset.make_bodies(SPARSE, np.array([number]))
+            assert np.mean(np.abs(visual.astype(int) - np.round(np.asarray(sense(body, pose)) * 255)) > 1) < 0.01
+            np.testing.assert_array_equal(support, sts.objects.support(body))
+            assert 0 < mass < 5
+            assert (sts.objects.DIRECTIONS @ com < support).all()
+            others = data.trajectory["pose"][data.trajectory["body"] == number, 0]
+            assert np.abs(others - pose).max(1).min() > 1e-3
+            seen += 1
+    assert seen == 8
+    assert len(np.unique(data.view["pose"], axis=0)) == 8
+    assert dataset.load(sparse).views("test")._fields == dataset.Views._fields
+
+
+def test_a_collection_without_views_has_none(folder):
+    views = dataset.load(folder).views("train")
+    assert [leaf.shape for leaf in views] == [(0, 64, 64, 3), (0, 7), (0, 128), (0,), (0, 3), (0,)]
+    with pytest.raises(ValueError, match="unknown part 'all'"):
+        dataset.load(folder).views("all")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"num_rendered": 0},
+            r"num_rendered must be a whole number from 1 to num_per_object=2, or None .* got 0",
+        ),
+        ({"num_rendered": 3}, r"num_rendered must be .* got 3"),
+        ({"num_rendered": True}, r"num_rendered must be .* got True"),
+        ({"num_views": -1}, r"num_views must be a whole number of at least 0, got -1"),
+        ({"num_views": False}, r"num_views must be .* got False"),
+    ],
+)
+def test_counts_out_of_range_are_refused_before_anything_is_written(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataset.collect(dataclasses.replace(SMALL, **changes), sts.Sensor(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_the_sensor_of_a_dataset_is_read_as_any_other(folder):
@@ -272,14 +373,15 @@ def test_a_description_that_was_changed_afterwards_is_named(copied):
         dataset.load(copied)
 
 
-def test_an_older_dataset_must_be_collected_again(copied):
+@pytest.mark.parametrize("older", [1, 3])
+def test_an_older_dataset_must_be_collected_again(copied, older):
     path = copied / "collection.json"
     content = json.loads(path.read_text())
     del content["format"]
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content if older == 1 else {**content, "format": older}))
     for use in (dataset.load, lambda folder: dataset.collect(SMALL, sts.Sensor(), folder)):
         with pytest.raises(
-            ValueError, match=r"is a dataset of format 1, and this version reads format 4: delete .* and"
+            ValueError, match=rf"is a dataset of format {older}, and this version reads format 4: delete .* and"
         ):
             use(copied)
 

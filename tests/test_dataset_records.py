@@ -28,6 +28,16 @@ def test_frames_come_back_in_the_order_asked_for(tmp_path):
         np.testing.assert_array_equal(there[[4, 0, 2]], here)
 
 
+def test_views_behind_frames_come_back_in_the_order_asked_for(tmp_path):
+    images, path = some_images(), tmp_path / "a.array_record"
+    views = np.random.default_rng(1).integers(0, 256, (3, 9, 7, 3), dtype=np.uint8)
+    records.write_images(path, [images, (views,)])
+    back = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
+    np.testing.assert_array_equal(back, views[[2, 0]])
+    with pytest.raises(dataset.TornFileError, match=r"holds 8 records instead of 5"):
+        records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
+
+
 def test_same_frames_same_bytes(tmp_path):
     for name in ("a", "b"):
         records.write_images(tmp_path / f"{name}.array_record", [some_images()])
@@ -98,11 +108,11 @@ COLLECTION, SENSOR = "c" * 64, "s" * 64
 
 
 def shard(folder, index, seed=0, collection=COLLECTION):
-    """A shard's record file, written with five images and arrays that hold nothing."""
+    """A shard's record file, written with five images, two views and arrays that hold nothing."""
     path = folder / f"{index}.array_record"
     images = some_images()._replace(visual=np.random.default_rng(seed).integers(0, 256, (5, 9, 7, 3), dtype=np.uint8))
     arrays = {name: np.arange(3) for name in records.ARRAYS}
-    records.write_shard(path, [images], arrays, records.Identity(collection, SENSOR, index))
+    records.write_shard(path, [images, (images.visual[:2],)], arrays, records.Identity(collection, SENSOR, index))
     return path
 
 

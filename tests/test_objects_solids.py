@@ -1,9 +1,14 @@
+import dataclasses
+import inspect
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
+from sts_jax import objects
 from sts_jax.objects import fill_moments, rest_poses
 from sts_jax.objects.solids import convex_hull, corner_normals, outside_hull, solid_moments, surface_moments
 
@@ -199,3 +204,29 @@ def test_corner_normals_of_faces_without_area_are_finite():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]])
     normals = corner_normals(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
+
+
+def test_directions_are_unit_vectors_spread_over_the_sphere():
+    directions = objects.DIRECTIONS
+    assert (directions.shape, directions.dtype) == ((128, 3), np.float32)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(directions.mean(0), 0, atol=0.01)
+    np.testing.assert_allclose(directions.T @ directions / 128, np.eye(3) / 3, atol=0.01)
+    step = 37.5
+    angle, z = math.pi * (1 + math.sqrt(5)) * step, 1 - 2 * step / 128
+    expected = [math.sqrt(1 - z * z) * math.cos(angle), math.sqrt(1 - z * z) * math.sin(angle), z]
+    np.testing.assert_allclose(directions[37], expected, atol=1e-6)
+
+
+def test_the_support_of_a_cuboid_and_of_a_hull_is_the_furthest_corner():
+    corners = np.array([[x, y, z] for x in (-0.01, 0.03) for y in (-0.02, 0.02) for z in (-0.05, 0.01)])
+    body = objects.make(jax.random.key(0), "mouse")
+    padded = np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None].astype(np.float32)
+    for hulls in (padded, np.asarray(body.hulls)):
+        found = objects.support(dataclasses.replace(body, hulls=jnp.asarray(hulls)))
+        assert (found.shape, found.dtype) == ((128,), np.float32)
+        for direction, value in zip(objects.DIRECTIONS, found, strict=True):
+            furthest = max(float(np.dot(v, direction)) for v in hulls.reshape(-1, 3).astype(float))
+            np.testing.assert_allclose(value, furthest, atol=1e-7)
+    with pytest.raises(ValueError, match=r"hulls has the shape \(1, 1, .*: take one of the bodies"):
+        inspect.unwrap(objects.support)(objects.stack([body]))

@@ -447,3 +447,32 @@ def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:
         )
     with pytest.raises(ValueError, match="no body"):
         physics.simulate(jax.random.key(0), [], Sensor(), SCENARIO)
+
+
+def test_further_starts_are_independent_of_simulated_ones_and_of_their_number(bodies: list[objects.Body]) -> None:
+    key, two = jax.random.key(3), bodies[:2]
+    one = physics.starts(key, two, Sensor(), SCENARIO, 3)
+    assert one.pose.shape == (6, 7)
+    np.testing.assert_array_equal(one.body, [0, 0, 0, 1, 1, 1])
+    assert len(np.unique(np.round(one.hidden.fill, 6))) == 6
+    fewer = physics.starts(key, bodies[0], Sensor(), SCENARIO, 2)
+    np.testing.assert_allclose(fewer.pose, one.pose[:2], atol=1e-6)
+    np.testing.assert_array_equal(fewer.hidden.fill, one.hidden.fill[:2])
+    drawn = physics.simulate(key, two, Sensor(), SCENARIO, 3, engine="mujoco")
+    for further, own in ((one.pose, drawn.pose[:, 0]), (one.hidden.fill, drawn.hidden.fill)):
+        assert np.abs(np.asarray(further)[:, None] - np.asarray(own)[None]).reshape(36, -1).max(1).min() > 1e-4
+    with pytest.raises(ValueError, match="num is 0"):
+        physics.starts(key, two, Sensor(), SCENARIO, 0)
+
+
+def test_mass_properties_of_draws_are_those_of_each(bodies: list[objects.Body]) -> None:
+    drawn = physics.starts(jax.random.key(5), bodies[:2], Sensor(), SCENARIO, 9).hidden
+    which = np.repeat([0, 1], 9)
+    found = physics.rigids(bodies[:2], which, drawn)
+    for row in (0, 8, 9, 17):
+        own = jax.tree.map(lambda x, row=row: x[row], drawn)
+        mass, com, inertia = objects.rigid(bodies[which[row]], own.fill, own.shell_scale, own.up)
+        np.testing.assert_allclose(found.mass[row], mass, rtol=1e-5)
+        np.testing.assert_allclose(found.com[row], com, atol=1e-7)
+        np.testing.assert_allclose(found.inertia[row], inertia, rtol=1e-3, atol=1e-9)
+        assert found.friction[row] == own.friction

@@ -110,7 +110,7 @@ class Dataset:
             np.empty((len(rows), height, width, 3), np.uint8),
             np.empty((len(rows), height, width), bool),
         )
-        for shard in np.unique(self.shard_of[rows]):
+        for shard in np.unique(self.shard_of[rows]).tolist():
             here = np.flatnonzero(self.shard_of[rows] == shard)
             part = records.read_images(
                 self.shards[shard],
@@ -191,7 +191,7 @@ class Dataset:
         rows = np.flatnonzero(np.isin(self.view["body"], self._part(part)))
         height, width = self.collection["resolution"]
         visual = np.empty((len(rows), height, width, 3), np.uint8)
-        for shard in np.unique(self.view_shard_of[rows]):
+        for shard in np.unique(self.view_shard_of[rows]).tolist():
             here = np.flatnonzero(self.view_shard_of[rows] == shard)
             visual[here] = records.read_views(
                 self.shards[shard],

@@ -25,7 +25,8 @@ INPUTS = (*IMAGES, "pose")
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
 _NEAREST = 0.2  # of the camera's distance: an object nearer to the pinhole is drawn at this distance
-_CONTRAST = 6.0  # of the outline of a sample, against that of the mean
+_CONTRAST = 4.5  # of the outline of a sample, against that of the mean
+_OUTSIDE = 8.0  # by how much less the outside of the canvas is covered, in logits
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
 
 
@@ -63,6 +64,7 @@ class Config:
     state_weight: float = 16.0  # of the squared error of the first pose, as each image's expert has it
     pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
     outcome_weight: float = 8.0  # of the outcome's nats
+    covered_weight: float = 0.5  # of the nats of the object's outline
     first_weight: float = 0.5  # of the nats of the first moment's images
     look_weight: float = 0.3  # of the look's divergence: below 1, samples are sharper
     drawn: float = 0.4375  # share of a batch whose last moment is drawn; every sample trains the rest
@@ -347,11 +349,11 @@ class Decoder(nnx.Module):
         x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
         for layer, enlarge in zip(self.layers, self.enlarge, strict=False):
             x = _unfold(enlarge(layer(x)))
-        x = _unfold(self.last(jax.nn.swish(self.layers[-1](x))))
+        x = _unfold(self.last(jax.nn.swish(self.layers[-1](x)))).at[..., 3].add(_OUTSIDE)
         x = window.sample(x, _on_canvas(config, pose, heading))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
         # At first, hardly anything is covered.
-        return Layers(covered=x[..., 3:4] - 3, colour=jax.nn.sigmoid(x[..., :3]), touch=x[..., 4:7])
+        return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=jax.nn.sigmoid(x[..., :3]), touch=x[..., 4:7])
 
 
 def compose(

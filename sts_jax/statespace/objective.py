@@ -7,6 +7,7 @@ For a batch of first moments with their last moments, it is the sum of
   the inputs;
 - the excess cross-entropy of both streams of the last moment, drawn in the true final pose with a sample of the look,
   and that of the first moment, drawn in the true first pose;
+- the cross-entropy of the pixels that the object covers in these pictures;
 - beta times the divergence of the look from its prior, in nats.
 
 A moment is drawn in its true pose, so that the decoder never averages over places. The subset whose belief gives the
@@ -23,7 +24,7 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
-from sts_jax.statespace import poses, state
+from sts_jax.statespace import poses, state, window
 from sts_jax.statespace.networks import IMAGES, FinalPose, Model, compose
 
 EXACT_LOG_VAR = -9.2  # of a pose that is given: 0.5 mm
@@ -158,7 +159,8 @@ def loss(
 
     Returns:
         The loss, and its parts: means over the items that count, before any weight. `state` is in units of the code
-        squared, all others are in nats. `state`, `doubt` and `first` are summed over the input images.
+        squared, all others are in nats. `state`, `doubt` and `first` are summed over the input images, and `covered`
+        over the first and the last moment.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
@@ -219,6 +221,7 @@ def loss(
     total = (
         terms["visual"]
         + config.tactile_weight * terms["tactile"]
+        + config.covered_weight * terms["covered"]
         + config.first_weight * terms["first"]
         + config.state_weight * terms["state"]
         + config.pose_weight * (terms["doubt"] + terms["pose"])
@@ -324,8 +327,9 @@ def _picture_terms(
     before: _Pictures,
     empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Float[Array, ""]]:
-    """The nats of the last moment's images, by name, and of the first moment's, summed over the names."""
+    """The nats of the last moment's images, by name, of the first moment's, summed over the names, and of outlines."""
     size = model.config.image_size
+    small = {name: reduced(x, size) for name, x in empty.items()}
 
     def looks(key: PRNGKeyArray, belief: Gaussian) -> Float[Array, "n look"]:
         mean, log_var = (x[:, state.CODE :] for x in belief)
@@ -338,7 +342,7 @@ def _picture_terms(
         jax.lax.stop_gradient(jnp.concatenate([x.belief.mean[:, : state.CODE] for x in (after, before)])),
         jnp.concatenate([looks(key, x.belief) for key, x in zip(keys, (after, before), strict=True)]),
     )
-    drawn = compose(layers, {name: reduced(x, size) for name, x in empty.items()})
+    drawn = compose(layers, small)
     number = len(after.pose)
     terms = {name: jnp.mean(excess(drawn[name][:number], after.images[name])) for name in IMAGES}
     terms["first"] = jnp.zeros(())
@@ -346,4 +350,21 @@ def _picture_terms(
         counts = before.counts[name]
         wrong = excess(drawn[name][number:], reduced(_counted(counts, image), size))
         terms["first"] += jnp.sum(jnp.where(counts, wrong, 0)) / jnp.maximum(jnp.sum(counts), 1)
+    terms["covered"] = jnp.mean(_outline_nats(layers.covered[:number], after.images["visual"] - small["visual"]))
+    if "visual" in before.images:
+        counts = before.counts["visual"]
+        change = reduced(_counted(counts, before.images["visual"]), size) - small["visual"]
+        wrong = _outline_nats(layers.covered[number:], change)
+        terms["covered"] += jnp.sum(jnp.where(counts, wrong, 0)) / jnp.maximum(jnp.sum(counts), 1)
     return terms
+
+
+def _outline_nats(logit: Float[Array, "n h w 1"], change: Float[Array, "n h w 3"]) -> Float[Array, "n"]:
+    """Cross-entropy of the probability that a pixel shows the object, summed over pixels.
+
+    Args:
+        logit: of the probability.
+        change: the visual image less that of the empty sensor.
+    """
+    seen = window.shows(change)
+    return jnp.sum(jax.nn.softplus(logit[..., 0]) - seen * logit[..., 0], axis=(1, 2))

@@ -20,6 +20,15 @@ class Window(NamedTuple):
     side: Float[Array, "n"]
 
 
+def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
+    """1 where an image shows something, else 0.
+
+    Args:
+        change: images less that of the empty sensor.
+    """
+    return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
+
+
 def locate(change: Float[Array, "n size size 3"]) -> Window:
     """The window around everything that an image shows; the whole image where it shows nothing.
 
@@ -27,8 +36,8 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
         change: square images less that of the empty sensor.
     """
     size = change.shape[1]
-    seen = jnp.max(jnp.abs(change), axis=-1) > THRESHOLD
-    weight = seen.astype(jnp.float32)
+    weight = shows(change)
+    seen = weight > 0
     total = jnp.maximum(jnp.sum(weight, axis=(1, 2)), 1)
     place = (jnp.arange(size) + 0.5) / size
 
