@@ -3,25 +3,46 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import sts_jax as sts
-from sts_jax import statespace, training
+from sts_jax import objects, statespace, training
 
 TINY = statespace.Config(
     input_size=16,
     image_size=16,
-    look=4,
+    traits=4,
+    own=1,
+    shown=1,
+    degree=2,
+    directions=4,
+    support=6,
     components=2,
     window=8,
     encoder=(4, 4, 4),
-    decoder=(8, 4, 4, 4),
+    decoder=(8, 4, 4),
     hidden=16,
     transition=16,
     canvas=16,
 )
 
 STATE = dataclasses.replace(TINY, inputs=statespace.INPUTS, outcomes=3, condition=3, input_size=32)
+
+
+def random_codes(rng, number):
+    """Codes of random poses."""
+    quat = rng.normal(size=(number, 4))
+    pose = np.concatenate([0.02 * rng.normal(size=(number, 3)), quat / np.linalg.norm(quat, axis=1)[:, None]], axis=1)
+    return training.Preprocessing().encode_pose(jnp.asarray(pose, jnp.float32))
+
+
+def random_states(rng, number):
+    """Codes of random convex objects in random poses."""
+    points = rng.normal(size=(number, 20, 3)) * [0.02, 0.015, 0.01]
+    support = np.max(points @ objects.DIRECTIONS.T.astype(np.float64), axis=1)
+    solid = support, rng.uniform(0.02, 0.2, number), 0.005 * rng.normal(size=(number, 3))
+    return statespace.encode(random_codes(rng, number), *(jnp.asarray(x, jnp.float32) for x in solid))
 
 
 def state_model(**changes):

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from flax import nnx
 from scipy import special, stats
-from statespace_config import TINY
+from statespace_config import TINY, random_codes, random_states
 
-from sts_jax import optics, statespace, training
+from sts_jax import optics, statespace
 from sts_jax.evaluation import metrics
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import networks, objective, poses
+from sts_jax.statespace import harmonics, networks, objective, poses, state
 
 CONFIG = dataclasses.replace(
     TINY, inputs=("visual", "tactile", "pose"), outcomes=3, condition=3, input_size=32, drawn=0.5, drawn_first=0.5
@@ -28,12 +28,8 @@ class Batch(NamedTuple):
     targets: dict
     present: dict
     condition: jax.Array
-
-
-def codes(rng, number):
-    quat = rng.normal(size=(number, 4))
-    pose = np.concatenate([0.02 * rng.normal(size=(number, 3)), quat / np.linalg.norm(quat, axis=1)[:, None]], axis=1)
-    return training.Preprocessing().encode_pose(jnp.asarray(pose, jnp.float32))
+    views: dict | None = None
+    falls: dict | None = None
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +45,27 @@ def batch(empty):
     for image in images.values():
         for i in range(NUMBER):
             image[i, 5 + 2 * i : 20, 8 : 16 + 3 * i] = rng.uniform(0.1, 0.9, 3)
-    small = {name: jnp.asarray(rng.uniform(0.2, 0.8, (NUMBER, 16, 16, 3)), jnp.float32) for name in images}
-    state = codes(rng, NUMBER)
+    small = {name: rng.uniform(0.2, 0.8, (NUMBER, 16, 16, 3)) for name in images}
+    for i, image in enumerate(small["visual"]):  # the last moment's objects cover a part of the view
+        image[: 8 - i, :] = empty["visual"].reshape(16, 2, 16, 2, 3).mean((1, 3))[: 8 - i, :]
+    small = {name: jnp.asarray(image, jnp.float32) for name, image in small.items()}
+    code = random_states(rng, NUMBER)
     return Batch(
-        inputs={name: jnp.asarray(image) for name, image in images.items()} | {"pose": state},
-        targets=small | {"state": state, "pose": codes(rng, NUMBER), "outcome": jnp.array([0, 1, 2, 0])},
+        inputs={name: jnp.asarray(image) for name, image in images.items()} | {"pose": code[:, :12]},
+        targets=small | {"state": code, "pose": random_codes(rng, NUMBER), "outcome": jnp.array([0, 1, 2, 0])},
         present={name: jnp.ones(NUMBER, bool) for name in statespace.INPUTS},
         condition=jnp.asarray(rng.normal(size=(NUMBER, 3)), jnp.float32),
     )
+
+
+@pytest.fixture(scope="module")
+def complete(batch):
+    """The batch with first moments without an end and with trajectories without images."""
+    rng = np.random.default_rng(1)
+    falls = {"state": random_states(rng, 5), "pose": random_codes(rng, 5), "outcome": jnp.array([2, 1, 0, 1, 2])}
+    falls["condition"] = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
+    views = {"visual": batch.inputs["visual"][:3, ::-1], "state": random_states(rng, 3)}
+    return batch._replace(views=views, falls=falls)
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +76,11 @@ def model():
 
 @pytest.fixture(scope="module")
 def loss(model, empty):
-    """The loss, its parts and its gradient, compiled once."""
+    """The loss, its parts and its gradient, compiled once with and once without views and falls."""
     graphdef, params = model
 
     @jax.jit
-    def run(batch, params=params):
+    def run(batch, params):
         def total(params):
             return statespace.loss(
                 graphdef,
@@ -82,11 +91,13 @@ def loss(model, empty):
                 empty,
                 present=batch.present,
                 condition=batch.condition,
+                views=batch.views,
+                falls=batch.falls,
             )
 
         return jax.value_and_grad(total, has_aux=True)(params)
 
-    return run
+    return lambda batch, params=params: run(batch, params)
 
 
 @pytest.fixture(scope="module")
@@ -131,17 +142,19 @@ def test_the_log_density_is_that_of_a_mixture_in_the_turned_frame():
     final = networks.FinalPose(
         outcome=jnp.asarray(special.log_softmax(rng.normal(size=(2, 3)), axis=1), jnp.float32),
         weight=jnp.asarray(special.log_softmax(rng.normal(size=(2, 3, 2)), axis=2), jnp.float32),
-        mean=jnp.asarray(rng.normal(size=(2, 3, 2, 12)), jnp.float32),
-        log_var=jnp.asarray(rng.normal(size=(2, 3, 2, 12)), jnp.float32),
+        mean=jnp.asarray(rng.normal(size=(2, 3, 2, poses.MOVE)), jnp.float32),
+        log_var=jnp.asarray(rng.normal(size=(2, 3, 2, poses.MOVE)), jnp.float32),
         heading=jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=1), jnp.float32),
     )
-    code, outcome = codes(rng, 2), jnp.array([2, 0])
-    chance, density = objective.log_density(final, code, outcome)
+    code, outcome = random_codes(rng, 2), jnp.array([2, 0])
+    since = poses.matrix(random_codes(rng, 2))
+    chance, density = objective.log_density(final, code, since, outcome)
     for i, j in enumerate([2, 0]):
         turn = np.eye(3)
         turn[:2, :2] = [[np.cos(angle[i]), np.sin(angle[i])], [-np.sin(angle[i]), np.cos(angle[i])]]
         position, matrix = np.asarray(code[i, :3]), np.asarray(code[i, 3:]).reshape(3, 3)
-        own = np.concatenate([turn @ position, (turn @ matrix).ravel()])
+        level = turn @ np.asarray(since[i]) @ turn.T
+        own = np.concatenate([turn @ position, (turn @ matrix).ravel(), level.ravel()])
         parts = [
             float(final.weight[i, j, k])
             + stats.multivariate_normal(final.mean[i, j, k], np.diag(np.exp(final.log_var[i, j, k]))).logpdf(own)
@@ -161,48 +174,55 @@ def test_an_expert_turns_with_the_picture(model, empty):
     change = inside[..., None] * np.random.default_rng(0).uniform(0.1, 0.5, (32, 32, 3))
     both = jnp.asarray(np.stack([change, np.rot90(change, -1)]), jnp.float32)  # rows count downwards: columns to rows
     expert = jax.jit(lambda params, x: nnx.merge(model[0], params).encoders["visual"](x))(params, both)
-    pose, look = jnp.split(expert.mean, [12], axis=1)
-    log_var = expert.log_var
-    np.testing.assert_allclose(pose[1], poses.turn_code(QUARTER, pose[0]), atol=1e-4)
-    np.testing.assert_allclose(jnp.exp(log_var[1, :12]), poses.turn_variance(QUARTER, jnp.exp(log_var[0, :12])), 1e-3)
-    np.testing.assert_allclose(look[1], look[0], atol=1e-4)
-    np.testing.assert_allclose(log_var[1, 12:], log_var[0, 12:], atol=1e-4)
-    assert np.abs(pose[1] - pose[0]).max() > 0.1
+    count = state.CODE + CONFIG.traits + CONFIG.own * harmonics.number(CONFIG.degree)
+    for values, turn_state, turn_shown in (
+        (expert.mean, state.turn, harmonics.turn),
+        (jnp.exp(expert.log_var), state.turn_variance, harmonics.turn_variance),
+    ):
+        known, still, shown = jnp.split(values, [state.CODE, count], axis=1)
+        expected = turn_state(QUARTER[None], state.split(known[:1]))
+        for found, part in zip(state.split(known[1:]), expected, strict=True):
+            np.testing.assert_allclose(found, part, rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(still[1], still[0], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(shown[1], turn_shown(QUARTER[None], shown[:1, None])[0, 0], rtol=1e-3, atol=1e-4)
+    pose, _, _, _, shown, low = state.split(expert.mean[:, : state.CODE])
+    assert min(float(jnp.abs(x[1] - x[0]).max()) for x in (pose, shown, low)) > 0.01
 
 
 def test_the_final_pose_turns_with_state_and_condition(model):
     """Exact where the weights of the absolute heading, place and condition are zero, for doubts that are level."""
-    absolute = slice(2 * 12 + CONFIG.look, 2 * 12 + CONFIG.look + 4 + 2)
+    shapes = 2 * CONFIG.support + (CONFIG.own + CONFIG.shown) * CONFIG.directions
+    start = 2 * poses.CODE + 7 + 5 + CONFIG.traits + shapes
+    absolute = slice(start, start + 4 + 2)
     params = changed(model[1], ("transition", "first"), lambda kernel: kernel.at[absolute].set(0))
     rng = np.random.default_rng(0)
-    state, end, condition = codes(rng, 3), codes(rng, 3), jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
-    outcome, look = jnp.array([0, 1, 2]), jnp.asarray(rng.normal(size=(3, 4)), jnp.float32)
+    begin, end, outcome = random_states(rng, 3), random_codes(rng, 3), jnp.array([0, 1, 2])
+    condition = jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
+    traits, own, shown = networks.parts(CONFIG, jnp.asarray(rng.normal(size=(3, CONFIG.look)), jnp.float32))
     angle = jnp.stack([jnp.cos(jnp.array([0.4, 2.0, -1.3])), jnp.sin(jnp.array([0.4, 2.0, -1.3]))], axis=1)
 
     @jax.jit
-    def density(state, end, condition):
-        belief = Gaussian(jnp.concatenate([state, look], axis=1), jnp.full((3, 16), -3.0))
-        final = nnx.merge(model[0], params).transition(belief, condition)
-        return objective.log_density(final, end, outcome)
+    def density(begin, end, condition, shown):
+        mean = jnp.concatenate([begin, traits, own.reshape(3, -1), shown.reshape(3, -1)], axis=1)
+        final = nnx.merge(model[0], params).transition(Gaussian(mean, jnp.full_like(mean, -3.0)), condition)
+        since = poses.matrix(end) @ poses.matrix(begin[:, :12]).swapaxes(1, 2)
+        return objective.log_density(final, end, since, outcome)
 
-    before = density(state, end, condition)
+    before = density(begin, end, condition, shown)
     moved = jnp.concatenate([poses.turn(angle, condition[:, :2]), condition[:, 2:]], axis=1)
-    after = density(poses.turn_code(angle, state), poses.turn_code(angle, end), moved)
+    turned = state.join(state.turn(angle, state.split(begin)))
+    after = density(turned, poses.turn_code(angle, end), moved, harmonics.turn(angle, shown))
     for a, b in zip(before, after, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4)
-    alone = density(poses.turn_code(angle, state), end, condition)
+    alone = density(turned, end, condition, shown)
     assert np.abs(alone[1] - before[1]).min() > 1
 
 
 def test_a_picture_is_where_the_camera_sees_the_object(model):
-    """The drawing of one look, displaced and turned: absolute inputs and the neighbours' weights are zero here."""
+    """The drawing of one object, displaced and turned: weights of the absolute place and heading are zero here."""
     params = changed(model[1], ("decoder", "first"), lambda kernel: kernel.at[jnp.r_[0:2, 12:16]].set(0))
-    params = changed(params, ("decoder", "light"), jnp.zeros_like)
-    for name in ("view", "last"):
-        params = changed(
-            params, ("decoder", name), lambda kernel: jnp.zeros_like(kernel).at[1, 1].set(10 * kernel[1, 1])
-        )
-    code = codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 0.4]))
+    params = changed(params, ("decoder", "last"), lambda kernel: 30 * kernel)
+    code = random_codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 0.4]))
     step = CONFIG.view / 16 * (CONFIG.camera_distance + 0.4 * CONFIG.position_scale) / CONFIG.camera_distance
     there = code.at[:2].set(jnp.array([3 * step, -2 * step]) / CONFIG.position_scale)
     camera = optics.Camera()
@@ -212,13 +232,50 @@ def test_a_picture_is_where_the_camera_sees_the_object(model):
     np.testing.assert_allclose(pixels[1] - pixels[0], [3, -2], atol=1e-4)
     grey = {name: jnp.full((16, 16, 3), 0.4) for name in statespace.IMAGES}
     batch = jnp.stack([code, there, poses.turn_code(QUARTER, code)])
+    # All three come from one present moment.
+    since = poses.matrix(random_codes(np.random.default_rng(1), 1))[0]
+    turns = jnp.stack([since, since, poses.about_vertical(QUARTER) @ since])
+    known = jnp.tile(random_states(np.random.default_rng(2), 1), (3, 1))
     look = jnp.ones((3, CONFIG.look))
-    drawn = jax.jit(lambda code: nnx.merge(model[0], params).decoder(code, look, grey))(batch)
+
+    @jax.jit
+    def draw(code):
+        return networks.compose(nnx.merge(model[0], params).decoder(code, turns, known, look), grey)
+
+    drawn = draw(batch)
     for picture in drawn.values():
         here, moved, turned = np.asarray(picture)
         assert np.std(here[4:12, 4:12]) > 1e-3
         np.testing.assert_allclose(moved[:-2, 3:], here[2:, :-3], atol=1e-4)
         np.testing.assert_allclose(turned, np.rot90(here, -1), atol=1e-4)
+
+
+def test_over_all_levels_a_pixel_is_covered_as_often_as_its_probability_says():
+    chance = np.linspace(0.02, 0.98, 25).reshape(1, 5, 5, 1)
+    logit = jnp.tile(jnp.asarray(np.log(chance / (1 - chance)), jnp.float32), (200, 1, 1, 1))
+    layers = networks.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
+    empty = {"visual": jnp.zeros((5, 5, 3)), "tactile": jnp.full((5, 5, 3), 0.4)}
+    soft = networks.compose(layers, empty)
+    np.testing.assert_allclose(soft["visual"][0], np.broadcast_to(chance[0], (5, 5, 3)), atol=1e-5)
+    np.testing.assert_allclose(soft["tactile"], 0.4, rtol=1e-5)
+    sharp = networks.compose(layers, empty, (jnp.arange(200) + 0.5) / 200)
+    np.testing.assert_allclose(np.mean(sharp["visual"], axis=0), soft["visual"][0], atol=0.02)
+    outlines = np.asarray(sharp["visual"])
+    assert np.mean((outlines < 0.05) | (outlines > 0.95)) > 0.7
+    np.testing.assert_array_equal(sharp["tactile"], soft["tactile"])
+
+
+def test_a_true_state_is_believed(model, empty, batch):
+    inputs = {"visual": batch.inputs["visual"], "state": batch.targets["state"]}
+    counts = {name: jnp.ones(NUMBER, bool) for name in inputs}
+
+    @jax.jit
+    def believe(inputs, counts):
+        return objective.fuse(objective.experts(nnx.merge(*model), inputs, counts, empty), counts)
+
+    belief, alone = believe(inputs, counts), believe(inputs, counts | {"state": jnp.zeros(NUMBER, bool)})
+    np.testing.assert_allclose(belief.mean[:, : state.CODE], batch.targets["state"], atol=2e-3)
+    np.testing.assert_allclose(belief.mean[:, state.CODE :], alone.mean[:, state.CODE :], atol=1e-5)
 
 
 def test_beliefs_are_products_of_the_single_ones(sample, batch):
@@ -232,7 +289,7 @@ def test_beliefs_are_products_of_the_single_ones(sample, batch):
     np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-3)
     np.testing.assert_allclose(fused.mean, mean, atol=1e-3)
     np.testing.assert_allclose(parts[2].mean[:, :12], batch.inputs["pose"], atol=1e-3)  # a pose is exact,
-    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and without a look
+    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and without a shape or a look
     same(belief(), jax.tree.map(jnp.zeros_like, fused))
 
 
@@ -259,10 +316,10 @@ def test_an_item_does_not_depend_on_its_neighbours(sample, batch):
 @pytest.mark.parametrize(
     ("name", "concerned"),
     [
-        ("visual", {"visual"}),
+        ("visual", {"visual", "covered"}),
         ("tactile", {"tactile"}),
-        ("state", {"state", "doubt", "first"}),
-        ("pose", {"pose", "visual", "tactile"}),
+        ("state", {"state", "doubt", "first", "covered", "pose", "visual", "tactile"}),  # the turn to the final pose
+        ("pose", {"pose", "visual", "tactile", "covered"}),
         ("outcome", {"outcome", "pose"}),
     ],
 )
@@ -273,6 +330,77 @@ def test_a_target_changes_its_own_parts_of_the_loss_alone(loss, batch, name, con
     new = (target + 1) % 3 if name == "outcome" else target[::-1]
     (_, after), _ = loss(batch._replace(targets=batch.targets | {name: new}))
     assert {part for part in before if before[part] != after[part]} == concerned
+
+
+def test_views_and_falls_change_their_own_parts_of_the_loss_alone(loss, batch, complete):
+    (_, without), _ = loss(batch)
+    (_, before), gradient = loss(complete)
+    for part in before:  # two compiled programs round differently
+        alike = np.isclose(before[part], without[part], rtol=1e-5)
+        assert alike == (part not in {"state", "doubt", "first", "covered", "outcome", "pose"}), part
+
+    def changed_parts(kind, name):
+        values = getattr(complete, kind)[name]
+        new = (values + 1) % 3 if name == "outcome" else values[::-1]
+        (_, after), _ = loss(complete._replace(**{kind: getattr(complete, kind) | {name: new}}))
+        return {part for part in before if before[part] != after[part]}
+
+    for name in ("visual", "state"):
+        assert changed_parts("views", name) == {"state", "doubt", "first", "covered"}
+    assert changed_parts("falls", "pose") == {"pose"}
+    for name in ("state", "outcome", "condition"):
+        assert changed_parts("falls", name) == {"outcome", "pose"}
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_views_weigh_as_much_as_other_first_moments(loss, complete):
+    """Each of three views and of the pictures that count has the same share of the squared error."""
+
+    def squared(*counts):
+        present = {"visual": jnp.array(counts, bool), "tactile": jnp.zeros(NUMBER, bool)}
+        (_, terms), _ = loss(complete._replace(present=complete.present | present))
+        return (3 + sum(counts)) * terms["state"]
+
+    views = squared(0, 0, 0, 0)
+    each = [squared(*row) - views for row in np.eye(4, dtype=int).tolist()]
+    np.testing.assert_allclose(squared(1, 1, 1, 1), views + sum(each), rtol=1e-4)
+    assert min(each) > 0
+
+
+@pytest.mark.parametrize("shown", ["object", "nothing"])
+def test_the_gradient_is_finite_where_nothing_is_known_of_the_rotation(loss, complete, model, empty, shown):
+    """The pose counts nowhere, and the encoders' states are zero: headings are those of vectors of length 0."""
+    params = model[1]
+    for name in statespace.IMAGES:
+        params = changed(params, ("encoders", name, "last"), jnp.zeros_like)
+    inputs = dict(complete.inputs)
+    if shown == "nothing":
+        inputs |= {name: jnp.tile(image, (NUMBER, 1, 1, 1)) for name, image in empty.items()}
+    present = complete.present | {"pose": jnp.zeros(NUMBER, bool)}
+    (total, terms), gradient = loss(complete._replace(inputs=inputs, present=present), params)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((total, terms, gradient)))
+    moved = nnx.to_pure_dict(gradient)["encoders"]["visual"]["last"]["kernel"]
+    assert np.abs(moved).max() > 0
+
+
+def test_the_states_of_falls_are_exact_or_have_noise_of_the_size_that_their_beliefs_have():
+    number = 400
+    code = jnp.tile(random_states(np.random.default_rng(0), 8), (number // 8, 1))
+    falls = {"state": code, "pose": code[:, :12], "outcome": jnp.zeros(number, jnp.int32)}
+    ends = objective._known_ends(jax.random.key(0), falls, CONFIG.look)
+    mean, variance = (np.asarray(x, np.float64) for x in (ends.belief.mean, jnp.exp(ends.belief.log_var)))
+    np.testing.assert_array_equal(mean[:, state.CODE :], 0)  # nothing is known of the look
+    np.testing.assert_allclose(variance[:, state.CODE :], 1, rtol=1e-5)
+    np.testing.assert_allclose(mean[:, :12], code[:, :12], atol=1e-3)
+    np.testing.assert_allclose(mean[::2, : state.CODE], code[::2], atol=1e-3)
+    # Without the prior, the belief is a Gaussian of this mean and variance.
+    mean, variance = mean[1::2, 12 : state.CODE], variance[1::2, 12 : state.CODE]
+    noise = variance / (1 - variance)
+    error = (mean * noise / variance - code[1::2, 12:]) / np.sqrt(noise)
+    np.testing.assert_allclose(error.mean(), 0, atol=0.03)
+    np.testing.assert_allclose(error.std(), 1, atol=0.03)
+    assert np.sqrt(noise).min() > 0.019
+    assert np.sqrt(noise).max() < 1.01
 
 
 def test_a_few_steps_lower_the_loss(loss, batch, model):
@@ -296,12 +424,13 @@ def test_samples_are_poses_and_pictures(sample, batch):
     np.testing.assert_allclose(matrix @ matrix.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(matrix), 1, atol=1e-5)
     np.testing.assert_allclose(found.outcome.sum(1), 1, rtol=1e-5)
-    assert all(((x >= 0) & (x <= 1)).all() for x in found.images.values())
+    assert all(((x >= 0) & (x <= 1)).all() for x in (*found.images.values(), *found.mean.values()))
+    np.testing.assert_allclose(found.mean["tactile"], found.images["tactile"].mean(0), atol=1e-6)
     assert np.std(found.pose, axis=0).min() > 0
 
 
 def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
-    code = codes(np.random.default_rng(0), 5)
+    code = random_codes(np.random.default_rng(0), 5)
     noisy = code.at[:, 3:].multiply(1.7) + 1e-3
     u, _, vt = np.linalg.svd(np.asarray(noisy[:, 3:]).reshape(-1, 3, 3).astype(np.float64))
     np.testing.assert_allclose(poses.rigid(noisy)[:, 3:].reshape(-1, 3, 3), u @ vt, atol=1e-5)
@@ -316,7 +445,7 @@ def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
         ({"inputs": ()}, "at least one of"),
         ({"window": 12}, "window is 12 pixels; it takes a multiple of 8"),
         ({"input_size": 24}, "input_size is 24 pixels; it takes a multiple of 16"),
-        ({"encoder": (4, 4)}, "encoder has 2 and decoder 4 widths; give 3 and 4"),
+        ({"encoder": (4, 4)}, "encoder has 2 and decoder 3 widths; give 3 and 3"),
         ({"condition": 1}, "condition is 1 numbers"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
     ],

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from statespace_config import TINY
+from statespace_config import TINY, random_codes, random_states
 
-from sts_jax import mvae, training
+from sts_jax import mvae, objects, statespace, training
 
 SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
 CONFIG = training.TrainConfig(steps=12, batch_size=8, log_every=2, checkpoint_every=4)
@@ -215,12 +215,15 @@ def test_it_learns_where_a_square_goes(tmp_path: Path):
 
 STATE = dataclasses.replace(TINY, drawn=1.0, drawn_first=0.25)
 STATE_CONFIG = training.TrainConfig(
-    steps=6, batch_size=4, learning_rate=1e-2, log_every=1, checkpoint_every=2, beta_warmup=0.5
+    steps=6, batch_size=4, views=2, falls=3, learning_rate=1e-2, log_every=1, checkpoint_every=2, beta_warmup=0.5
 )
 
 
-def falls(samples=4):
-    """A bar somewhere on a grey image ends elsewhere and turned; it falls off in every other sample."""
+def bars(samples=4, *, further=False):
+    """A bar somewhere on a grey image ends elsewhere and turned; it falls off in every other sample.
+
+    `further` adds views and falls, which have other numbers of rows.
+    """
     rng = np.random.default_rng(0)
     first, last = (np.full((samples, 16, 16, 3), 120, np.uint8) for _ in range(2))
     code = np.zeros((2, samples, 12), np.float32)
@@ -231,20 +234,31 @@ def falls(samples=4):
         first[i, place[0, 1] - 1 : place[0, 1] + 1, place[0, 0] - 3 : place[0, 0] + 3] = 40 * i + 10
         last[i, place[1, 1] - 3 : place[1, 1] + 3, place[1, 0] - 1 : place[1, 0] + 1] = 40 * i + 10
     grey = np.full((16, 16, 3), 120, np.uint8)
-    targets = {"visual": last, "tactile": last, "state": code[0], "pose": code[1]}
+    corners = np.stack(np.meshgrid([-0.03, 0.03], [-0.01, 0.01], [-0.01, 0.01]), axis=-1).reshape(-1, 3)
+    support = np.tile((corners @ objects.DIRECTIONS.T).max(0), (samples, 1)).astype(np.float32)
+    solid = support, np.full(samples, 0.1, np.float32), np.zeros((samples, 3), np.float32)
+    state = np.asarray(statespace.encode(jnp.asarray(code[0]), *(jnp.asarray(x) for x in solid)))
+    targets = {"visual": last, "tactile": last, "state": state, "pose": code[1]}
+    views, ends = {}, {}
+    if further:
+        views = {"visual": first[:3], "state": state[:3]}
+        states, poses = np.asarray(random_states(rng, 5)), np.asarray(random_codes(rng, 5))
+        ends = {"state": states, "pose": poses, "outcome": np.array([0, 1, 0, 1, 1], np.int32)}
     return training.Arrays(
         {"visual": first, "pose": code[0]},
         targets | {"outcome": np.arange(samples, dtype=np.int32) % 2},
         empty={"visual": grey, "tactile": grey},
+        views=views,
+        falls=ends,
     )
 
 
 @pytest.mark.slow
 def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
-    whole = training.train(STATE_CONFIG, STATE, falls(), workdir=tmp_path / "whole")
+    whole = training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path / "whole")
     with pytest.raises(Killed):
-        training.train(STATE_CONFIG, STATE, falls(), workdir=tmp_path / "killed", progress=kill_at(3))
-    model = training.train(STATE_CONFIG, STATE, falls(), workdir=tmp_path / "killed")
+        training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path / "killed", progress=kill_at(3))
+    model = training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path / "killed")
     same(model.state, whole.state)
     log = (tmp_path / "whole" / "metrics.jsonl").read_text()
     assert (tmp_path / "killed" / "metrics.jsonl").read_text() == log
@@ -256,12 +270,51 @@ def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
     assert loaded.settings["kind"] == "statespace"
 
 
+def test_views_and_falls_are_taken_by_rows_of_their_own_and_change_the_checksum():
+    data = bars(further=True)
+    rows = {"views": np.array([2, 0]), "falls": np.array([4, 4, 1])}
+    batch = data.take(np.array([3, 1]), **rows)
+    np.testing.assert_array_equal(batch["targets"]["pose"], data.targets["pose"][[3, 1]])
+    for name, index in rows.items():
+        own = getattr(data, name)
+        assert batch[name].keys() == own.keys()
+        for key, values in own.items():
+            np.testing.assert_array_equal(batch[name][key], values[index])
+    assert not {"views", "falls"} & data.take(np.array([0])).keys()
+    sums = {data.checksum(), bars().checksum()}
+    for name in rows:
+        for key, values in getattr(data, name).items():
+            changed = values.copy()
+            changed.reshape(-1)[-1] += 1
+            sums.add(dataclasses.replace(data, **{name: getattr(data, name) | {key: changed}}).checksum())
+    assert len(sums) == 2 + 2 + 3
+    assert bars(further=True).checksum() == data.checksum()
+
+
+def test_a_batch_has_views_and_falls_as_the_training_asks(tmp_path, monkeypatch):
+    asked = []
+    take = training.Arrays.take
+
+    def remember(self, index, **further):
+        asked.append({name: rows.tolist() for name, rows in further.items()})
+        return take(self, index, **further)
+
+    monkeypatch.setattr(training.Arrays, "take", remember)
+    with pytest.raises(Killed):
+        training.train(STATE_CONFIG, STATE, bars(further=True), workdir=tmp_path, progress=kill_at(3))
+    for name, size, samples in (("views", 2, 3), ("falls", 3, 5)):
+        rows = [batch[name] for batch in asked]
+        assert [len(batch) for batch in rows] == [size] * 3
+        once = sum(rows, [])[:samples]
+        assert sorted(once) == list(range(samples))  # each once before any comes again
+
+
 @pytest.mark.slow
 def test_a_state_space_model_learns_four_samples_by_heart(tmp_path):
     config = training.TrainConfig(
         steps=400, batch_size=4, learning_rate=2e-3, b2=0.99, clip=200.0, log_every=50, checkpoint_every=400
     )
-    training.train(config, STATE, falls(), workdir=tmp_path)
+    training.train(config, STATE, bars(), workdir=tmp_path)
     log = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     first, last = log[0], log[-1]
     assert last["visual"] < 0.1 * first["visual"]
@@ -284,7 +337,7 @@ def test_a_state_space_model_learns_four_samples_by_heart(tmp_path):
     ],
 )
 def test_arrays_that_do_not_fit_a_state_space_model_are_named(tmp_path, change, message):
-    data = falls()
+    data = bars()
     fields = {name: getattr(data, name) for name in ("inputs", "targets", "present", "target_present", "empty")}
     for name, value in change.items():
         fields[name] = fields[name] | value if name in fields else value

@@ -54,7 +54,7 @@ def values(
         directions: unit vectors.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1
-    return jnp.einsum("nck,njk->ncj", coefficients, basis(directions @ rotation, degree))
+    return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:

@@ -1,8 +1,9 @@
 """Encoders, transition and decoder as Flax NNX modules.
 
-The latent is the present state: a pose code (`statespace.poses`) and a look, which is everything else that is seen or
-felt of an object. An encoder per image gives a Gaussian over both. The transition maps a belief about the present
-state to a density of the final pose. The decoder draws both streams of an object of a look in a pose.
+The latent is the present state: a state code with the pose, the shape and the mass (`statespace.state`), and a look,
+which is everything else that is seen or felt of an object. An encoder per image gives a Gaussian over both. The
+transition maps a belief about the present state to a density of the final pose and of the rotation to it. The decoder
+draws both streams of an object in a pose, given this rotation and the present state.
 
 Convolutions have stride 1, for which XLA's CPU backend is fast. Pixels are folded into channels to make an image
 smaller, and channels are unfolded into pixels to make it larger.
@@ -189,7 +190,7 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 
 
 class Encoder(nnx.Module):
-    """One image's expert: a Gaussian over pose code and look."""
+    """One image's expert: a Gaussian over state code and look."""
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
@@ -213,7 +214,7 @@ class Encoder(nnx.Module):
             change: images less that of the empty sensor.
 
         Returns:
-            A Gaussian over pose code and look, `(n, 12 + look)`.
+            A Gaussian over state code and look, `(n, code + look)`.
         """
         config = self.config
         place = window.locate(jax.lax.stop_gradient(change))
@@ -305,7 +306,7 @@ class Transition(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Draws an object of a look in a pose.
+    """Draws an object of a state and a look in a pose.
 
     A picture of the object is drawn on a canvas that follows its heading. It is placed in the view below the object's
     origin, at the height of the object's lowest point, which the camera sees from below. `compose` puts it over the

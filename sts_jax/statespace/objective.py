@@ -2,9 +2,9 @@
 
 For a batch of first moments with their last moments, it is the sum of
 
-- the squared error of each image's expert at the true first pose, and the nats of its variance;
-- the nats of the transition at the true outcome and the true final pose, for the belief of every non-empty subset of
-  the inputs;
+- the squared error of each image's expert at the true first state, and the nats of its variance;
+- the nats of the transition at the true outcome, the true final pose and the rotation to it, for the belief of every
+  non-empty subset of the inputs;
 - the excess cross-entropy of both streams of the last moment, drawn in the true final pose with a sample of the look,
   and that of the first moment, drawn in the true first pose;
 - the cross-entropy of the pixels that the object covers in these pictures;
@@ -12,6 +12,9 @@ For a batch of first moments with their last moments, it is the sum of
 
 A moment is drawn in its true pose, so that the decoder never averages over places. The subset whose belief gives the
 look is drawn for each sample, among those with an image.
+
+First moments without an end (views) add to the first part, and the first moments that are drawn are then theirs.
+Trajectories without images (falls) add to the second part, with beliefs around the true state.
 """
 
 import itertools
@@ -38,7 +41,7 @@ def experts(
     counts: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Gaussian]:
-    """The Gaussian of each input over pose code and look.
+    """The Gaussian of each input over state code and look.
 
     Args:
         model: the networks.
@@ -199,7 +202,10 @@ def loss(
     last = math.ceil(config.drawn * number)
     turn = _turn(targets["state"], targets["pose"])
     after = _Pictures(
-        *jax.tree.map(lambda x: x[:last], (targets["pose"], turn, belief, {name: targets[name] for name in IMAGES})),
+        pose=targets["pose"][:last],
+        turn=turn[:last],
+        belief=jax.tree.map(lambda x: x[:last], belief),
+        images={name: targets[name][:last] for name in IMAGES},
         counts={name: jnp.ones(last, bool) for name in IMAGES},
     )
     first = math.ceil(config.drawn_first * number)
@@ -289,8 +295,9 @@ def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], look: int) -> _Ends:
             jnp.tile(centre, 3),
         )
     )
-    doubt = jnp.where(jnp.arange(number)[:, None] % 2 == 0, EXACT_LOG_VAR / 2, doubt)
-    noisy = code + jnp.exp(doubt) * jax.random.normal(noise, code.shape)
+    exactly = jnp.arange(number)[:, None] % 2 == 0
+    doubt = jnp.where(exactly, EXACT_LOG_VAR / 2, doubt)
+    noisy = code + jnp.where(exactly, 0, jnp.exp(doubt)) * jax.random.normal(noise, code.shape)
     mean = jnp.concatenate([code[:, : poses.CODE], noisy[:, poses.CODE :], jnp.zeros((number, look))], axis=-1)
     expert = Gaussian(mean, jnp.concatenate([2 * doubt, jnp.full((number, look), UNKNOWN_LOG_VAR)], axis=-1))
     known = jnp.ones(number, bool)

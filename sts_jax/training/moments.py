@@ -76,7 +76,7 @@ def state_moments(
     Raises:
         ValueError: a trajectory has an outcome that the scenario does not have.
     """
-    ends = [pairs] if falls is None else [pairs, falls]
+    ends: list[Pairs | Ends] = [pairs] if falls is None else [pairs, falls]
     outcome, *other_outcomes = (_outcome_index(own.outcome, scenario) for own in ends)
     condition, *other_conditions = (np.asarray(preprocessing.encode_condition(jnp.asarray(x.condition))) for x in ends)
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))

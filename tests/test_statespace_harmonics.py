@@ -1,0 +1,91 @@
+"""Harmonics on the sphere: against SciPy, numerical quadrature, real rotations and sampled coefficients."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+from scipy.spatial.transform import Rotation
+
+from sts_jax.statespace import harmonics
+
+DEGREE = 6
+COUNT = harmonics.number(DEGREE)
+ANGLES = np.array([0.0, 0.7, -2.4], np.float32)
+
+
+def expected_basis(direction, degree=DEGREE):
+    """SciPy's harmonics, real and of mean square 1, in float64."""
+    x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
+    polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
+    found = []
+    for n in range(degree + 1):
+        for m in (0, *(sign * k for k in range(1, n + 1) for sign in (1, -1))):
+            value = np.sqrt(4 * np.pi) * special.sph_harm_y(n, abs(m), polar, azimuth)
+            part = value.imag if m < 0 else value.real
+            found.append(part * (np.sqrt(2) * (-1) ** m if m else 1))
+    return np.stack(found, axis=-1)
+
+
+def directions(number, seed=0):
+    rows = np.random.default_rng(seed).normal(size=(number, 3))
+    return (rows / np.linalg.norm(rows, axis=1)[:, None]).astype(np.float32)
+
+
+def unit(angle):
+    return jnp.stack([jnp.cos(jnp.asarray(angle)), jnp.sin(jnp.asarray(angle))], axis=-1)
+
+
+def test_the_harmonics_are_those_of_scipy():
+    places = np.concatenate([directions(200), np.eye(3, dtype=np.float32), -np.eye(3, dtype=np.float32)])
+    np.testing.assert_allclose(harmonics.basis(jnp.asarray(places), DEGREE), expected_basis(places), atol=2e-5)
+
+
+def test_the_harmonics_are_orthonormal():
+    """Gauss-Legendre in the height and equal steps of the azimuth are exact for these polynomials."""
+    height, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
+    azimuth = 2 * np.pi * np.arange(2 * DEGREE + 2) / (2 * DEGREE + 2)
+    level = np.sqrt(1 - height**2)[:, None]
+    z = np.broadcast_to(height[:, None], (len(height), len(azimuth)))
+    places = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
+    share = np.repeat(weight / 2, len(azimuth)) / len(azimuth)
+    found = np.asarray(harmonics.basis(jnp.asarray(places, jnp.float32), DEGREE), np.float64)
+    np.testing.assert_allclose(found.T @ (share[:, None] * found), np.eye(COUNT), atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_harmonic_shrinks_with_the_length_to_the_power_of_its_degree(degree):
+    places = directions(20)
+    power = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
+    whole, half = (np.asarray(harmonics.basis(jnp.asarray(scale * places), degree)) for scale in (1, 0.5))
+    np.testing.assert_allclose(half, whole * 0.5**power, atol=1e-6)
+
+
+def test_the_values_of_turned_functions_are_those_at_directions_turned_back():
+    rng = np.random.default_rng(0)
+    coefficients = rng.normal(size=(4, 2, COUNT)).astype(np.float32)
+    rotations = Rotation.random(4, random_state=1)
+    places = directions(30)
+    found = harmonics.values(jnp.asarray(coefficients), jnp.asarray(rotations.as_matrix(), jnp.float32), places)
+    for i in range(4):
+        expected = coefficients[i] @ expected_basis(rotations[i].inv().apply(places)).T
+        np.testing.assert_allclose(found[i], expected, atol=1e-3)
+
+
+def test_coefficients_turned_about_the_vertical_are_those_of_the_turned_function():
+    coefficients = np.random.default_rng(0).normal(size=(len(ANGLES), 2, COUNT)).astype(np.float32)
+    places = directions(30)
+    turned = np.asarray(harmonics.turn(unit(ANGLES), jnp.asarray(coefficients)))
+    rotations = Rotation.from_euler("z", ANGLES[:, None])
+    expected = harmonics.values(jnp.asarray(coefficients), jnp.asarray(rotations.as_matrix(), jnp.float32), places)
+    for i in range(len(ANGLES)):
+        np.testing.assert_allclose(turned[i] @ expected_basis(places).T, expected[i], atol=1e-3)
+
+
+def test_turned_variances_are_those_of_sampled_coefficients():
+    rng = np.random.default_rng(0)
+    variance = rng.uniform(0.1, 2, COUNT).astype(np.float32)
+    samples = np.sqrt(variance) * rng.normal(size=(20_000, COUNT)).astype(np.float32)
+    for angle in ANGLES:
+        turned = harmonics.turn(unit(angle)[None], jnp.asarray(samples)[None])[0]
+        found = harmonics.turn_variance(unit(angle)[None], jnp.asarray(variance)[None, None])[0, 0]
+        np.testing.assert_allclose(found, np.var(turned, axis=0), rtol=0.06)  # six standard deviations

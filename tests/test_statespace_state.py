@@ -1,0 +1,136 @@
+"""State codes: against the support functions of rotated vertices, rotated centres of mass and a dense covariance."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from statespace_config import random_states
+
+from sts_jax import objects
+from sts_jax.statespace import harmonics, poses, state
+
+NUMBER = 5
+DIRECTIONS = objects.DIRECTIONS.astype(np.float64)
+ANGLES = np.linspace(-2.5, 2.5, NUMBER)
+
+
+def unit(angle):
+    return jnp.stack([jnp.cos(jnp.asarray(angle, jnp.float32)), jnp.sin(jnp.asarray(angle, jnp.float32))], axis=-1)
+
+
+def encoded(rotations, points, mass=0.1, com=(0.0, 0.0, 0.0), position=(0.0, 0.0, 0.0)):
+    """The state codes of one hull, of its vertices `points` (m), in several rotations."""
+    number = len(rotations)
+    code = np.concatenate([np.tile(position, (number, 1)), rotations.as_matrix().reshape(number, 9)], axis=1)
+    values = np.max(points @ DIRECTIONS.T, axis=0)
+    solid = np.tile(values, (number, 1)), np.full(number, mass), np.tile(com, (number, 1))
+    return state.encode(*(jnp.asarray(x, jnp.float32) for x in (code, *solid)))
+
+
+def fitted(points):
+    """Harmonics of the support function of some vertices, fitted in float64."""
+    values = np.max(points @ DIRECTIONS.T, axis=0) / state.LENGTH - state.MEAN
+    basis = np.asarray(harmonics.basis(jnp.asarray(DIRECTIONS, jnp.float32), state.DEGREE), np.float64)
+    return np.linalg.lstsq(basis, values, rcond=None)[0]
+
+
+def box(*size):
+    corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
+    return corners * size
+
+
+def test_a_code_is_split_and_joined():
+    code = random_states(np.random.default_rng(0), NUMBER)
+    parts = state.split(code)
+    assert code.shape == (NUMBER, state.CODE)
+    assert tuple(part.shape[1] for part in parts) == state.SIZES
+    np.testing.assert_array_equal(state.join(parts), code)
+    np.testing.assert_array_equal(parts.pose, code[:, :12])
+
+
+def test_a_ball_of_the_mean_size_and_of_the_mass_unit_is_zero():
+    rotations = Rotation.random(NUMBER, random_state=0)
+    ball = DIRECTIONS * state.MEAN * state.LENGTH
+    parts = state.split(encoded(rotations, ball, mass=state.MASS))
+    for part in parts[1:]:
+        np.testing.assert_allclose(part, 0, atol=1e-5)
+    heavier = state.split(encoded(rotations, 1.1 * ball, mass=np.e * state.MASS))
+    np.testing.assert_allclose(heavier.mass, 1, rtol=1e-5)
+    for part in (heavier.own, heavier.shown):
+        np.testing.assert_allclose(part, np.eye(state.SUPPORT)[:1] * 0.1 * state.MEAN * np.ones((NUMBER, 1)), atol=1e-5)
+
+
+def test_the_shown_shape_is_that_of_the_rotated_vertices():
+    rng = np.random.default_rng(0)
+    rotations = Rotation.random(NUMBER, random_state=2)
+    points = rng.normal(size=(200, 3))
+    # A smooth hull: the harmonics of a higher degree, which a fit mixes into the lower ones, are small.
+    points *= np.array([0.035, 0.025, 0.02]) / np.linalg.norm(points, axis=1)[:, None]
+    parts = state.split(encoded(rotations, points))
+    np.testing.assert_allclose(parts.own, np.tile(fitted(points), (NUMBER, 1)), atol=1e-4)
+    for i, rotation in enumerate(rotations):
+        expected = fitted(rotation.apply(points))
+        np.testing.assert_allclose(parts.shown[i], expected, atol=0.02)
+        assert np.abs(parts.own[i] - expected).max() > 0.1
+
+
+def test_the_shown_centre_of_mass_is_the_rotated_one():
+    rotations = Rotation.random(NUMBER, random_state=3)
+    com = np.array([0.004, -0.002, 0.007])
+    parts = state.split(encoded(rotations, box(0.04, 0.03, 0.02), com=com))
+    np.testing.assert_allclose(parts.com, np.tile(com, (NUMBER, 1)) / state.LENGTH, rtol=1e-5)
+    np.testing.assert_allclose(parts.low, rotations.apply(com) / state.LENGTH, atol=1e-5)
+
+
+def test_a_turned_state_is_the_state_of_the_turned_pose():
+    rotations = Rotation.random(NUMBER, random_state=4)
+    rng = np.random.default_rng(0)
+    points, com = 0.02 * rng.normal(size=(30, 3)), np.array([0.004, -0.002, 0.007])
+    before = state.split(encoded(rotations, points, com=com, position=(0.3, -0.2, 0.5)))
+    after = state.turn(unit(ANGLES), before)
+    about = Rotation.from_euler("z", ANGLES[:, None])
+    expected = state.split(encoded(about * rotations, points, com=com))
+    expected = expected._replace(
+        pose=expected.pose.at[:, :3].set(jnp.asarray(about.apply([0.3, -0.2, 0.5]), jnp.float32))
+    )
+    for found, wanted in zip(after, expected, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=2e-4)
+
+
+def test_turned_variances_are_the_diagonal_of_the_turned_covariance():
+    variance = np.random.default_rng(0).uniform(0.1, 2, state.CODE).astype(np.float32)
+    angle = unit([0.7])
+    # Turning is linear.
+    turn = state.join(state.turn(jnp.tile(angle, (state.CODE, 1)), state.split(jnp.eye(state.CODE))))
+    expected = np.diag(np.asarray(turn).T @ np.diag(variance) @ np.asarray(turn))
+    found = state.join(state.turn_variance(angle, state.split(jnp.asarray(variance)[None])))[0]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("certainty", [0.0, 0.4])
+def test_the_heading_of_an_uncertain_rotation_is_the_long_axis_of_the_shown_shape(certainty):
+    code = encoded(Rotation.from_euler("z", ANGLES[:, None]), box(0.08, 0.02, 0.03))
+    blurred = code.at[:, 3:12].multiply(certainty)
+    found = state.heading(state.split(blurred))
+    line = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
+    np.testing.assert_allclose(np.abs(np.sum(found * line, axis=1)), 1, atol=1e-3)  # it has no sign
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
+
+
+def test_the_heading_of_a_known_rotation_is_that_of_the_mesh():
+    """The shape is long along another axis, and is not asked."""
+    code = encoded(Rotation.from_euler("z", ANGLES[:, None]), box(0.02, 0.08, 0.03))
+    parts = state.split(code)
+    np.testing.assert_allclose(state.heading(parts), unit(ANGLES), atol=1e-5)
+    wild = state.split(random_states(np.random.default_rng(0), 20))
+    np.testing.assert_array_equal(state.heading(wild), poses.heading(wild.pose))
+
+
+def test_nothing_known_has_some_heading_and_no_gradient():
+    def total(code):
+        return state.heading(state.split(code)).sum()
+
+    nothing = jnp.zeros((1, state.CODE))
+    np.testing.assert_allclose(np.linalg.norm(state.heading(state.split(nothing))), 1, rtol=1e-6)
+    np.testing.assert_array_equal(jax.grad(total)(nothing), 0)
