@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from statespace_config import STATE, state_model
+from statespace_config import STATE, random_states, state_model
 
 import sts_jax as sts
 from sts_jax import mvae, statespace, training
@@ -407,10 +407,11 @@ def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
     assert out.visual.shape == out.tactile.shape == (2, 16, 16, 3)
     assert out.samples.visual.shape == out.samples.tactile.shape == (64, 2, 16, 16, 3)
     assert out.samples.pose.shape == (64, 2, 7)
-    assert out.mean.shape == out.log_var.shape == (2, statespace.CODE + STATE.look)
+    assert out.mean.shape == out.log_var.shape == (2, statespace.STATE_CODE + STATE.look)
     np.testing.assert_allclose(out.outcome_probability.sum(-1), 1, rtol=1e-5)
     assert out.outcome_probability.shape == (2, STATE.outcomes)
-    np.testing.assert_allclose(out.visual, out.samples.visual.mean(0), atol=1e-6)
+    np.testing.assert_allclose(out.tactile, out.samples.tactile.mean(0), atol=1e-6)
+    np.testing.assert_allclose(out.visual, out.samples.visual.mean(0), atol=0.05)  # of sharp outlines
     np.testing.assert_allclose(np.linalg.norm(out.samples.pose[..., 3:], axis=-1), 1, rtol=1e-5)
     assert np.std(out.samples.pose[..., :3], axis=0).min() > 0
     # A pose that is given is believed: its expert is by far the most precise.
@@ -447,6 +448,17 @@ def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
     slope = jax.grad(lambda pose: state_predictor(pose=pose, condition=condition).pose[:, 0].sum())(jnp.asarray(pose))
     assert np.isfinite(slope).all()
     assert np.abs(slope).max() > 0
+
+
+def test_a_true_state_is_believed_and_a_wrong_one_refused(state_predictor, predictor):
+    given, code = measurement(2), np.asarray(random_states(np.random.default_rng(0), 2))
+    out = state_predictor(visual=given["visual"], condition=CONDITION, state=code)
+    np.testing.assert_allclose(out.mean[:, : statespace.STATE_CODE], code, atol=2e-3)
+    for wrong, message in ((code[:1], r"state has shape \(1, 117\); it needs"), (code * np.nan, "state has NaN")):
+        with pytest.raises(ValueError, match=message):
+            state_predictor(visual=given["visual"], condition=CONDITION, state=wrong)
+    with pytest.raises(ValueError, match="takes no state: it is a model of the paper's kind"):
+        predictor(pose=given["pose"], state=code)
 
 
 def test_the_prior_of_a_state_space_model_is_standard_normal(state_predictor):

@@ -222,20 +222,21 @@ def test_a_picture_is_where_the_camera_sees_the_object(model):
     """The drawing of one object, displaced and turned: weights of the absolute place and heading are zero here."""
     params = changed(model[1], ("decoder", "first"), lambda kernel: kernel.at[jnp.r_[0:2, 12:16]].set(0))
     params = changed(params, ("decoder", "last"), lambda kernel: 30 * kernel)
-    code = random_codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 0.4]))
-    step = CONFIG.view / 16 * (CONFIG.camera_distance + 0.4 * CONFIG.position_scale) / CONFIG.camera_distance
-    there = code.at[:2].set(jnp.array([3 * step, -2 * step]) / CONFIG.position_scale)
-    camera = optics.Camera()
-    pixels, _ = optics.to_pixels(
-        camera, optics.full_window(camera, (16, 16)), (16, 16), jnp.stack([code, there])[:, :3] * CONFIG.position_scale
-    )
-    np.testing.assert_allclose(pixels[1] - pixels[0], [3, -2], atol=1e-4)
-    grey = {name: jnp.full((16, 16, 3), 0.4) for name in statespace.IMAGES}
-    batch = jnp.stack([code, there, poses.turn_code(QUARTER, code)])
+    code = random_codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 1.5]))
     # All three come from one present moment.
     since = poses.matrix(random_codes(np.random.default_rng(1), 1))[0]
     turns = jnp.stack([since, since, poses.about_vertical(QUARTER) @ since])
     known = jnp.tile(random_states(np.random.default_rng(2), 1), (3, 1))
+    lowest = 1.5 * CONFIG.position_scale - state.reach(state.split(known[:1]), since[None])[0]
+    assert lowest > 0.02
+    step = CONFIG.view / 16 * (CONFIG.camera_distance + lowest) / CONFIG.camera_distance
+    there = code.at[:2].set(jnp.array([3 * step, -2 * step]) / CONFIG.position_scale)
+    camera = optics.Camera()
+    places = (jnp.stack([code, there])[:, :3] * CONFIG.position_scale).at[:, 2].set(lowest)
+    pixels, _ = optics.to_pixels(camera, optics.full_window(camera, (16, 16)), (16, 16), places)
+    np.testing.assert_allclose(pixels[1] - pixels[0], [3, -2], atol=1e-4)
+    grey = {name: jnp.full((16, 16, 3), 0.4) for name in statespace.IMAGES}
+    batch = jnp.stack([code, there, poses.turn_code(QUARTER, code)])
     look = jnp.ones((3, CONFIG.look))
 
     @jax.jit

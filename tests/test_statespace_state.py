@@ -75,6 +75,16 @@ def test_the_shown_shape_is_that_of_the_rotated_vertices():
         assert np.abs(parts.own[i] - expected).max() > 0.1
 
 
+def test_an_object_reaches_down_to_its_lowest_vertex():
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points *= np.array([0.035, 0.025, 0.02]) / np.linalg.norm(points, axis=1)[:, None]
+    present, since = (Rotation.random(NUMBER, random_state=seed) for seed in (5, 6))
+    found = state.reach(state.split(encoded(present, points)), jnp.asarray(since.as_matrix(), jnp.float32))
+    expected = [-(rotation.apply(points)[:, 2].min()) for rotation in since * present]
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+    assert np.ptp(expected) > 1e-3
+
+
 def test_the_shown_centre_of_mass_is_the_rotated_one():
     rotations = Rotation.random(NUMBER, random_state=3)
     com = np.array([0.004, -0.002, 0.007])
