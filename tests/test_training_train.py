@@ -305,7 +305,7 @@ def test_a_batch_has_views_and_falls_as_the_training_asks(tmp_path, monkeypatch)
     for name, size, samples in (("views", 2, 3), ("falls", 3, 5)):
         rows = [batch[name] for batch in asked]
         assert [len(batch) for batch in rows] == [size] * 3
-        once = sum(rows, [])[:samples]
+        once = [row for batch in rows for row in batch][:samples]
         assert sorted(once) == list(range(samples))  # each once before any comes again
 
 

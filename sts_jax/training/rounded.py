@@ -1,8 +1,8 @@
 """Rounded weights in one small file, for models that are passed on.
 
 The kernel of a layer is stored as whole numbers q of steps s, `w = q s`. Each output channel has its own step, the root
-mean square of its weights divided by 256, so that a weight changes by at most half a step. Compressed, a weight takes
-about 1.4 bytes, and 1.9 in half precision. Vectors, such as biases, are stored unchanged.
+mean square of its weights divided by 128, so that a weight changes by at most half a step. Compressed, a weight takes
+about 1.2 bytes, and 1.9 in half precision. Vectors, such as biases, are stored unchanged.
 """
 
 import io
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 NAME = "weights.npz"
-_LEVELS = 256  # steps in a channel's root mean square
+_LEVELS = 128  # steps in a channel's root mean square
 _LARGEST = 2**15 - 1  # of q, which has 16 bits; a channel with a larger weight has longer steps
 _STEP = ":step"  # appended to the name of a kernel
 
