@@ -281,7 +281,7 @@ class Predictor:
 
         Args:
             folder: A new or an empty folder.
-            compact: Round the weights to a third of their size. A weight changes by at most 1/512 of the root mean
+            compact: Round the weights to a third of their size. A weight changes by at most 1/256 of the root mean
                 square of its output channel, and predictions change slightly.
 
         Raises:

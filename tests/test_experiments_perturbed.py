@@ -19,7 +19,9 @@ TINY = dataclasses.replace(
         perturbed.SMOKE.collection,
         scenario=physics.Perturbed(frames=6),
         num_objects=10,
-        num_per_object=1,
+        num_per_object=2,
+        num_rendered=1,
+        num_views=1,
         num_full=1,
         symmetries=True,
     ),
@@ -42,7 +44,7 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     given = {name.partition(", ")[2] for name in predictors if name.startswith("state-space model")}
     inputs = ("visual", "tactile", "pose")
     pairs = ("visual and tactile", "visual and pose", "tactile and pose")
-    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs")}
+    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs", stages.KNOWN)}
     assert predictors["state-space model, from tactile"]["outcome_balanced_accuracy"]["value"] >= 0
     rows = [line for line in (workdir / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
     assert len(rows) == 10
@@ -50,9 +52,19 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     assert {path.stem for path in (workdir / "figures").glob("*.png")} == expected
 
 
+def test_views_and_falls_are_trained_on(workdir):
+    data = dataset.load(workdir / "dataset")
+    samples = json.loads((workdir / "models/statespace/config.json").read_text())["data"]["samples"]
+    assert samples == 8 * len(data.members("train")) == 4 * len(data.members("train", rendered=False))
+    assert len(data.views("train").pose) == len(data.split["train"]) > 0
+    record = json.loads((workdir / "models/statespace/metrics.jsonl").read_text().splitlines()[-1])
+    assert all(np.isfinite(value) for value in record.values())
+
+
 def test_distributions_are_judged_where_samples_are_drawn(workdir):
     predictors = json.loads((workdir / "metrics.json").read_text())["predictors"]
     own = predictors["state-space model, from visual and tactile"]
+    assert predictors[f"state-space model, from {stages.KNOWN}"]["outcome_log_loss"]["value"] > 0
     assert own["outcome_log_loss"]["value"] > 0
     assert 0 <= own["coverage"]["value"] <= 1
     assert own["visual_skill_best"] is not None
@@ -61,11 +73,12 @@ def test_distributions_are_judged_where_samples_are_drawn(workdir):
 
 def test_pairs_have_the_condition_turned_like_the_pose(workdir):
     data = dataset.load(workdir / "dataset")
-    pairs = data.pairs(np.array([1, 0]), symmetries=True)
+    rows = data.rendered()[[1, 0]]
+    pairs = data.pairs(rows, symmetries=True)
     assert pairs.condition.shape == (16, 3)
     assert pairs.condition.dtype == np.float32
-    np.testing.assert_array_equal(data.pairs(np.array([1, 0])).condition, data.trajectory["condition"][[1, 0]])
-    np.testing.assert_array_equal(pairs.condition[[0, 8]], data.trajectory["condition"][[1, 0]])
+    np.testing.assert_array_equal(data.pairs(rows).condition, data.trajectory["condition"][rows])
+    np.testing.assert_array_equal(pairs.condition[[0, 8]], data.trajectory["condition"][rows])
     # The angle from where it stands to where the pad goes stays, but for its sign in a mirror.
     place, along = (x[..., 0] + 1j * x[..., 1] for x in (pairs.pose[:, 0], pairs.condition))
     angle = np.angle(along / place).reshape(2, 2, 4)
