@@ -1,6 +1,6 @@
 """Objects laid on the tilted pad, or let go just above: from the first moment to what the sensor sees at rest.
 
-    python -m experiments.inclined                    # about 15 minutes on two CPU cores
+    python -m experiments.inclined                    # 15 to 20 minutes on two CPU cores
     python -m experiments.inclined --preset long      # at most 150 minutes; can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests

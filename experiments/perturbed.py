@@ -1,6 +1,6 @@
 """A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to what the sensor sees at rest.
 
-    python -m experiments.perturbed                    # about 15 minutes on two CPU cores
+    python -m experiments.perturbed                    # 15 to 20 minutes on two CPU cores
     python -m experiments.perturbed --preset long      # at most 150 minutes; can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
