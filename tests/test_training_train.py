@@ -270,6 +270,23 @@ def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
     assert loaded.settings["kind"] == "statespace"
 
 
+@pytest.mark.parametrize(
+    ("name", "key", "change", "message"),
+    [
+        ("views", "visual", lambda x: x[:, :8], "views has"),
+        ("views", "state", lambda x: x[:2], "equally many"),
+        ("falls", "pose", lambda x: x[:, :7], "falls has"),
+        ("falls", "outcome", lambda x: x + 2, "outcome is int32 from 2 to 3"),
+    ],
+)
+def test_views_and_falls_that_do_not_fit_are_refused(tmp_path, name, key, change, message):
+    data = bars(further=True)
+    own = getattr(data, name)
+    wrong = dataclasses.replace(data, **{name: own | {key: change(own[key])}})
+    with pytest.raises(ValueError, match=message):
+        training.train(STATE_CONFIG, STATE, wrong, workdir=tmp_path)
+
+
 def test_views_and_falls_are_taken_by_rows_of_their_own_and_change_the_checksum():
     data = bars(further=True)
     rows = {"views": np.array([2, 0]), "falls": np.array([4, 4, 1])}

@@ -466,12 +466,21 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
             raise ValueError(f"{kind} have samples of {found}; the model takes {expected[kind]}")
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
         raise ValueError(f"empty needs `visual` and `tactile` of shape {(*size, 3)}, from dataset.empty_frame")
-    outcome = arrays.targets["outcome"]
-    if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
-        raise ValueError(
-            f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}; give whole numbers from 0 to "
-            f"{model.outcomes - 1}, or a model of more outcomes"
-        )
+    further = {
+        "views": {"visual": (*size, 3), "state": (statespace.STATE_CODE,)},
+        "falls": {**codes, "outcome": (), **({"condition": (model.condition,)} if model.condition else {})},
+    }
+    for kind, values in (("views", arrays.views), ("falls", arrays.falls)):
+        found = {name: x.shape[1:] for name, x in values.items()}
+        if values and (found != further[kind] or len({len(x) for x in values.values()}) > 1):
+            shapes = {name: x.shape for name, x in values.items()}
+            raise ValueError(f"{kind} has {shapes}; it takes equally many samples of {further[kind]}")
+    for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
+        if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
+            raise ValueError(
+                f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}; give whole numbers from 0 to "
+                f"{model.outcomes - 1}, or a model of more outcomes"
+            )
     _check_condition(model.condition, arrays)
 
 
