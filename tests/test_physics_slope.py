@@ -60,7 +60,7 @@ def test_above_it_slides_with_what_friction_leaves(friction: float, degrees: flo
     speed = np.einsum("nfi,ni->nf", found.velocity[..., :2], down)
     gained = (speed[:, 4] - speed[:, 2]) / (2 * 0.05)
     expected = G * (np.sin(slope) - friction * np.cos(slope))
-    # A block that rocks on its edges is pressed less for a moment. How much depends on rounding, and so on the processor.
+    # A block that rocks is pressed less for a moment. How much depends on rounding, and so on the processor.
     np.testing.assert_allclose(gained.mean(), expected, rtol=0.02)
     np.testing.assert_allclose(gained, expected, rtol=0.04)
     across = np.abs(found.velocity[:, 4, 0] * down[:, 1] - found.velocity[:, 4, 1] * down[:, 0])
