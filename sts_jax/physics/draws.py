@@ -30,7 +30,7 @@ def starts(
 ) -> Starts:
     """Draws `num` further starts of each body and their hidden values, without simulating them.
 
-    They are distributed as those of `simulate` and independent of what it draws with the same key. Start j of body i
+    They are distributed as those of `simulate` and independent of its draws with the same key. Start j of body i
     depends on `key`, i, j and the body, not on how many others there are.
 
     Args:

@@ -370,7 +370,7 @@ def compose(
         layers: from the decoder.
         empty: both images of the untouched sensor, of the same size.
         level: the probability of being covered, from 0 to 1, above which a pixel of a sample is covered. Over uniform
-            levels, each pixel is covered as often as its probability says, and every outline is sharp. None draws the
+            levels, each pixel is covered with its probability, and every outline is sharp. None draws the
             mean.
 
     Returns:

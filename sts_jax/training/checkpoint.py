@@ -49,7 +49,7 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
 
     Args:
         folder: the model's folder.
-        state: what is written.
+        state: the state to write.
         compact: round the weights, and write one small file, see `training.rounded`.
 
     Raises:
