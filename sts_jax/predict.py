@@ -328,8 +328,8 @@ class Predictor:
             pose: `(*n, 7)` m and unit quaternion, mesh frame in the sensor frame.
             condition: `(*n, c)`, the scenario's input in SI units, for models that have one. For a jerk: acceleration
                 of the pad along x and y (m/s^2) and its duration (s).
-            state: `(*n, code)`, the true pose, shape and mass, from `statespace.encode`. A simulation knows them, and a
-                state-space model then shows how much of its error is not due to its senses.
+            state: `(*n, code)`, the true pose, shape and mass, from `statespace.encode`, for state-space models. A
+                simulation provides them. The error that remains is that of the learned physics and of the drawing.
             present: By name, which items of a modality count, bool `(*n,)`; what does not count may be NaN.
             key: For `num_samples`; consumed.
             num_samples: Draw this many predictions. A state-space model's images are then the means over them.

@@ -15,7 +15,7 @@ from sts_jax.objects.body import (
 from sts_jax.objects.libraries import HOLLOW, Entry, Item, Library, bodies, describe, facts, library, read, survey
 from sts_jax.objects.meshes import load
 from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import DIRECTIONS, decompose, gaps, hull_gap, rest_poses, support
+from sts_jax.objects.solids import DIRECTIONS, decompose, gaps, hull_gap, lattice, rest_poses, support
 
 __all__ = [
     "CATEGORIES",
@@ -36,6 +36,7 @@ __all__ = [
     "fill_moments",
     "gaps",
     "hull_gap",
+    "lattice",
     "library",
     "load",
     "make",

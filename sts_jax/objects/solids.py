@@ -26,14 +26,15 @@ REST_MARGIN = 5e-4  # m, how far inside the outline of a face the centre of mass
 NUM_DIRECTIONS = 128
 
 
-def _lattice(num: int) -> Float[np.ndarray, "n 3"]:
-    """Unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+def lattice(num: int) -> Float[np.ndarray, "n 3"]:
+    """`num` unit vectors spread evenly over the sphere: a Fibonacci lattice."""
     step = np.arange(num) + 0.5
     z, angle = 1 - 2 * step / num, np.pi * (1 + np.sqrt(5)) * step
-    return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+    points = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+    return points.astype(np.float32)
 
 
-DIRECTIONS = _lattice(NUM_DIRECTIONS).astype(np.float32)  # (128, 3) unit vectors, at which `support` is evaluated
+DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3) unit vectors, at which `support` is evaluated
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 

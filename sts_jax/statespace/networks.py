@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sts_jax import objects
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import harmonics, poses, state, window
 
@@ -155,7 +155,7 @@ def _shapes(
 ) -> list[Array]:
     """Traits and the values of all functions on the sphere, those of the object's frame turned and those shown."""
     traits, own, shown = parts(config, look)
-    many, few = _directions(config.support), _directions(config.directions)
+    many, few = objects.lattice(config.support), objects.lattice(config.directions)
     return [
         traits,
         harmonics.values(known.own[:, None], own_turn, many),
@@ -167,14 +167,6 @@ def _shapes(
 
 def _joined(*features: Float[Array, "n ..."]) -> Float[Array, "n k"]:
     return jnp.concatenate([x.reshape(len(x), -1) for x in features], axis=-1)
-
-
-def _directions(count: int) -> np.ndarray:
-    """Directions that are spread evenly over the sphere (Fibonacci's lattice)."""
-    step = np.arange(count) + 0.5
-    z, angle = 1 - 2 * step / count, np.pi * (1 + 5**0.5) * step
-    level = np.sqrt(1 - z**2)
-    return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=-1).astype(np.float32)
 
 
 def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h//2 w//2 4*c"]:
