@@ -60,12 +60,12 @@ def main(name: str, times: int, workdir: Path | None) -> None:
         rows = stages.rows_of(data, config.splits[0])
         pairs = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
     train, test = (dataset.reduced(part, config.image_size) for part in pairs)
+    judge = stages.judge_of(config.collection.scenario, train)
     with tqdm(total=times * len(test.object), desc="re-roll", unit="trajectories") as bar:
-        made = ceilings.reroll(config.collection, sensor, test, times, lambda done: bar.update(done - bar.n))
-    outcomes = config.collection.scenario.outcomes
+        made = ceilings.reroll(config.collection, sensor, test, times, judge, lambda done: bar.update(done - bar.n))
     scores = dict(made.scores)
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
-        scores[title] = evaluation.score(row, test, outcomes=outcomes)
+        scores[title] = judge(row, test)
     summary = evaluation.summarise(scores, test)
     print(evaluation.table(summary, title=f"{name}: what can be predicted"))
     print(evaluation.full_table(summary, title=f"{name}: every figure"))

@@ -14,6 +14,7 @@ from sts_jax import _files, dataset, evaluation
 from sts_jax.dataset.records import read_arrays
 
 SEED = 20  # of the re-rolls
+FORMAT = 2  # of what is kept; 2: outcomes are decided by the ratio of probability to frequency
 
 
 class Ceilings(NamedTuple):
@@ -34,6 +35,7 @@ def ceilings(
     *,
     times: int,
     num: int,
+    judge: Callable[..., evaluation.Scores],
 ) -> Ceilings:
     """The ceilings of the first `num` held-out items: read, or computed and written to `ceiling{suffix}.npz`.
 
@@ -48,13 +50,14 @@ def ceilings(
         test: The held-out items.
         times: Re-rolls of each.
         num: How many of the items.
+        judge: `evaluation.score`, which knows the outcomes and perhaps their frequencies.
     """
     few = dataset.Pairs(*(leaf[:num] for leaf in test))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
     inputs = {
         "dataset": data.identity,
         "the held-out list": _files.digest(few.trajectory.tolist()),
-        "the re-rolls": _files.digest([times, SEED]),
+        "the re-rolls": _files.digest([times, SEED, FORMAT]),
     }
     reason = results.stale(record, inputs)
     if reason is not None:
@@ -62,7 +65,7 @@ def ceilings(
             say(f"ceilings: again, because {reason}")
         with Bar() as bar:
             total = times * len(few.object)
-            made = reroll(collection, sensor, few, times, lambda done: bar("re-roll", done, total))
+            made = reroll(collection, sensor, few, times, judge, lambda done: bar("re-roll", done, total))
         dataset.write_arrays(path, _flat(made))
         results.write(record, {"times": times, "items": len(few.object)}, inputs, [path])
     return _restored(read_arrays(path))
@@ -73,6 +76,7 @@ def reroll(
     sensor: sts.Sensor,
     test: dataset.Pairs,
     times: int,
+    judge: Callable[..., evaluation.Scores],
     progress: Callable[[int], object] | None = None,
 ) -> Ceilings:
     """The ceilings of some items: their mean and a single one, scored."""
@@ -82,8 +86,8 @@ def reroll(
         raise TypeError("evaluation.ceiling returned no samples")
     one = evaluation.Predicted(*(None if leaf is None else leaf[0] for leaf in samples[:4]))
     scores = {
-        evaluation.CEILING: evaluation.score(mean, test, outcomes=collection.scenario.outcomes),
-        evaluation.ONE_REROLL: evaluation.score(one, test),
+        evaluation.CEILING: judge(mean, test),
+        evaluation.ONE_REROLL: judge(one, test),
     }
     return Ceilings(scores, samples.pose, samples.outcome)
 

@@ -1,6 +1,7 @@
 """The stages that experiments share: collect, train, evaluate; each goes on where it stopped, with a progress bar."""
 
 import dataclasses
+import functools
 import itertools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -323,6 +324,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     if config.model == "paper":
         validation, given = dataset.reduced(validation, config.image_size), test
     blank = training.load_blank(model_folder(workdir, main_model(config), config, split))[0] / 255
+    judge = judge_of(scenario, train_pairs)
     possible = ceilings(
         workdir,
         suffix,
@@ -332,17 +334,18 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         test,
         times=config.rerolls,
         num=config.num_rerolled,
+        judge=judge,
     )
     scores = dict(possible.scores)
     for title, row in evaluation.baselines(scenario, train_pairs, test).items():
-        scores[title] = evaluation.score(row, test, outcomes=scenario.outcomes)
+        scores[title] = judge(row, test)
     shown: dict[str, evaluation.Predicted] = {}  # the first predictions of each model, for the figures
     with Bar() as bar:
         jobs = list(queries(config, workdir, split))
         for number, (title, predictor, names) in enumerate(jobs):
             bar("evaluate", number, len(jobs), title)
             row = predict(scenario, predictor, names, validation, given, blank, num_samples=number_of_samples(config))
-            scores[title] = evaluation.score(row, test, outcomes=scenario.outcomes)
+            scores[title] = judge(row, test)
             shown[title] = evaluation.first(row, config.num_shown)
         summary = evaluation.summarise(scores, test)
         bar("evaluate", len(jobs), len(jobs), "intervals done")
@@ -370,6 +373,12 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     _files.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
     results.write(done, {"split": split, **summary}, inputs, [table, complete, *drawn])
     return text
+
+
+def judge_of(scenario: sts.physics.Scenario, train: dataset.Pairs) -> Callable[..., evaluation.Scores]:
+    """`evaluation.score` for the outcomes of a scenario, as frequent as they are among some training trajectories."""
+    frequency = evaluation.frequency(train.outcome, scenario.outcomes)
+    return functools.partial(evaluation.score, outcomes=scenario.outcomes, frequency=frequency)
 
 
 def main_model(config: Config) -> str:
@@ -484,7 +493,8 @@ def predict(
 ) -> evaluation.Predicted:
     """The prediction of a model for the held-out trajectories.
 
-    The outcome is that of the pose; with samples, its probabilities are the shares of the samples' outcomes. The
+    The outcome is that of the pose; with samples, its probabilities are the shares of the samples' outcomes, unless the
+    model predicts them itself. The
     outcome of a model without a pose is read from whether its image is empty, in scenarios that only ask whether the
     object fell off; in other scenarios it has none.
     """

@@ -131,6 +131,31 @@ def test_a_distribution_is_scored_by_its_samples_and_probabilities():
     np.testing.assert_array_equal(scores.right, likeliest == test.outcome)
 
 
+def test_the_outcome_is_decided_for_the_best_balanced_accuracy():
+    """Of items that fall off in one case of ten, with a predictor that knows every probability."""
+    count, rng = 20000, np.random.default_rng(0)
+    off = np.clip(rng.beta(0.3, 2.7, count), 0.01, 0.99)
+    test, predicted = judged(2)
+    test = test._replace(outcome=np.where(rng.random(count) < off, FELL, RESTS).astype(np.int32))
+    test = test._replace(
+        **{
+            name: np.broadcast_to(getattr(test, name)[:1], (count, *getattr(test, name).shape[1:]))
+            for name in ("visual", "tactile", "segmentation", "pose", "contact", "condition", "object", "trajectory")
+        }
+    )
+    predicted = evaluation.Predicted(outcome_probability=np.stack([1 - off, off], 1))
+    outcomes = physics.Freefall.outcomes
+    frequency = evaluation.frequency(test.outcome, outcomes)
+    np.testing.assert_allclose(frequency, [1 - (test.outcome == FELL).mean(), (test.outcome == FELL).mean()], atol=1e-4)
+    decided = evaluation.score(predicted, test, outcomes=outcomes, frequency=frequency).outcome
+    accuracy = evaluation.metrics.balanced_accuracy
+    found = accuracy(decided, test.outcome)
+    # No other threshold on the probability does better, beyond chance.
+    others = [accuracy(np.where(off > limit, FELL, RESTS), test.outcome) for limit in np.linspace(0.01, 0.9, 90)]
+    assert found == pytest.approx(max(others), abs=0.01)
+    assert found > accuracy(np.where(off > 0.5, FELL, RESTS), test.outcome) + 0.1
+
+
 def test_a_deterministic_prediction_scores_its_error_and_the_sharpness_of_its_image():
     test, predicted = judged()
     scores = evaluation.score(predicted._replace(samples=None, outcome_probability=None), test)

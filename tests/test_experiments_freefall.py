@@ -76,7 +76,7 @@ def test_the_ceilings_are_scored_once_and_kept(workdir, monkeypatch):
     sensor, data = sts.Sensor(), dataset.load(workdir / "dataset")
     test = dataset.reduced(data.pairs(stages.rows_of(data, "object")["test"]), 64)
     monkeypatch.setattr(ceilings, "reroll", lambda *_: pytest.fail("rolled again"))
-    found = ceilings.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256)
+    found = ceilings.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
     metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
     own = found.scores["ceiling (mean of re-rolls)"]
     assert own.position.mean() == pytest.approx(metrics["position"]["value"])

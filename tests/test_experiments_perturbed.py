@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 import sts_jax as sts
+from benchmarks import recognise
 from experiments import perturbed, show, stages
 from sts_jax import dataset, physics
 
@@ -119,3 +120,12 @@ def test_what_is_shown_is_a_strip_and_an_animation(name, scenario, tmp_path, mon
 def test_an_unknown_scenario_cannot_be_shown(tmp_path):
     with pytest.raises(ValueError, match="give one of freefall, inclined, perturbed"):
         show.main(show.Config("sideways", out=tmp_path))
+
+
+def test_pictures_to_be_recognised_come_with_their_answers(workdir, tmp_path, monkeypatch):
+    monkeypatch.setattr(recognise, "NUMBER", 2)
+    found = [recognise.main(recognise.Args(workdir, tmp_path / f"{seed}.png", seed=seed)) for seed in range(6)]
+    assert {text.splitlines()[1] for text in found} == {"answers: A1 B2", "answers: A2 B1"}
+    assert Image.open(tmp_path / "0.png").size[0] > 100
+    with pytest.raises(ValueError, match="first is 100: fewer than 2"):
+        recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))

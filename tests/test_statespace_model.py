@@ -128,6 +128,13 @@ def test_excess_is_that_of_the_metrics_and_zero_at_the_target():
     found = objective.excess(jnp.asarray(image), jnp.asarray(target))
     np.testing.assert_allclose(found, metrics.image_error(image, target).excess, rtol=1e-4)
     np.testing.assert_allclose(objective.excess(jnp.asarray(image), jnp.asarray(image)), 0, atol=1e-4)
+    upper = np.zeros((2, 8, 8), np.float32)
+    upper[:, :4] = 1
+    np.testing.assert_allclose(
+        objective.excess(jnp.asarray(image), jnp.asarray(target), jnp.asarray(upper)),
+        metrics.image_error(image[:, :4], target[:, :4]).excess,
+        rtol=1e-4,
+    )
 
 
 def test_reduced_images_are_means_of_blocks():

@@ -106,6 +106,16 @@ def shares(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarr
     return (counts + 1 / len(outcomes)) / (len(outcome) + 1)
 
 
+def frequency(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarray:
+    """How often each outcome occurs `(c,)`, with one more item that is spread evenly, so that none is 0.
+
+    Args:
+        outcome: int `(n,)`, of training trajectories.
+        outcomes: `scenario.outcomes`.
+    """
+    return shares(outcome[:, None], outcomes)[0]
+
+
 def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
     """The outcome of freefall as an image shows it: off the pad where it is closer to the empty one than a threshold.
 
@@ -174,13 +184,23 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     }
 
 
-def score(predicted: Predicted, test: Pairs, *, outcomes: Sequence[physics.Outcome] = ()) -> Scores:
+def score(
+    predicted: Predicted,
+    test: Pairs,
+    *,
+    outcomes: Sequence[physics.Outcome] = (),
+    frequency: np.ndarray | None = None,
+) -> Scores:
     """Errors per item of a prediction of the last moment.
+
+    With `outcome_probability` and `frequency`, the outcome that is judged has the largest ratio of probability to
+    frequency. This decision has the best expected balanced accuracy: a rare outcome counts as much as a common one.
 
     Args:
         predicted: Of all items, or of the first ones only.
         test: The held-out items.
         outcomes: `scenario.outcomes`, for predictions with `outcome_probability`.
+        frequency: Of each outcome among training trajectories, from `frequency`.
 
     Raises:
         ValueError: `outcome_probability` has another number of columns than `outcomes`.
@@ -223,7 +243,7 @@ def score(predicted: Predicted, test: Pairs, *, outcomes: Sequence[physics.Outco
     if predicted.visual is not None or samples.visual is not None:
         scores = scores._replace(gradient_target=metrics.gradient_energy(truth))
     if predicted.outcome_probability is not None:
-        scores = _with_probability(scores, predicted.outcome_probability, test, outcomes)
+        scores = _with_probability(scores, predicted.outcome_probability, test, outcomes, frequency)
     return scores
 
 
@@ -233,7 +253,11 @@ def in_unit(image: np.ndarray) -> np.ndarray:
 
 
 def _with_probability(
-    scores: Scores, probability: np.ndarray, test: Pairs, outcomes: Sequence[physics.Outcome]
+    scores: Scores,
+    probability: np.ndarray,
+    test: Pairs,
+    outcomes: Sequence[physics.Outcome],
+    frequency: np.ndarray | None,
 ) -> Scores:
     """The scores with those of the outcome's probabilities."""
     if probability.shape != (len(test.outcome), len(outcomes)):
@@ -244,9 +268,14 @@ def _with_probability(
     number = np.array([int(outcome) for outcome in outcomes])
     likeliest = number[probability.argmax(1)]
     label = (test.outcome[:, None] == number).argmax(1)
+    outcome = scores.outcome
+    if frequency is not None:
+        outcome = number[(probability / frequency).argmax(1)]
+    elif outcome is None:
+        outcome = likeliest
     fell_off = number.tolist().index(int(physics.Outcome.FELL_OFF))
     return scores._replace(
-        outcome=likeliest if scores.outcome is None else scores.outcome,
+        outcome=outcome,
         log_loss=metrics.log_loss(probability, label),
         confidence=probability.max(1),
         right=likeliest == test.outcome,

@@ -5,9 +5,10 @@ For a batch of first moments with their last moments, it is the sum of
 - the squared error of each image's expert at the true first state, and the nats of its variance;
 - the nats of the transition at the true outcome, the true final pose and the rotation to it, for the belief of every
   non-empty subset of the inputs;
-- the excess cross-entropy of both streams of the last moment, drawn in the true final pose with a sample of the look,
-  and that of the first moment, drawn in the true first pose;
-- the cross-entropy of the pixels that the object covers in these pictures;
+- the excess cross-entropy of the last moment, drawn in the true final pose with a sample of the look, and that of the
+  first moment, drawn in the true first pose. It is that of the colours of the pixels that show the object and that of
+  the tactile image;
+- the cross-entropy of the probability that a pixel shows the object, in these pictures;
 - beta times the divergence of the look from its prior, in nats.
 
 A moment is drawn in its true pose, so that the decoder never averages over places. The subset whose belief gives the
@@ -90,13 +91,18 @@ def log_density(
     return of_outcome(final.outcome), jax.nn.logsumexp(weight + each, axis=-1)
 
 
-def excess(image: Float[Array, "n h w c"], target: Float[Array, "n h w c"]) -> Float[Array, "n"]:
-    """Binary cross-entropy less the target's own entropy, nats, summed over pixels and channels."""
+def excess(
+    image: Float[Array, "n h w c"],
+    target: Float[Array, "n h w c"],
+    counts: Float[Array, "n h w"] | None = None,
+) -> Float[Array, "n"]:
+    """Binary cross-entropy less the target's own entropy, nats, summed over the pixels that count and over channels."""
     image = jnp.clip(image, _LEAST, 1 - _LEAST)
     cross = target * jnp.log(image) + (1 - target) * jnp.log1p(-image)
     inside = jnp.clip(target, 1e-6, 1 - 1e-6)
     own = inside * jnp.log(inside) + (1 - inside) * jnp.log1p(-inside)
-    return jnp.sum(own - cross, axis=(1, 2, 3))
+    each = jnp.sum(own - cross, axis=-1)
+    return jnp.sum(each if counts is None else counts * each, axis=(1, 2))
 
 
 def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
@@ -346,29 +352,33 @@ def _picture_terms(
         jax.lax.stop_gradient(jnp.concatenate([x.belief.mean[:, : state.CODE] for x in (after, before)])),
         jnp.concatenate([looks(key, x.belief) for key, x in zip(keys, (after, before), strict=True)]),
     )
-    drawn = compose(layers, small)
     number = len(after.pose)
-    terms = {name: jnp.mean(excess(drawn[name][:number], after.images[name])) for name in IMAGES}
-    terms["first"] = jnp.zeros(())
+    seen = window.shows(after.images["visual"] - small["visual"])
+    touch = compose(layers, small)["tactile"]
+    terms = {
+        "visual": jnp.mean(excess(layers.colour[:number], after.images["visual"], seen)),
+        "tactile": jnp.mean(excess(touch[:number], after.images["tactile"])),
+        "covered": jnp.mean(_outline_nats(layers.covered[:number], seen)),
+        "first": jnp.zeros(()),
+    }
     for name, image in before.images.items():
         counts = before.counts[name]
-        wrong = excess(drawn[name][number:], reduced(_counted(counts, image), size))
-        terms["first"] += jnp.sum(jnp.where(counts, wrong, 0)) / jnp.maximum(jnp.sum(counts), 1)
-    terms["covered"] = jnp.mean(_outline_nats(layers.covered[:number], after.images["visual"] - small["visual"]))
-    if "visual" in before.images:
-        counts = before.counts["visual"]
-        change = reduced(_counted(counts, before.images["visual"]), size) - small["visual"]
-        wrong = _outline_nats(layers.covered[number:], change)
-        terms["covered"] += jnp.sum(jnp.where(counts, wrong, 0)) / jnp.maximum(jnp.sum(counts), 1)
+        target = reduced(_counted(counts, image), size)
+        share = counts / jnp.maximum(jnp.sum(counts), 1)
+        if name == "visual":
+            seen = window.shows(target - small[name])
+            terms["covered"] += jnp.sum(share * _outline_nats(layers.covered[number:], seen))
+            terms["first"] += jnp.sum(share * excess(layers.colour[number:], target, seen))
+        else:
+            terms["first"] += jnp.sum(share * excess(touch[number:], target))
     return terms
 
 
-def _outline_nats(logit: Float[Array, "n h w 1"], change: Float[Array, "n h w 3"]) -> Float[Array, "n"]:
+def _outline_nats(logit: Float[Array, "n h w 1"], seen: Float[Array, "n h w"]) -> Float[Array, "n"]:
     """Cross-entropy of the probability that a pixel shows the object, summed over pixels.
 
     Args:
         logit: of the probability.
-        change: the visual image less that of the empty sensor.
+        seen: 1 where a pixel shows it, else 0.
     """
-    seen = window.shows(change)
     return jnp.sum(jax.nn.softplus(logit[..., 0]) - seen * logit[..., 0], axis=(1, 2))

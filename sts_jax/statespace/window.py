@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from sts_jax.statespace import poses
 
-THRESHOLD = 4 / 255  # a pixel shows something where a channel differs by more than this
+THRESHOLD = 12 / 255  # a pixel shows the object where a channel differs by more than this; its shadow differs by less
 MARGIN = 1.1  # side of the window over the larger extent of the silhouette
 SMALLEST = 0.08  # side of the smallest window, of the image's
 

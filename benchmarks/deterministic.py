@@ -1,0 +1,181 @@
+"""A plain network that predicts one end, as a baseline: what does the state-space model gain at equal cost?
+
+    python -m benchmarks.deterministic runs/freefall                         # of --preset default
+    python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
+
+Takes the dataset of a run, trains a convolutional network without a latent on the first images, the pose and the
+condition for the same number of seconds as the run's state-space model (`--seconds`), and prints its errors beside the
+baselines. The network minimises the cross-entropy of both last images and of the outcome and the squared error of the
+final pose. It sees the trajectories that have images, and of the others it can use nothing.
+"""
+
+import dataclasses
+import functools
+import itertools
+import time
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+from flax import nnx
+from jaxtyping import Array, Float
+
+import sts_jax as sts
+from experiments import command, freefall, inclined, perturbed, stages
+from sts_jax import _files, dataset, evaluation, statespace, training
+
+EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed}
+BATCH, RATE, WARMUP = 32, 1e-3, 100
+POSE_WEIGHT, TACTILE_WEIGHT, OUTCOME_WEIGHT = 300.0, 4.0, 8.0  # against the nats of the visual image
+TITLE = "deterministic network, from all inputs"
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Which run, and how long the network is trained."""
+
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment with its models trained
+    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
+    preset: Literal["smoke", "default", "long"] = "default"
+    seconds: float = 420.0  # of training, after compilation
+    seed: int = 0
+
+
+class Network(nnx.Module):
+    """Images at 128x128, pose code and condition to logits of both images at 64x64, pose code and outcome logits."""
+
+    def __init__(self, images: int, numbers: int, outcomes: int, rngs: nnx.Rngs) -> None:
+        widths = [3 * images, 32, 64, 128, 128]
+        self.down = nnx.List([nnx.Conv(4 * a, b, (3, 3), rngs=rngs) for a, b in itertools.pairwise(widths)])
+        self.join = nnx.Linear(8 * 8 * 128 + numbers, 512, rngs=rngs)
+        self.layers = nnx.List([nnx.Linear(512, 512, rngs=rngs) for _ in range(3)])
+        self.norms = nnx.List([nnx.LayerNorm(512, rngs=rngs) for _ in range(3)])
+        self.numbers = nnx.Linear(512, 12 + outcomes, rngs=rngs)
+        self.core = nnx.Linear(512, 8 * 8 * 128, rngs=rngs)
+        self.up = nnx.List([nnx.Conv(a, 4 * b, (3, 3), rngs=rngs) for a, b in ((128, 64), (64, 32), (32, 6))])
+
+    def __call__(self, images: Float[Array, "n h w c"], numbers: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
+        """Picture logits `(n, 64, 64, 6)`, visual and tactile, pose codes `(n, 12)` and outcome logits."""
+        x = images
+        for layer in self.down:
+            x = jax.nn.swish(layer(_fold(x)))
+        x = self.join(jnp.concatenate([x.reshape(len(x), -1), numbers], axis=-1))
+        for norm, layer in zip(self.norms, self.layers, strict=True):
+            x = x + layer(jax.nn.swish(norm(x)))
+        final = self.numbers(x)
+        picture = self.core(x).reshape(len(x), 8, 8, -1)
+        for layer in self.up:
+            picture = _unfold(layer(jax.nn.swish(picture)))
+        return picture, final[:, :12], final[:, 12:]
+
+
+def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h/2 w/2 4*c"]:
+    """Blocks of 2x2 pixels as channels."""
+    n, h, w, c = x.shape
+    return x.reshape(n, h // 2, 2, w // 2, 2, c).swapaxes(2, 3).reshape(n, h // 2, w // 2, 4 * c)
+
+
+def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c/4"]:
+    """The inverse of `_fold`."""
+    n, h, w, c = x.shape
+    return x.reshape(n, h, w, 2, 2, c // 4).swapaxes(2, 3).reshape(n, 2 * h, 2 * w, c // 4)
+
+
+def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str, Array]) -> tuple[Array, Array]:
+    """The images less those of the empty sensor, side by side in the channels, and all numbers.
+
+    Args:
+        inputs: `visual`, perhaps `tactile`, uint8 `(n, 128, 128, 3)`, and `pose` `(n, 12)`, codes.
+        condition: `(n, c)`, or None.
+        empty: both images of the untouched sensor, uint8.
+    """
+    images = [inputs[name] / 255.0 - empty[name] / 255.0 for name in ("visual", "tactile") if name in inputs]
+    numbers = [inputs["pose"]] if condition is None else [inputs["pose"], condition]
+    return jnp.concatenate(images, axis=-1), jnp.concatenate(numbers, axis=-1)
+
+
+def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, Any]) -> Array:
+    """The sum of the images' and the outcome's cross-entropies and the pose's squared error, a mean over the batch."""
+    picture, pose, outcome = nnx.merge(graphdef, params)(*features(batch["inputs"], batch["condition"], batch["empty"]))
+    targets = batch["targets"]
+    visual, tactile = (
+        jnp.sum(optax.sigmoid_binary_cross_entropy(logits, targets[name] / 255.0), axis=(1, 2, 3))
+        for name, logits in zip(("visual", "tactile"), jnp.split(picture, 2, axis=-1), strict=True)
+    )
+    known = optax.softmax_cross_entropy_with_integer_labels(outcome, targets["outcome"])
+    error = jnp.sum((pose - targets["pose"]) ** 2, axis=-1)
+    return jnp.mean(visual + TACTILE_WEIGHT * tactile + POSE_WEIGHT * error + OUTCOME_WEIGHT * known)
+
+
+def fit(
+    arrays: training.Arrays, network: nnx.GraphDef[Network], params: nnx.State, seconds: float, seed: int
+) -> tuple[nnx.State, int]:
+    """Train for so many seconds after compilation, with a rate that falls with time as a cosine; the steps it took."""
+    optimiser = optax.chain(optax.clip_by_global_norm(3e3), optax.scale_by_adam(b2=0.99))
+
+    @functools.partial(jax.jit, donate_argnums=(0, 1))
+    def step(params: nnx.State, state: optax.OptState, batch: dict[str, Any], rate: Array) -> tuple[Any, Any]:
+        update, state = optimiser.update(jax.grad(functools.partial(loss, network))(params, batch), state)
+        return optax.apply_updates(params, jax.tree.map(lambda x: -rate * x, update)), state
+
+    state = optimiser.init(params)
+    start, count = None, 0
+    for index in training.order(seed, len(arrays), BATCH, 0, 10**9):
+        share = 0.0 if start is None else (time.perf_counter() - start) / seconds
+        if share >= 1:
+            break
+        rate = RATE * min((count + 1) / WARMUP, 1) * 0.5 * (1 + np.cos(np.pi * share))
+        params, state = jax.block_until_ready(step(params, state, arrays.take(index), jnp.float32(rate)))
+        start = start or time.perf_counter()  # the first step compiles
+        count += 1
+    return params, count
+
+
+def predict(
+    graphdef: nnx.GraphDef[Network], params: nnx.State, job: stages.Job, arrays: training.Arrays
+) -> evaluation.Predicted:
+    """The network's end of every item; the outcome is that with the largest probability."""
+
+    @jax.jit
+    def run(batch: dict[str, Any]) -> tuple[Array, ...]:
+        found = nnx.merge(graphdef, params)(*features(batch["inputs"], batch["condition"], batch["empty"]))
+        visual, tactile = jnp.split(jax.nn.sigmoid(found[0]), 2, axis=-1)
+        return visual, tactile, job.preprocessing.decode_pose(found[1]), jax.nn.softmax(found[2])
+
+    parts = [run(arrays.take(rows)) for rows in np.array_split(np.arange(len(arrays)), -(-len(arrays) // 64))]
+    visual, tactile, pose, outcome = (np.concatenate([np.asarray(part[k]) for part in parts]) for k in range(4))
+    return evaluation.Predicted(visual, tactile, pose, outcome_probability=outcome)
+
+
+def main(args: Args) -> str:
+    """Train the network on a run's training objects and return the table of its errors on the held-out ones."""
+    sts.enable_compilation_cache()
+    config, sensor = EXPERIMENTS[args.scenario].PRESETS[args.preset], sts.Sensor()
+    with _files.lock(args.workdir):
+        stages.claim(config, args.workdir)
+        data = stages.collect(config, args.workdir, sensor)
+    rows, scenario = stages.rows_of(data, config.splits[0]), config.collection.scenario
+    train, given = data.pairs(rows["train"]), data.pairs(rows["test"])
+    job = next(stages.jobs(config, sensor, train))
+    assert isinstance(job.model, statespace.Config)
+    held_out = training.state_moments(given, job.model, scenario, job.preprocessing, job.empty)
+    numbers = 12 + len(job.preprocessing.condition_scale)
+    images = len([name for name in ("visual", "tactile") if name in job.arrays.inputs])
+    network, params = nnx.split(Network(images, numbers, len(scenario.outcomes), nnx.Rngs(args.seed)))
+    params, steps = fit(job.arrays, network, params, args.seconds, args.seed)
+    train, test = (dataset.reduced(pairs, config.image_size) for pairs in (train, given))
+    predictions = evaluation.baselines(scenario, train, test)
+    predictions[TITLE] = predict(network, params, job, held_out)
+    judge = stages.judge_of(scenario, train)
+    scores = {title: judge(row, test) for title, row in predictions.items()}
+    size = sum(x.size for x in jax.tree.leaves(params))
+    note = f"{steps} gradient steps of {BATCH} in {args.seconds:g} s, {size:,} parameters."
+    title = f"{args.workdir.name}: a deterministic network"
+    return evaluation.full_table(evaluation.summarise(scores, test), title=title, notes=[note])
+
+
+if __name__ == "__main__":
+    print(main(tyro.cli(Args, description=__doc__)))

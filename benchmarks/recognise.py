@@ -1,0 +1,68 @@
+"""Can a stranger tell which predicted picture belongs to which true end?
+
+    python -m benchmarks.recognise runs/freefall --out recognise.png
+    python -m benchmarks.recognise runs/freefall --given visual pose --first 20
+
+Predicts ten consecutive held-out trajectories and draws one sample of the last visual image of each (A to J), above the
+ten true images in another order (1 to 10). Print or show the picture, ask somebody to match them, then compare with the
+answers that are printed here. Guessing gets one right on average.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from experiments import command
+from sts_jax import dataset
+
+NUMBER = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Whose predictions are drawn, from what."""
+
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment with its models trained
+    out: Path = Path("recognise.png")
+    given: tuple[str, ...] = ()  # modalities that are given; if not given: all of the model's
+    first: int = 0  # place of the first trajectory in the held-out list
+    seed: int = 0  # of the samples and of the order
+
+
+def main(args: Args) -> str:
+    """Draw the picture and return the answers."""
+    data = dataset.load(args.workdir / "dataset")
+    rows = data.members("test")[args.first : args.first + NUMBER]
+    if len(rows) < NUMBER:
+        raise ValueError(f"first is {args.first}: fewer than {NUMBER} held-out trajectories begin there")
+    pairs = data.pairs(rows)
+    predictor = sts.Predictor.load(args.workdir / "models" / "statespace")
+    given = args.given or predictor.modalities
+    inputs = {name: getattr(pairs, name)[:, 0] / (1 if name == "pose" else 255) for name in given}
+    condition = pairs.condition if pairs.condition.shape[1] else None
+    found = predictor(**inputs, condition=condition, key=jax.random.key(args.seed), num_samples=16)
+    assert found.samples is not None
+    assert found.samples.visual is not None
+    predicted = np.asarray(found.samples.visual[0])
+    truth = dataset.reduced(pairs, predicted.shape[1]).visual[:, 1]
+    order = np.random.default_rng(args.seed).permutation(NUMBER)
+    figure, axes = plt.subplots(4, -(-NUMBER // 2), figsize=(12, 10), layout="constrained")
+    letters = "ABCDEFGHIJ"[:NUMBER]
+    titles = [*(f"prediction {letter}" for letter in letters), *(f"true end {number + 1}" for number in range(NUMBER))]
+    for axis, image, title in zip(axes.ravel(), [*predicted, *truth[order]], titles, strict=True):
+        axis.imshow(image, interpolation="nearest")
+        axis.set_title(title)
+        axis.axis("off")
+    figure.savefig(args.out, dpi=80)
+    answers = " ".join(f"{letter}{int(np.flatnonzero(order == k)[0]) + 1}" for k, letter in enumerate(letters))
+    return f"{args.out}: from {' and '.join(given)}, held-out {rows[0]} to {rows[-1]}\nanswers: {answers}"
+
+
+if __name__ == "__main__":
+    print(main(tyro.cli(Args, description=__doc__)))

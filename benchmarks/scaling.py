@@ -1,0 +1,105 @@
+"""How the state-space model's skill grows with the number of training trajectories and with training time.
+
+    python -m benchmarks.scaling runs/freefall --out scaling.png          # of --preset default; half an hour
+
+Takes the dataset of a run, and trains a model for each pair of a number of training objects and a number of gradient
+steps, in `RUN/scaling/`; a model that is there is not trained again. Prints visual skill on the held-out objects with
+95 % intervals, and draws it.
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from benchmarks.deterministic import EXPERIMENTS
+from experiments import command, stages
+from experiments.progress import say
+from sts_jax import _files, dataset, evaluation, training
+from sts_jax.evaluation.figures import Trained, scaling
+
+Part = TypeVar("Part", dataset.Pairs, dataset.Views, dataset.Ends)
+SUBSETS = (("visual", "pose"), ("visual",))
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Which models are trained."""
+
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment with its dataset collected
+    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
+    preset: Literal["smoke", "default", "long"] = "default"
+    shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)  # of the training objects, each with the most steps
+    steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps, each with all training objects
+    out: Path = Path("scaling.png")
+
+
+def some(part: Part, objects: np.ndarray) -> Part:
+    """The items of some objects."""
+    return type(part)(*(leaf[np.isin(part.object, objects)] for leaf in part))
+
+
+def train(config: stages.Config, data: dataset.Dataset, folder: Path, share: float, steps: int) -> tuple[int, float]:
+    """Train a model on a share of the objects for so many steps; the number of trajectories, and minutes."""
+    pairs, views = data.pairs(data.members("train")), data.views("train")
+    falls = data.ends(data.members("train", rendered=False))
+    objects = np.unique(falls.object)
+    kept = objects[: max(round(share * len(objects)), 1)]
+    pairs, views, falls = some(pairs, kept), some(views, kept), some(falls, kept)
+    job = next(stages.jobs(config, sts.Sensor(), pairs, views, falls))
+    schedule = dataclasses.replace(job.schedule, steps=steps, warmup=min(job.schedule.warmup, steps // 4))
+    note, stamps = folder / "seconds.json", []
+    if not note.exists():
+        stages.run(job._replace(schedule=schedule), folder, config.targets, lambda *_: stamps.append(time.monotonic()))
+        _files.write_json(note, float(np.median(np.diff(stamps))) * steps)
+    return len(falls.object), _files.read_json(note, f"delete {folder}") / 60
+
+
+def main(args: Args) -> str:
+    """Train and judge every model; a line for each model and subset of inputs."""
+    sts.enable_compilation_cache()
+    config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
+    with _files.lock(args.workdir):
+        stages.claim(config, args.workdir)
+        data = stages.collect(config, args.workdir, sts.Sensor())
+        runs = dict.fromkeys([(share, max(args.steps)) for share in args.shares] + [(1.0, n) for n in args.steps])
+        given = data.pairs(data.members("test"))
+        test, scenario = dataset.reduced(given, config.image_size), config.collection.scenario
+        train_pairs = dataset.reduced(data.pairs(data.members("train")), config.image_size)
+        judge = stages.judge_of(scenario, train_pairs)
+        scores = {name: judge(row, test) for name, row in evaluation.baselines(scenario, train_pairs, test).items()}
+        points, titles = [], []
+        for share, steps in runs:
+            folder = args.workdir / "scaling" / f"{share:.4f}-{steps}"
+            trajectories, minutes = train(config, data, folder, share, steps)
+            predictor, blank = sts.Predictor.load(folder), training.load_blank(folder)[0] / 255
+            for subset in SUBSETS:
+                found = stages.predict(scenario, predictor, subset, given, given, blank, num_samples=config.num_samples)
+                title = f"{' and '.join(subset)}, {trajectories} trajectories, {steps} steps"
+                say(title)
+                scores[title] = judge(found, test)
+                titles.append(title)
+                points.append((" and ".join(subset), trajectories, round(minutes, 1)))
+    summary = evaluation.summarise(scores, test)["predictors"]
+    skills = [summary[title]["visual_skill"] for title in titles]
+    scaling(
+        args.out,
+        [
+            Trained(*point, *(skill[key] for key in ("value", "low", "high")))
+            for point, skill in zip(points, skills, strict=True)
+        ],
+        title=f"{args.workdir.name}: visual skill of the state-space model",
+    )
+    lines = [
+        f"| {title} | {point[2]} | {skill['value']:.3f} [{skill['low']:.3f}, {skill['high']:.3f}] |"
+        for title, point, skill in zip(titles, points, skills, strict=True)
+    ]
+    return "\n".join(["| model | minutes | visual skill |", "|---|---|---|", *lines])
+
+
+if __name__ == "__main__":
+    print(main(tyro.cli(Args, description=__doc__)))
