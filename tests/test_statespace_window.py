@@ -1,10 +1,13 @@
 """Windows and interpolation: against drawn rectangles, SciPy and turned pictures."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import ndimage
 
+import sts_jax as sts
+from sts_jax import objects, physics
 from sts_jax.statespace import window
 
 SIZE = 64
@@ -90,3 +93,20 @@ def test_samples_are_those_of_scipy_and_zero_outside():
             np.testing.assert_allclose(own[:, channel], expected, atol=1e-5)
     outside = ((places <= -1) | (places >= 8)).any(-1)
     np.testing.assert_array_equal(np.asarray(found)[outside], 0)
+
+
+@pytest.mark.parametrize("category", ["camera", "scissors"])
+def test_an_image_shows_the_object_and_not_its_shadow(category):
+    """Against the renderer's own mask, of an object at rest."""
+    sensor, body = sts.Sensor(), objects.make(jax.random.key(0), category)
+    pose, wrench = physics.place(body, sensor)
+    resting = sts.sense(sensor, body, pose, wrench, resolution=(SIZE, SIZE))
+    away = sts.sense(sensor, body, pose.at[2].add(1e3), resolution=(SIZE, SIZE))
+    shown = np.asarray(window.shows((resting.visual - away.visual)[None]))[0] > 0
+    mask = np.asarray(resting.segmentation) > 0
+    assert mask.mean() > 0.01
+    assert (mask & ~shown).sum() < 0.05 * mask.sum()
+    faintly = np.abs(resting.visual - away.visual).max(-1) > 4 / 255
+    shadow = (faintly & ~mask).sum()
+    assert shadow > 0.5 * mask.sum()  # a smaller threshold would count it
+    assert (shown & ~mask).sum() < 0.4 * shadow
