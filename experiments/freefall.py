@@ -1,7 +1,7 @@
 """Objects dropped on the pad: from the first moment, still in the air, to what the sensor sees at rest.
 
     python -m experiments.freefall                    # about 15 minutes on two CPU cores
-    python -m experiments.freefall --preset long      # at most 150 minutes; can be stopped and started again
+    python -m experiments.freefall --preset long      # about 75 minutes; can be stopped and started again
     python -m experiments.freefall --model paper      # the paper's four models instead of the state-space model
     python -m experiments.freefall --preset smoke     # about two minutes, for tests
     python -m experiments.freefall --preset paper     # the paper's counts and schedule: hours; a GPU helps
@@ -38,7 +38,7 @@ DEFAULT = stages.Config(
 LONG = dataclasses.replace(
     DEFAULT,
     collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=40000),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=20000),
 )
 SMOKE = stages.smoke(DEFAULT)
 PAPER = stages.paper(COLLECTION, num_objects=340, num_per_object=5)  # 1,700 trajectories
