@@ -67,7 +67,7 @@ def main(name: str, times: int, workdir: Path | None) -> None:
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
         scores[title] = judge(row, test)
     summary = evaluation.summarise(scores, test)
-    print(evaluation.table(summary, title=f"{name}: what can be predicted"))
+    print(evaluation.table(summary, title=f"{name}: the best possible predictions"))
     print(evaluation.full_table(summary, title=f"{name}: every figure"))
     print("\n".join(spread(test.pose[:, 0], made.pose, made.outcome)))
 
@@ -76,7 +76,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", choices=CONFIGS, default="freefall")
     parser.add_argument("--times", type=int, default=16, help="how often each start is rolled, at least 2 (16)")
-    parser.add_argument("--workdir", type=Path, help="of a run with --preset default; otherwise collects anew")
+    parser.add_argument("--workdir", type=Path, help="of a run with --preset default (default: collect anew)")
     arguments = parser.parse_args()
     if arguments.times < 2:
         parser.error(f"--times must be at least 2, got {arguments.times}: ends of one start are compared")

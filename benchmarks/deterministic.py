@@ -1,4 +1,4 @@
-"""A plain network that predicts one end, as a baseline: what does the state-space model gain at equal cost?
+"""A plain network that predicts one end, as a baseline for the state-space model at equal cost.
 
     python -m benchmarks.deterministic runs/freefall                         # of --preset default
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
@@ -113,7 +113,7 @@ def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, An
 def fit(
     arrays: training.Arrays, network: nnx.GraphDef[Network], params: nnx.State, seconds: float, seed: int
 ) -> tuple[nnx.State, int]:
-    """Train for so many seconds after compilation, with a rate that falls with time as a cosine; the steps it took."""
+    """Train for so many seconds after compilation, with a cosine schedule of time. Returns also the number of steps."""
     optimiser = optax.chain(optax.clip_by_global_norm(3e3), optax.scale_by_adam(b2=0.99))
 
     @functools.partial(jax.jit, donate_argnums=(0, 1))
@@ -137,7 +137,7 @@ def fit(
 def predict(
     graphdef: nnx.GraphDef[Network], params: nnx.State, job: stages.Job, arrays: training.Arrays
 ) -> evaluation.Predicted:
-    """The network's end of every item; the outcome is that with the largest probability."""
+    """The predicted end of every item."""
 
     @jax.jit
     def run(batch: dict[str, Any]) -> tuple[Array, ...]:

@@ -26,11 +26,11 @@ NUMBER = 10
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Whose predictions are drawn, from what."""
+    """The run, the inputs and the trajectories whose predictions are drawn."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment with its models trained
     out: Path = Path("recognise.png")
-    given: tuple[str, ...] = ()  # modalities that are given; if not given: all of the model's
+    given: tuple[str, ...] = ()  # modalities (default: all of the model's)
     first: int = 0  # place of the first trajectory in the held-out list
     seed: int = 0  # of the samples and of the order
 

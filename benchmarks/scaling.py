@@ -1,9 +1,9 @@
 """How the state-space model's skill grows with the number of training trajectories and with training time.
 
-    python -m benchmarks.scaling runs/freefall --out scaling.png          # of --preset default; half an hour
+    python -m benchmarks.scaling runs/freefall --out scaling.png          # of --preset default, half an hour
 
 Takes the dataset of a run, and trains a model for each pair of a number of training objects and a number of gradient
-steps, in `RUN/scaling/`; a model that is there is not trained again. Prints visual skill on the held-out objects with
+steps, in `RUN/scaling/`. A model that is there is not trained again. Prints visual skill on the held-out objects with
 95 % intervals, and draws it.
 """
 
@@ -44,7 +44,7 @@ def some(part: Part, objects: np.ndarray) -> Part:
 
 
 def train(config: stages.Config, data: dataset.Dataset, folder: Path, share: float, steps: int) -> tuple[int, float]:
-    """Train a model on a share of the objects for so many steps; the number of trajectories, and minutes."""
+    """Train a model on a share of the objects for so many steps. Returns the number of trajectories and minutes."""
     pairs, views = data.pairs(data.members("train")), data.views("train")
     falls = data.ends(data.members("train", rendered=False))
     objects = np.unique(falls.object)
@@ -60,7 +60,7 @@ def train(config: stages.Config, data: dataset.Dataset, folder: Path, share: flo
 
 
 def main(args: Args) -> str:
-    """Train and judge every model; a line for each model and subset of inputs."""
+    """Train and judge every model, and return a table with a line for each model and subset of inputs."""
     sts.enable_compilation_cache()
     config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
     with _files.lock(args.workdir):

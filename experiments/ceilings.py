@@ -14,7 +14,7 @@ from sts_jax import _files, dataset, evaluation
 from sts_jax.dataset.records import read_arrays
 
 SEED = 20  # of the re-rolls
-FORMAT = 2  # of what is kept; 2: outcomes are decided by the ratio of probability to frequency
+FORMAT = 2  # of the files (2: outcomes are decided by the ratio of probability to frequency)
 
 
 class Ceilings(NamedTuple):
@@ -39,7 +39,7 @@ def ceilings(
 ) -> Ceilings:
     """The ceilings of the first `num` held-out items: read, or computed and written to `ceiling{suffix}.npz`.
 
-    `ceiling{suffix}.json` records the checksums of what they were made of.
+    `ceiling{suffix}.json` records the checksums of their inputs.
 
     Args:
         workdir: The work directory.

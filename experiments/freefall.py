@@ -1,11 +1,11 @@
-"""Objects dropped on the pad: from the first moment, still in the air, to what the sensor sees at rest.
+"""Objects dropped on the pad: from the first moment, still in the air, to the images and the pose at rest.
 
     python -m experiments.freefall                    # about 15 minutes on two CPU cores
-    python -m experiments.freefall --preset long      # about 75 minutes; can be stopped and started again
+    python -m experiments.freefall --preset long      # about 75 minutes, can be stopped and started again
     python -m experiments.freefall --model paper      # the paper's four models instead of the state-space model
     python -m experiments.freefall --preset smoke     # about two minutes, for tests
-    python -m experiments.freefall --preset paper     # the paper's counts and schedule: hours; a GPU helps
-    python -m experiments.freefall --plan             # seconds per stage, measured on a little of each; then stops
+    python -m experiments.freefall --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.freefall --plan             # seconds per stage, measured on a little of each
 
 Leaves `runs/freefall/`: config.json, dataset/, models/NAME/, metrics.json, table.md, figures/*.png. Started again on
 the same --workdir it goes on where it stopped, and touches nothing where all is done.

@@ -1,11 +1,11 @@
-"""Objects laid on the tilted pad, or let go just above: from the first moment to what the sensor sees at rest.
+"""Objects laid on the tilted pad, or let go just above: from the first moment to the images and the pose at rest.
 
     python -m experiments.inclined                    # 15 to 20 minutes on two CPU cores
-    python -m experiments.inclined --preset long      # at most 150 minutes; can be stopped and started again
+    python -m experiments.inclined --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
-    python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours; a GPU helps
-    python -m experiments.inclined --plan             # seconds per stage, measured on a little of each; then stops
+    python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.inclined --plan             # seconds per stage, measured on a little of each
 
 Leaves `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md, figures/*.png. Started again on
 the same --workdir it goes on where it stopped, and touches nothing where all is done.

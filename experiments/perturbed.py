@@ -1,11 +1,11 @@
-"""A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to what the sensor sees at rest.
+"""A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to the images and the pose at rest.
 
     python -m experiments.perturbed                    # 15 to 20 minutes on two CPU cores
-    python -m experiments.perturbed --preset long      # at most 150 minutes; can be stopped and started again
+    python -m experiments.perturbed --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
-    python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours; a GPU helps
-    python -m experiments.perturbed --plan             # seconds per stage, measured on a little of each; then stops
+    python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours, a GPU helps
+    python -m experiments.perturbed --plan             # seconds per stage, measured on a little of each
 
 Leaves `runs/perturbed/`: config.json, dataset/, models/NAME/, metrics.json, table.md, figures/*.png. Started again on
 the same --workdir it goes on where it stopped, and touches nothing where all is done.

@@ -18,7 +18,7 @@ def plan(config: stages.Config, *, num: int = 64, steps: int = 4) -> str:
 
     Args:
         config: The experiment.
-        num: Trajectories to simulate; each has its first and last frame rendered in all symmetries.
+        num: Trajectories to simulate. Each has its first and last frame rendered in all symmetries.
         steps: Gradient steps of each model.
 
     Returns:

@@ -1,4 +1,4 @@
-"""A record of what results were made of: while its checksums hold, the results are up to date."""
+"""Checksums of the inputs of results: while they hold, the results are up to date."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,10 +14,10 @@ def identity(folder: Path) -> str:
 
 
 def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], outputs: Sequence[Path]) -> None:
-    """Write results as JSON, with the checksums of what they were made of and of the files made with them.
+    """Write results as JSON, with the checksums of their inputs and of the files made with them.
 
     Args:
-        path: The JSON file; written last, it marks the results as complete.
+        path: The JSON file. It is written last and marks the results as complete.
         content: The results.
         inputs: A checksum for each input, by a name that a user understands.
         outputs: The other files, all below the folder of `path`.

@@ -31,7 +31,7 @@ class Args:
     """Which model is shipped."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment
-    name: str | None = None  # of the model; if not given: that of the work directory
+    name: str | None = None  # of the model (default: the name of the work directory)
 
 
 def ship(workdir: Path, name: str) -> str:
@@ -42,7 +42,7 @@ def ship(workdir: Path, name: str) -> str:
         OSError: a file of the model is damaged or missing, or the library is not writable.
     """
     if not name.isidentifier():
-        raise ValueError(f"name is {name!r}; it takes letters, digits and underscores: give --name freefall")
+        raise ValueError(f"name is {name!r}, but it takes only letters, digits and underscores: give --name freefall")
     original = sts.Predictor.load(workdir / "models" / "statespace")
     MODELS.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=MODELS, prefix=".") as temporary:

@@ -1,4 +1,4 @@
-"""The stages that experiments share: collect, train, evaluate; each goes on where it stopped, with a progress bar."""
+"""The stages that experiments share: collect, train, evaluate. Each resumes and shows its progress."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ from experiments.progress import Bar, say
 from sts_jax import _files, dataset, evaluation, mvae, statespace, training
 from sts_jax.training import TrainConfig
 
-# The models of an experiment by the modalities they have, the main one first; the paper's are the rows of its Table 1.
+# The models of an experiment by the modalities they have, the main one first. The paper's are the rows of its Table 1.
 MODELS: dict[str, dict[str, tuple[str, ...]]] = {
     "statespace": {"statespace": ("visual", "tactile", "pose")},
     "paper": {
@@ -44,29 +44,29 @@ CHUNK = 64  # items predicted by one call
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One experiment: what is collected, how it is learnt, how it is judged."""
+    """One experiment: its dataset, its models, and how they are trained and evaluated."""
 
     collection: dataset.Collection
     training: TrainConfig  # of the paper's models
     state_training: TrainConfig  # of the state-space model
     model: Literal["statespace", "paper"] = "statespace"  # which of MODELS are trained
-    steps: tuple[int, ...] | None = None  # gradient steps of each of the paper's models; None: training.epochs decide
+    steps: tuple[int, ...] | None = None  # gradient steps of each of the paper's models (None: training.epochs decide)
     targets: Literal["all", "own"] = (
         "all"  # a subset of modalities is asked for "all" targets, or for its "own" (paper)
     )
     rotation: Literal["matrix", "quaternion"] = "matrix"  # as the networks see it
-    mask_blank_touch: bool = True  # a touch without contact is no input; False: the blank image is fed (paper)
+    mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is, as in the paper)
     # Held out: whole "object"s (70/10/20), or a fifth of the shuffled "trajectory"s, which shows each object on both
     # sides (paper). With several, each has its own models and table.
     splits: tuple[str, ...] = ("object",)
     num_shown: int = 8  # held-out trajectories in the figures
     image_size: int = 64  # pixels, side of the images that are predicted and judged
-    num_samples: int = 16  # of each prediction of the state-space model; the paper's are judged by their mean
+    num_samples: int = 16  # of each prediction of the state-space model (the paper's are judged by their mean)
     rerolls: int = 16  # of each start, for the ceilings
     num_rerolled: int = 256  # held-out starts, the first ones, that the ceilings are computed on
 
 
-# The same for all scenarios; `steps` is the preset's.
+# The same for all scenarios. The presets set `steps`.
 STATE_TRAINING = TrainConfig(
     batch_size=32,
     learning_rate=1.5e-3,
@@ -153,7 +153,7 @@ def claim(config: Config, workdir: Path) -> None:
 
 
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
-    """Make what is missing of the dataset and open it."""
+    """Make the missing shards of the dataset and open it."""
     with Bar() as bar:
         made = dataset.collect(
             config.collection,
@@ -362,7 +362,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
     notes = [
         "Gradient steps: "
         + ", ".join(f"{name} {count}" for name, count in steps.items())
-        + f"; batch {_schedule(config).batch_size}.",
+        + f", batch {_schedule(config).batch_size}.",
         f"Ceiling: {config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
         "values, and a model from touch can exceed it.",
     ]
@@ -387,7 +387,7 @@ def main_model(config: Config) -> str:
 
 
 def number_of_samples(config: Config) -> int:
-    """Samples of each prediction; 0 judges deterministic predictions."""
+    """Samples of each prediction, or 0 for deterministic predictions."""
     return config.num_samples if config.model == "statespace" else 0
 
 
@@ -493,14 +493,14 @@ def predict(
 ) -> evaluation.Predicted:
     """The prediction of a model for the held-out trajectories.
 
-    The outcome is that of the pose; with samples, its probabilities are the shares of the samples' outcomes, unless the
+    The outcome is that of the pose. With samples, its probabilities are the shares of the samples' outcomes, unless the
     model predicts them itself. The
     outcome of a model without a pose is read from whether its image is empty, in scenarios that only ask whether the
-    object fell off; in other scenarios it has none.
+    object fell off. In other scenarios it has none.
     """
 
     def run(pairs: dataset.Pairs, num_samples: int) -> evaluation.Predicted:
-        """Predict in calls of equal size, which bounds the memory; the last call repeats an item to be as long."""
+        """Predict in calls of equal size, which bounds the memory. The last call repeats an item to be as long."""
         count = len(pairs.object)
         size, parts = min(count, CHUNK), []
         for number, start in enumerate(range(0, count, size)):
@@ -529,7 +529,7 @@ def _asked(
     num_samples: int,
     seed: int,
 ) -> evaluation.Predicted:
-    """The prediction for some items, from the modalities `names`; images of samples in `uint8`."""
+    """The prediction for some items, from the modalities `names`, with images of samples in `uint8`."""
     condition = pairs.condition[rows] if pairs.condition.shape[1] else None
     if names:
         out = predictor(
@@ -566,4 +566,4 @@ def _read_log(folder: Path) -> list[dict[str, float]]:
     except FileNotFoundError:
         return []
     except ValueError as error:  # invalid UTF-8 or no JSON
-        raise dataset.TornFileError(f"{path} is damaged ({error}); delete {folder} and train again.") from error
+        raise dataset.TornFileError(f"{path} is damaged ({error}): delete {folder} and train again.") from error

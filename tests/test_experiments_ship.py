@@ -78,7 +78,7 @@ def test_an_earlier_model_stays_where_the_new_one_is_refused(models, workdir, mo
 
 @pytest.mark.parametrize("name", ["", "..", "runs/falls", "free fall"])
 def test_a_name_that_is_no_word_is_refused(models, workdir, name):
-    with pytest.raises(ValueError, match="it takes letters, digits and underscores"):
+    with pytest.raises(ValueError, match="it takes only letters, digits and underscores"):
         ship.ship(workdir, name)
 
 

@@ -50,7 +50,7 @@ def values(
 
     Args:
         coefficients: c functions of each of n objects.
-        rotation: of each object; a mean of rotations, which is shorter than one, gives about the mean of the values.
+        rotation: of each object. A mean of rotations, which is shorter than one, gives about the mean of the values.
         directions: unit vectors.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1

@@ -40,7 +40,7 @@ class Config:
 
     inputs: tuple[str, ...] = ("visual", "pose")  # some of INPUTS
     outcomes: int = 2  # of the scenario
-    condition: int = 0  # numbers in the scenario's condition; the first two are a vector of the pad's plane
+    condition: int = 0  # numbers in the scenario's condition, of which the first two are a vector of the pad's plane
     input_size: int = 128  # pixels, side of the images that are given
     image_size: int = 64  # pixels, side of the images that are predicted
     camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
@@ -67,24 +67,24 @@ class Config:
     covered_weight: float = 0.15  # of the nats of the object's outline
     first_weight: float = 0.5  # of the nats of the first moment's images
     look_weight: float = 0.3  # of the look's divergence: below 1, samples are sharper
-    drawn: float = 0.4375  # share of a batch whose last moment is drawn; every sample trains the rest
+    drawn: float = 0.4375  # share of a batch whose last moment is drawn (all train the other parts)
     drawn_first: float = 0.125  # share whose first moment is drawn
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
-            raise ValueError(f"inputs is {self.inputs}; it takes at least one of {INPUTS}, in this order")
+            raise ValueError(f"inputs is {self.inputs}, but it must be at least one of {INPUTS}, in this order")
         if not set(self.inputs) & set(IMAGES):
-            raise ValueError(f"inputs is {self.inputs}; the look needs an image: add 'visual' or 'tactile'")
+            raise ValueError(f"inputs is {self.inputs}, but the look needs an image: add 'visual' or 'tactile'")
         for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
             if getattr(self, name) % part or getattr(self, name) < part:
-                raise ValueError(f"{name} is {getattr(self, name)} pixels; it takes a multiple of {part}")
+                raise ValueError(f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}")
         if len(self.encoder) != 3 or len(self.decoder) != 3:
-            raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths; give 3 and 3")
+            raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths, both need 3")
         if self.condition < 0 or self.condition == 1:
-            raise ValueError(f"condition is {self.condition} numbers; give 0, or at least the 2 of a vector")
+            raise ValueError(f"condition is {self.condition} numbers, but it must be 0, or at least the 2 of a vector")
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it takes a share of a batch, above 0 and at most 1")
+                raise ValueError(f"{name} is {getattr(self, name)}, but a share must be above 0 and at most 1")
 
     @property
     def look(self) -> int:
@@ -256,7 +256,7 @@ class Transition(nnx.Module):
 
         Args:
             belief: over state code and look, `(n, code + look)`.
-            condition: each number divided by its usual size; None where the model has none.
+            condition: each number divided by its usual size, or None if the model has none.
 
         Returns:
             The density in the frame of the heading of the belief's mean.
@@ -410,7 +410,7 @@ class Model(nnx.Module):
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
-    """A new model as `(graphdef, params, stats)`; consumes `key`. It has no running statistics: `stats` is empty."""
+    """A new model as `(graphdef, params, stats)`. Consumes `key`. There are no running statistics: `stats` is empty."""
 
     @jax.jit
     def draw(key: PRNGKeyArray) -> nnx.State:

@@ -2,14 +2,14 @@
 
 For a batch of first moments with their last moments, it is the sum of
 
-- the squared error of each image's expert at the true first state, and the nats of its variance;
+- the squared error of each image's expert at the true first state, and the nats of its variance
 - the nats of the transition at the true outcome, the true final pose and the rotation to it, for the belief of every
-  non-empty subset of the inputs;
+  non-empty subset of the inputs
 - the excess cross-entropy of the last moment, drawn in the true final pose with a sample of the look, and that of the
   first moment, drawn in the true first pose. It is that of the colours of the pixels that show the object and that of
-  the tactile image;
-- the cross-entropy of the probability that a pixel shows the object, in these pictures;
-- beta times the divergence of the look from its prior, in nats.
+  the tactile image
+- the cross-entropy of the probability that a pixel shows the object, in these pictures
+- beta times the divergence of the look from its prior, in nats
 
 A moment is drawn in its true pose, so that the decoder never averages over places. The subset whose belief gives the
 look is drawn for each sample, among those with an image.
@@ -154,11 +154,11 @@ def loss(
         params: its parameters.
         key: consumed.
         inputs: as of `experts`: all that the model takes.
-        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], of the size that is predicted; the state code
-            `state` `(n, code)` of the first moment; the pose code `pose` `(n, 12)` of the last; `outcome` `(n,)`, an
-            index into the scenario's.
+        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], of the size that is predicted, the state code
+            `state` `(n, code)` of the first moment, the pose code `pose` `(n, 12)` of the last, and `outcome` `(n,)`,
+            an index into the scenario's.
         empty: as of `experts`.
-        present: which inputs count, by name; all where not given. Each sample needs one. The values of those that do
+        present: which inputs count, by name (default: all). Each sample needs one. The values of those that do
             not count, NaN among them, have no influence.
         condition: as of `Transition`.
         views: further first moments without an end: `visual` `(m, size, size, 3)` and `state` `(m, code)`.

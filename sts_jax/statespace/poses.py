@@ -23,7 +23,7 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     rest on one of its faces has one of these level, so that the choice is stable there. No gradient flows through it.
 
     Args:
-        code: pose codes; the nine numbers need not be an exact rotation.
+        code: pose codes, whose nine numbers need not be an exact rotation.
     """
     columns = jax.lax.stop_gradient(code[..., 3:].reshape(*code.shape[:-1], 3, 3)[..., :2, :])
     lengths = jnp.linalg.norm(columns, axis=-2)

@@ -46,7 +46,7 @@ def sample(
         empty: as of `objective.experts`.
         condition: as of `Transition`.
         num: how many final poses.
-        drawn: for how many of them both images are drawn, each with its own look; at most `num`.
+        drawn: for how many of them both images are drawn, each with its own look (at most `num`).
     """
     model = nnx.merge(graphdef, params)
     belief = fuse(experts(model, inputs, present, empty), present)

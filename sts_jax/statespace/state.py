@@ -2,12 +2,12 @@
 
 A state code has these parts, in this order:
 
-- `pose`: the pose code, see `statespace.poses`;
-- `own`: the support function of the object's hull about the mesh origin, as harmonics in the object's frame;
-- `com`: the centre of mass in the object's frame;
-- `mass`: the logarithm of the mass;
-- `shown`: the support function in the sensor's frame, as the object is turned at present;
-- `low`: the centre of mass from the mesh origin, in the sensor's frame.
+- `pose`: the pose code, see `statespace.poses`
+- `own`: the support function of the object's hull about the mesh origin, as harmonics in the object's frame
+- `com`: the centre of mass in the object's frame
+- `mass`: the logarithm of the mass
+- `shown`: the support function in the sensor's frame, as the object is turned at present
+- `low`: the centre of mass from the mesh origin, in the sensor's frame
 
 The last two follow from the others. An image shows them directly, however uncertain the rotation is.
 """

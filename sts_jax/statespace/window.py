@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from sts_jax.statespace import poses
 
-THRESHOLD = 12 / 255  # a pixel shows the object where a channel differs by more than this; its shadow differs by less
+THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (a shadow differs by less)
 MARGIN = 1.1  # side of the window over the larger extent of the silhouette
 SMALLEST = 0.08  # side of the smallest window, of the image's
 
@@ -30,7 +30,7 @@ def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """The window around everything that an image shows; the whole image where it shows nothing.
+    """The window around everything that an image shows, or the whole image if it shows nothing.
 
     Args:
         change: square images less that of the empty sensor.
@@ -64,7 +64,7 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """The windows at another resolution, each pixel the mean of four interpolated values; zero outside of the image.
+    """The windows at another resolution, each pixel the mean of four interpolated values, zero outside of the image.
 
     Args:
         images: square ones.
@@ -80,7 +80,7 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Bilinear interpolation at some columns and rows, whole numbers at pixel centres; zero outside of the image."""
+    """Bilinear interpolation at some columns and rows, whole numbers at pixel centres. Zero outside of the image."""
     side, channels = images.shape[1], images.shape[-1]
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     # The four neighbours of a place lie side by side, and one lookup finds them.
