@@ -1,13 +1,15 @@
 """How the state-space model's skill grows with the number of training trajectories and with training time.
 
-    python -m benchmarks.scaling runs/freefall --out scaling.png          # of --preset default, half an hour
+    python -m benchmarks.scaling runs/freefall --out scaling.png               # of --preset default, half an hour
+    python -m benchmarks.scaling runs/freefall --shares 1 --steps 3300 --seeds 1 2   # how far two more seeds differ
 
 Takes the dataset of a run, and trains a model for each pair of a number of training objects and a number of gradient
-steps, in `RUN/scaling/`. A model that is there is not trained again. Prints visual skill on the held-out objects with
-95 % intervals, and draws it.
+steps, in `RUN/scaling/`. A model that is there is not trained again. Prints the errors on the held-out objects, and
+draws the visual skill with 95 % intervals.
 """
 
 import dataclasses
+import itertools
 import time
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -35,6 +37,7 @@ class Args:
     preset: Literal["smoke", "default", "long"] = "default"
     shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)  # of the training objects, each with the most steps
     steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps, each with all training objects
+    seeds: tuple[int, ...] = (0,)  # of the networks and of the order of the batches
     out: Path = Path("scaling.png")
 
 
@@ -43,7 +46,9 @@ def some(part: Part, objects: np.ndarray) -> Part:
     return type(part)(*(leaf[np.isin(part.object, objects)] for leaf in part))
 
 
-def train(config: stages.Config, data: dataset.Dataset, folder: Path, share: float, steps: int) -> tuple[int, float]:
+def train(
+    config: stages.Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
+) -> tuple[int, float]:
     """Train a model on a share of the objects for so many steps. Returns the number of trajectories and minutes."""
     pairs, views = data.pairs(data.members("train")), data.views("train")
     falls = data.ends(data.members("train", rendered=False))
@@ -51,7 +56,8 @@ def train(config: stages.Config, data: dataset.Dataset, folder: Path, share: flo
     kept = objects[: max(round(share * len(objects)), 1)]
     pairs, views, falls = some(pairs, kept), some(views, kept), some(falls, kept)
     job = next(stages.jobs(config, sts.Sensor(), pairs, views, falls))
-    schedule = dataclasses.replace(job.schedule, steps=steps, warmup=min(job.schedule.warmup, steps // 4))
+    warmup = min(job.schedule.warmup, steps // 4)
+    schedule = dataclasses.replace(job.schedule, steps=steps, warmup=warmup, seed=seed)
     note, stamps = folder / "seconds.json", []
     if not note.exists():
         stages.run(job._replace(schedule=schedule), folder, config.targets, lambda *_: stamps.append(time.monotonic()))
@@ -60,45 +66,39 @@ def train(config: stages.Config, data: dataset.Dataset, folder: Path, share: flo
 
 
 def main(args: Args) -> str:
-    """Train and judge every model, and return a table with a line for each model and subset of inputs."""
+    """Train and judge every model, and return a table with a row for each model and subset of inputs."""
     sts.enable_compilation_cache()
     config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
     with _files.lock(args.workdir):
         stages.claim(config, args.workdir)
         data = stages.collect(config, args.workdir, sts.Sensor())
-        runs = dict.fromkeys([(share, max(args.steps)) for share in args.shares] + [(1.0, n) for n in args.steps])
+        sizes = dict.fromkeys([(share, max(args.steps)) for share in args.shares] + [(1.0, n) for n in args.steps])
         given = data.pairs(data.members("test"))
         test, scenario = dataset.reduced(given, config.image_size), config.collection.scenario
         train_pairs = dataset.reduced(data.pairs(data.members("train")), config.image_size)
         judge = stages.judge_of(scenario, train_pairs)
         scores = {name: judge(row, test) for name, row in evaluation.baselines(scenario, train_pairs, test).items()}
-        points, titles = [], []
-        for share, steps in runs:
-            folder = args.workdir / "scaling" / f"{share:.4f}-{steps}"
-            trajectories, minutes = train(config, data, folder, share, steps)
+        points = {}
+        for (share, steps), seed in itertools.product(sizes, args.seeds):
+            folder = args.workdir / "scaling" / f"{share:.4f}-{steps}-{seed}"
+            trajectories, minutes = train(config, data, folder, share, steps, seed)
             predictor, blank = sts.Predictor.load(folder), training.load_blank(folder)[0] / 255
             for subset in SUBSETS:
-                found = stages.predict(scenario, predictor, subset, given, given, blank, num_samples=config.num_samples)
-                title = f"{' and '.join(subset)}, {trajectories} trajectories, {steps} steps"
+                title = f"{' and '.join(subset)}: {trajectories} trajectories, {steps} steps, seed {seed}"
                 say(title)
+                found = stages.predict(scenario, predictor, subset, given, given, blank, num_samples=config.num_samples)
                 scores[title] = judge(found, test)
-                titles.append(title)
-                points.append((" and ".join(subset), trajectories, round(minutes, 1)))
-    summary = evaluation.summarise(scores, test)["predictors"]
-    skills = [summary[title]["visual_skill"] for title in titles]
-    scaling(
-        args.out,
-        [
-            Trained(*point, *(skill[key] for key in ("value", "low", "high")))
-            for point, skill in zip(points, skills, strict=True)
-        ],
-        title=f"{args.workdir.name}: visual skill of the state-space model",
-    )
-    lines = [
-        f"| {title} | {point[2]} | {skill['value']:.3f} [{skill['low']:.3f}, {skill['high']:.3f}] |"
-        for title, point, skill in zip(titles, points, skills, strict=True)
+                points[title] = (" and ".join(subset), trajectories, round(minutes, 1))
+    summary = evaluation.summarise(scores, test)
+    skills = {title: summary["predictors"][title]["visual_skill"] for title in points}
+    trained = [
+        Trained(*points[title], skill["value"], skill["low"], skill["high"])
+        for title, skill in skills.items()
+        if title.endswith(f"seed {args.seeds[0]}")
     ]
-    return "\n".join(["| model | minutes | visual skill |", "|---|---|---|", *lines])
+    scaling(args.out, trained, title=f"{args.workdir.name}: visual skill of the state-space model")
+    notes = [f"{title}: {point[2]} minutes of training" for title, point in points.items()]
+    return evaluation.table(summary, title=f"{args.workdir.name}: scaling", rows=list(points), notes=notes)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
+import types
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import sts_jax as sts
-from benchmarks import recognise
+from benchmarks import deterministic, recognise, scaling
 from experiments import perturbed, show, stages
 from sts_jax import dataset, physics
 
@@ -129,3 +130,31 @@ def test_pictures_to_be_recognised_come_with_their_answers(workdir, tmp_path, mo
     assert Image.open(tmp_path / "0.png").size[0] > 100
     with pytest.raises(ValueError, match="first is 100: fewer than 2"):
         recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))
+
+
+@pytest.fixture
+def tiny_preset(monkeypatch):
+    """The run of this file as a preset that benchmarks know."""
+    monkeypatch.setitem(deterministic.EXPERIMENTS, "perturbed", types.SimpleNamespace(PRESETS={"smoke": TINY}))
+
+
+@pytest.mark.usefixtures("tiny_preset")
+def test_a_scaling_curve_is_made_of_models_that_are_kept(workdir, tmp_path):
+    args = scaling.Args(workdir, "perturbed", "smoke", shares=(0.5,), steps=(4,), seeds=(0, 1), out=tmp_path / "a.png")
+    text = scaling.main(args)
+    rows = [line for line in text.splitlines() if line.startswith(("| visual", "| visual and pose"))]
+    assert len(rows) == 2 * 2 * 2  # sizes, seeds, subsets
+    assert {"4 trajectories, 4 steps", "7 trajectories, 4 steps"} >= {
+        row.split(": ")[1].split(", seed")[0] for row in rows
+    }
+    assert Image.open(tmp_path / "a.png").size[0] > 300
+    stamps = {path: path.stat().st_mtime_ns for path in (workdir / "scaling").rglob("*") if path.is_file()}
+    assert scaling.main(args) == text
+    assert stamps == {path: path.stat().st_mtime_ns for path in (workdir / "scaling").rglob("*") if path.is_file()}
+
+
+@pytest.mark.usefixtures("tiny_preset")
+def test_the_deterministic_network_is_judged_beside_the_baselines(workdir):
+    text = deterministic.main(deterministic.Args(workdir, "perturbed", "smoke", seconds=1.0))
+    for name in (deterministic.TITLE, "nearest neighbour", "rests below its start"):
+        assert f"| {name} |" in text

@@ -1,5 +1,6 @@
 """Pictures of what was predicted, learnt and simulated, each written to one PNG file."""
 
+import collections
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -189,12 +190,13 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
         (axes[0], "trajectories", "minutes", "{:g} min"),
         (axes[1], "minutes", "trajectories", "{:,} trajectories"),
     ):
-        groups = dict.fromkeys((point.name, getattr(point, fixed)) for point in points)
+        groups = collections.Counter((point.name, getattr(point, fixed)) for point in points)
+        sizes = [(name, count) for (name, _), count in groups.items()]
         for group in groups:
             own = [point for point in points if (point.name, getattr(point, fixed)) == group]
             own = sorted(own, key=lambda point: getattr(point, along))
-            if len(own) < 2 and len(groups) > 1:
-                continue
+            if len(own) < 2 and any(count > 1 for name, count in sizes if name == group[0]):
+                continue  # other groups show how this model scales
             skill = np.array([point.skill for point in own])
             spread = [skill - [point.low for point in own], [point.high for point in own] - skill]
             label = f"{group[0]}, {unit.format(group[1])}"
