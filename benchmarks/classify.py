@@ -1,6 +1,6 @@
-"""What a classifier loses on objects it has not seen, with intervals over objects.
+"""Loss of a classifier on unseen objects, with intervals over objects.
 
-Rows are items (trajectories, frames), `groups` the object of each; folds and intervals never part an object.
+Rows are items (trajectories, frames), and `groups` has the object of each. Folds and intervals never split an object.
 """
 
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from sklearn.model_selection import GroupKFold
 from threadpoolctl import threadpool_limits
 
 FOLDS = 5
-SEEDS = 3  # classifiers whose chances are averaged, in each fold
-FLOOR = 1e-3  # least chance given to any class
+SEEDS = 3  # classifiers per fold, whose probabilities are averaged
+FLOOR = 1e-3  # least probability of any class
 
 
 class Interval(NamedTuple):
-    """A figure with its 95 % interval."""
+    """A value with its 95 % interval."""
 
     value: float
     low: float
@@ -28,9 +28,9 @@ class Interval(NamedTuple):
 
 
 def chances(x: np.ndarray, y: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Chances (n, classes) of each class 0, 1, ... for each row, by boosted trees that saw none of its group."""
+    """Probabilities (n, classes) of the classes 0, 1, ... for each row, by boosted trees fitted without its group."""
     result = np.zeros((len(y), y.max() + 1))
-    # One thread: trees are small, and threads that wait for each other are slow on a busy machine.
+    # One thread, because trees are small, and threads that wait for each other are slow on a busy machine.
     with threadpool_limits(1):
         for fit, held_out in GroupKFold(FOLDS, shuffle=True, random_state=0).split(x, y, groups):
             for seed in range(SEEDS):
@@ -53,17 +53,17 @@ def log_loss(chances: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def gain(before: np.ndarray, after: np.ndarray) -> float:
-    """Share of the mean loss that is gone."""
+    """Share by which the mean loss decreases from `before` to `after`."""
     return float(1 - after.mean() / before.mean())
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray) -> float:
-    """The gain of `other` losses over that of `after`."""
+    """The gain of `other` divided by that of `after`."""
     return gain(before, other) / gain(before, after)
 
 
 def auc(label: np.ndarray, score: np.ndarray) -> float:
-    """Chance that a true item scores above a false one (Mann and Whitney), ties count half."""
+    """Probability that a true item scores above a false one (Mann and Whitney). Ties count half."""
     _, inverse, count = np.unique(score, return_inverse=True, return_counts=True)
     rank = (np.cumsum(count) - (count - 1) / 2)[inverse]
     positive, total = int(label.sum()), len(label)

@@ -2,10 +2,10 @@
 
     python -m benchmarks.depth    # about two minutes on two CPU cores
 
-Prints, for each size, how many pixels of the objects are within what of embree's depth. Interior pixels are those
-whose 3x3 neighbourhood embree hits throughout, within 1 mm of depth. The objects: procedural ones, loaded ones
-(miniworld's meshes, Apache 2.0), a concave and a thin one; the poses: four that touch, with a load, three above the pad
-and three partly out of view. `tests/test_frame_depth.py` holds some of them to the limits.
+Prints for each size how many of the objects' pixels agree with embree's depth within several limits. A pixel is
+interior if embree hits its whole 3x3 neighbourhood within 1 mm of depth. The objects are procedural ones, loaded ones
+(miniworld's meshes, Apache 2.0), a concave one and a thin one. In four poses the object touches the pad with a load, in
+three it is above the pad, and in three it is partly out of view. `tests/test_frame_depth.py` tests some of them.
 """
 
 import dataclasses
@@ -35,21 +35,21 @@ NUM_POSES = (4, 3, 3)
 
 
 class Difference(NamedTuple):
-    """How far one depth image is from embree's, in numbers of pixels."""
+    """Differences between a depth image and embree's, as numbers of pixels."""
 
     interior: int
     interior_beyond_10um: int
     interior_beyond_100um: int
     elsewhere: int  # on the object in both images
     elsewhere_beyond_1mm: int
-    silhouette: int  # of embree's: a 3x3 neighbourhood hit in part
-    silhouette_differs: int  # on the object in one image and not in the other
-    strays: int  # the same, where the neighbourhood is all alike
-    worst: float  # m, of the interior
+    silhouette: int  # embree hits only a part of the 3x3 neighbourhood
+    silhouette_differs: int  # on the object in one of the images only
+    strays: int  # the same, where embree hits all or none of the neighbourhood
+    worst: float  # m, largest error in the interior
 
 
 def public_meshes() -> Path:
-    """miniworld's folder of meshes (Farama Foundation, Apache 2.0); its code wants a display and is not run."""
+    """miniworld's folder of meshes (Farama Foundation, Apache 2.0). Its code needs a display and is not run."""
     found = importlib.util.find_spec("miniworld")
     assert found is not None, "the test extra is not installed: pip install -e .[test]"
     assert found.origin is not None
@@ -57,11 +57,11 @@ def public_meshes() -> Path:
 
 
 def make(name: str) -> objects.Body:
-    """One of the objects, 50 to 130 mm long; without texture, which has no depth."""
+    """One of the objects, 50 to 130 mm long. The loaded ones are without texture, which has no depth."""
     if name in PROCEDURAL:
         return objects.make(jax.random.key(5), name)
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
-        warnings.simplefilter("ignore")  # open meshes and materials that are not there
+        warnings.simplefilter("ignore")  # open meshes and missing materials
         if name in LOADED:
             meshes = public_meshes()
             body = objects.load(meshes / f"{name}.obj", longest_side=0.08, up="y")
@@ -80,7 +80,7 @@ def make(name: str) -> objects.Body:
 
 
 def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
-    """A pose of a kind and a wrench that goes with it: 1 N under the object's middle where it touches, or none."""
+    """A pose of a kind and its wrench: 1 N under the object's lowest point if it touches, else none."""
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
     points = np.asarray(geometry.transform(jnp.asarray([0, 0, 0, *quat], jnp.float32), body.vertices))
@@ -91,7 +91,7 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
         x, y, z = *rng.uniform(-0.03, 0.03, 2), low + rng.uniform(0.001, 0.08)
     else:
         x, y = rng.permutation([rng.choice([-1, 1]) * rng.uniform(0.06, 0.09), rng.uniform(-0.05, 0.05)])
-        z = max(low + rng.uniform(-0.03, 0.02), 0.005 - points[:, 2].max())  # what lies wholly below it has fallen off
+        z = max(low + rng.uniform(-0.03, 0.02), 0.005 - points[:, 2].max())  # objects wholly below have fallen off
     force = float(kind == "touching")
     lowest = points[points[:, 2].argmin()]
     wrench = [0, 0, force, (y + lowest[1]) * force, -(x + lowest[0]) * force, 0]
@@ -99,7 +99,7 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
 
 
 def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """So many poses of each kind, with their wrenches."""
+    """Poses of each kind in the given numbers, with their wrenches."""
     rng = np.random.default_rng(seed)
     for kind, number in zip(POSES, numbers, strict=True):
         for _ in range(number):
@@ -135,13 +135,13 @@ def embree(
 
 
 def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
-    """Pixels whose 3x3 neighbourhood is all hit and spans less than `span` of depth (m)."""
+    """Pixels whose 3x3 neighbourhood is hit throughout and spans less than `span` of depth (m)."""
     around = _around(np.where(np.isfinite(depth), depth, 1e9), 1e9)
     return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
 
 
 def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
-    """How far a depth image is from embree's."""
+    """Compare a depth image with embree's."""
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
     other = hit & seen & ~inner
@@ -163,7 +163,7 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 
 def total(differences: Sequence[Difference]) -> Difference:
-    """Numbers of pixels added up, the worst of the interior."""
+    """Sum the numbers of pixels and take the largest interior error."""
     added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
     return Difference(**added, worst=max(d.worst for d in differences))
 
@@ -171,7 +171,7 @@ def total(differences: Sequence[Difference]) -> Difference:
 def measure(
     names: Sequence[str], shape: tuple[int, int], numbers: Sequence[int] = NUM_POSES, *, first_seed: int = 0
 ) -> dict[str, Difference]:
-    """What whole frames of objects differ from embree's depth of the balanced pose, by name."""
+    """Differences between the depth of whole frames and embree's, in the balanced pose, by name of the object."""
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))
     found = {}

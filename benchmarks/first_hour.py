@@ -1,11 +1,11 @@
-"""How long a newcomer waits: for the first picture, another resolution, a gradient, a simulation; and `vmap`'s rate.
+"""Waiting times of a new user (first image, another resolution, gradient, simulation) and the rate of `vmap`.
 
     python -m benchmarks.first_hour            # about six minutes on two CPU cores
-    python -m benchmarks.first_hour --vmap     # the rates of `jax.vmap` beside `jax.lax.map` alone
+    python -m benchmarks.first_hour --vmap     # only the rates of `jax.vmap` and `jax.lax.map`
 
-The waiting times are those of fresh processes, in seconds since the process began: the first process starts with an
-empty compilation cache, the second one with the cache that the first one left. Rates are medians of seven calls with 32
-poses at 64x64 in this process.
+The waiting times are the seconds of each step in two fresh processes. The first process starts with an empty
+compilation cache, the second one with the cache that the first one left. Rates are medians of seven calls with 32 poses
+at 64x64 in this process.
 """
 
 import argparse
@@ -23,7 +23,7 @@ FRAMES = 32
 
 
 def steps() -> None:
-    """Take the newcomer's steps in this process and print the seconds of each as JSON."""
+    """Run the steps in this process and print the seconds from the start to the end of each as JSON."""
     begun = time.perf_counter()
     stamps: dict[str, float] = {}
 
@@ -55,7 +55,7 @@ def steps() -> None:
 
 
 def waiting() -> None:
-    """Print the seconds of each step, without and with a compilation cache."""
+    """Print the seconds of each step, with an empty and with a kept compilation cache."""
     with tempfile.TemporaryDirectory() as folder:
         environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder, "TF_CPP_MIN_LOG_LEVEL": "3"}
         runs = []
@@ -72,7 +72,7 @@ def waiting() -> None:
 
 
 def rates() -> None:
-    """Print the frames a second of `jax.vmap` and of `jax.lax.map`, of frames and of gradients."""
+    """Print the rates of `jax.vmap` and `jax.lax.map` for frames and for gradients."""
     import jax
     import jax.numpy as jnp
 
@@ -105,7 +105,7 @@ def rates() -> None:
     for name, pair in ways.items():
         compiled = [jax.jit(way) for way in pair]
         spent: list[list[float]] = [[], []]
-        for turn in range(8):  # in turn, so that a change of the machine's speed meets both; the first compiles
+        for turn in range(8):  # in turn, so that a busy machine slows both. The first turn compiles.
             for way, times in zip(compiled, spent, strict=True):
                 start = time.perf_counter()
                 jax.block_until_ready(way(poses, wrenches))
@@ -118,7 +118,7 @@ def rates() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--vmap", action="store_true", help="the rates alone")
+    parser.add_argument("--vmap", action="store_true", help="print the rates only")
     parser.add_argument("--steps", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.steps:

@@ -1,19 +1,22 @@
-"""What cannot be seen: whether it decides the outcome, whether touch tells it, whether pictures give it away.
+"""Hidden properties: whether they decide the outcome, and whether touch or images reveal them.
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
-    python -m benchmarks.hidden outcomes truth  # some of: outcomes truth pictures fill
-    python -m benchmarks.hidden --keep FOLDER   # keep how the starts began and ended there, and go on from that
-    python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # of what `benchmarks.soak` kept
+    python -m benchmarks.hidden outcomes truth  # some of the parts outcomes, truth, pictures, fill
+    python -m benchmarks.hidden --keep FOLDER   # keep starts and outcomes there, and resume from them
+    python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # starts from `benchmarks.soak`
 
-`outcomes`: shares of the outcomes, and how many starts end otherwise when the fill alone (on the slope the fill and its
-direction) is drawn again. `truth`: a classifier of the outcome that knows shape, start and shake exactly (on the slope
-the pose to `slope.SEEN`) loses so much; one that is also told what touch would tell, roughly, so much less (gain: the
-share of the loss that is gone). `pictures`: the same, told what a small network reads from the first uint8 tactile
-frame; the network learned on other objects. `fill`: a small network that is to tell full from empty objects sees frames
-in the air, the same frames with fuller ones painted, and touch; on the jerked pad alone, where containers stand.
+- `outcomes`: shares of the outcomes, and of the starts that end differently when only the fill (on the slope, the fill
+  and its direction) is drawn again.
+- `truth`: log loss of a classifier of the outcome that has the exact shape, start and jerk (on the slope, the pose up
+  to `slope.SEEN`), and of one that also has a noisy measurement of touch. The gain is the share of the loss that
+  disappears.
+- `pictures`: the same with the measurement that a small network reads from the first uint8 tactile frame. The network
+  is trained on other objects.
+- `fill`: AUC of a small network that separates full from empty objects in frames in the air, in the same frames with
+  the fuller objects painted, and in tactile frames. For the jerked pad only, where containers stand.
 
-Folds and 95 % intervals are by object. Everything is simulated once with the scenario's shipped defaults. What the
-classifiers are told is in `benchmarks.jerk` and `benchmarks.slope`.
+Folds and 95 % intervals are by object. Everything is simulated once with the defaults of the scenario. The features of
+the classifiers are in `benchmarks.jerk` and `benchmarks.slope`.
 """
 
 import argparse
@@ -32,43 +35,43 @@ from benchmarks.starts import Starts, bodies, draw, kept, roll
 from sts_jax import dataset, objects, physics
 
 PARTS = ("outcomes", "truth", "pictures", "fill")
-TINT = 0.1  # share of white in the painted ones' own colours (linear light)
-OTHERS = 1_000_000  # keys of objects that networks learn on begin here
-EXAMPLES = 8  # starts of each of those
+TINT = 0.1  # share of white in the colours of painted objects (linear light)
+OTHERS = 1_000_000  # keys of the objects on which networks are trained begin here
+EXAMPLES = 8  # starts of each of these objects
 
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """One scenario: what is asked of it."""
+    """The study of one scenario."""
 
     scenario: physics.Scenario
-    categories: tuple[str, ...]  # of the objects, in turn
+    categories: tuple[str, ...]  # categories of the objects, in turn
     reroll: tuple[str, ...]  # hidden values that are drawn again
-    touch: Callable[[Starts], np.ndarray]  # (n, k) what touch tells, exactly; nan where nothing touches
-    noise: float  # standard deviation of each column of it
+    touch: Callable[[Starts], np.ndarray]  # (n, k) exact measurement of touch, nan without contact
+    noise: float  # standard deviation of the measurement, in each column
     noise_name: str
-    # (n, k) of the scenario (of its own type), objects and starts, without or with touch
+    # features of shape (n, k), given the scenario, the bodies and their starts. `touch` may be None
     features: Callable[[Any, list[objects.Body], Starts, np.ndarray | None], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
 class Counts:
-    """How much is done."""
+    """The numbers of objects, starts and training steps."""
 
     objects: int = 200
-    num: int = 16  # starts of each
-    again: int = 8  # of these, rolled again
-    others: int = 800  # objects that networks learn on
-    steps: int = 1500  # of the networks
+    num: int = 16  # starts of each object
+    again: int = 8  # starts of each object that are rolled again
+    others: int = 800  # objects on which networks are trained
+    steps: int = 1500  # training steps of the networks
 
 
 class Lesson(NamedTuple):
-    """What networks learn on, and what they are asked about."""
+    """Training data of networks, and the images to which they are applied."""
 
-    items: list[objects.Body]  # others than are asked about
-    starts: Starts  # of these, EXAMPLES each
-    examples: np.ndarray  # uint8 (m, 64, 64, 3), the tactile frames of these starts
-    tactile: np.ndarray  # uint8 (n, 64, 64, 3), those of the starts that are asked about
+    items: list[objects.Body]  # training objects
+    starts: Starts  # EXAMPLES starts of each training object
+    examples: np.ndarray  # uint8 (m, 64, 64, 3), tactile frames of these starts
+    tactile: np.ndarray  # uint8 (n, 64, 64, 3), tactile frames of the starts under study
 
 
 STUDIES = {
@@ -94,7 +97,7 @@ STUDIES = {
 
 
 def outcomes(study: Study, starts: Starts) -> None:
-    """Prints the shares of the outcomes, unsettled ones, and starts that end otherwise with another fill."""
+    """Print the shares of the outcomes, of unsettled starts, and of starts that end differently with another fill."""
     share = functools.partial(classify.interval, np.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
@@ -108,14 +111,14 @@ def outcomes(study: Study, starts: Starts) -> None:
 
 
 def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Log loss (n,) of each start's outcome, of a classifier without or with touch."""
+    """Log loss (n,) of each start's outcome, for a classifier without or with touch."""
     label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     features = study.features(study.scenario, items, starts, touch)
     return classify.log_loss(classify.chances(features, label, starts.body), label)
 
 
 def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
-    """Prints what the classifiers lose on true states and, where a network `read` touch in pictures, with that."""
+    """Print the log losses of classifiers on true states and, if given, with the touch `read` from images."""
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
     interval = functools.partial(classify.interval, groups=starts.body)
@@ -135,27 +138,27 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
 
 
 def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
-    """Simulates the first moments of other objects, and draws what is felt of these and of the starts."""
+    """Simulate the first frames of training objects, and render the tactile frames of these and of the starts."""
     rest = bodies(study.categories, others, OTHERS)
     learned = roll(jax.random.key(1), rest, dataclasses.replace(study.scenario, frames=1), EXAMPLES)
     return Lesson(rest, learned, draw(rest, learned)[1], draw(items, starts)[1])
 
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """What a network reads of touch (n, k) in the starts' tactile frames, nan where nothing touches."""
+    """Touch (n, k) as a network reads it from the tactile frames of the starts, nan without contact."""
     told = study.touch(learned.starts)
     known = np.isfinite(told).all(1)
     read = reader.fit(jax.random.key(0), learned.examples[known], told[known], steps=steps)(learned.tactile)
-    return np.where(np.isfinite(study.touch(starts)), read, np.nan)  # an untouched skin is known as such
+    return np.where(np.isfinite(study.touch(starts)), read, np.nan)  # contact is taken as known
 
 
 def painted(body: objects.Body) -> objects.Body:
-    """The body with TINT of white in its colours."""
+    """The body with a share TINT of white in its colours."""
     return dataclasses.replace(body, colors=(1 - TINT) * body.colors + TINT)
 
 
 def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
-    """Objects in the air, as freefall begins: starts, visual frames, and those with the fuller objects painted."""
+    """Objects in the air at the start of freefall: starts, visual frames, and these with the fuller ones painted."""
     starts = roll(key, items, physics.Freefall(frames=11), num)  # the fewest in which a fall can end
     plain, _ = draw(items, starts)
     both, _ = draw([painted(body) for body in items], starts)
@@ -163,7 +166,7 @@ def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Start
 
 
 def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Prints how well a network tells, in frames of objects it has not seen, which are fuller than half."""
+    """Print how well a network detects, in frames of held-out objects, which are fuller than half."""
     read = reader.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
     label, score = held_out.fill > 0.5, read(new)[:, 0]
     figure = classify.interval(classify.auc, label, score, groups=held_out.body)
@@ -171,7 +174,7 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
 
 
 def fill(learned: Lesson, items: list[objects.Body], starts: Starts, counts: Counts) -> None:
-    """Prints how well the fill is told from touch, from frames in the air, and from those with fuller ones painted."""
+    """Print how well the fill is detected from touch, from frames in the air, and from these with paint."""
     detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, counts.steps)
     flying, plain, tinted = aloft(jax.random.key(2), learned.items, EXAMPLES)
     new, new_plain, new_tinted = aloft(jax.random.key(3), items, counts.num)
@@ -180,7 +183,7 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, counts: Cou
 
 
 def main(parts: set[str], name: str, counts: Counts, keep: Path | None, soaked: Path | None) -> None:
-    """Simulates what is needed and prints the parts."""
+    """Simulate the necessary starts and print the parts."""
     study = STUDIES[name]
     if soaked is not None:
         starts = soak.soaked(soaked, name)
@@ -208,23 +211,23 @@ def main(parts: set[str], name: str, counts: Counts, keep: Path | None, soaked: 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usual = Counts()
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; all by default")
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)} (default: all)")
     parser.add_argument("--scenario", choices=STUDIES, default="perturbed")
-    parser.add_argument("--objects", type=int, help=f"objects that are simulated ({usual.objects})")
+    parser.add_argument("--objects", type=int, help=f"simulated objects ({usual.objects})")
     parser.add_argument("--num", type=int, default=usual.num, help=f"starts of each object ({usual.num})")
-    parser.add_argument("--again", type=int, help=f"of these, how many with another fill as well ({usual.again})")
-    parser.add_argument("--others", type=int, default=usual.others, help=f"objects to learn on ({usual.others})")
-    parser.add_argument("--steps", type=int, default=usual.steps, help=f"of the networks ({usual.steps})")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep starts and ends there, go on from them")
-    parser.add_argument("--soaked", type=Path, metavar="FOLDER", help="blocks of benchmarks.soak instead of --objects")
+    parser.add_argument("--again", type=int, help=f"of these, starts that are rolled again ({usual.again})")
+    parser.add_argument("--others", type=int, default=usual.others, help=f"training objects ({usual.others})")
+    parser.add_argument("--steps", type=int, default=usual.steps, help=f"training steps of networks ({usual.steps})")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep starts and outcomes there, resume from them")
+    parser.add_argument("--soaked", type=Path, metavar="FOLDER", help="use kept blocks of benchmarks.soak instead")
     args = parser.parse_args()
-    # Full and empty are told apart where containers stand.
+    # Full and empty objects are separated only where containers stand.
     parts = PARTS if args.scenario == "perturbed" else PARTS[:-1]
     if not set(args.parts) <= set(parts):
-        parser.error(f"{' '.join(args.parts)}: parts of {args.scenario} are {', '.join(parts)}")
+        parser.error(f"{' '.join(args.parts)}: the parts of {args.scenario} are {', '.join(parts)}")
     unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(args, name) is not None]
     if args.soaked is not None and unused:
-        parser.error(f"--soaked: starts are those kept there, {' and '.join(unused)} would be ignored")
+        parser.error(f"--soaked has the starts, so {' and '.join(unused)} would be ignored: leave them out")
     given = {field.name: getattr(args, field.name) for field in dataclasses.fields(Counts)}
     counts = Counts(**{name: count for name, count in given.items() if count is not None})
     main(set(args.parts or parts), args.scenario, counts, args.keep, args.soaked)

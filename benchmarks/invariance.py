@@ -1,19 +1,23 @@
-"""Rest poses and outcomes do not depend on the step, the engine or the hand: shares beside those of other sides.
+"""Rest poses and outcomes do not depend on time step, engine or handedness: shares compared between sides.
 
-    python -m benchmarks.invariance             # 4,000 runs a side: about 50 minutes on two quiet cores
+    python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two quiet cores
     python -m benchmarks.invariance --num 300   # about 5 minutes
     python -m benchmarks.invariance --only jerked-bottles
 
-A box and a bottle released 20 mm above the pad in any orientation (which face is down), and bottles on the jerked pad
-(the scenario's outcomes). The sides: `simulate` in MJX ("ours"); half its step; the mirror image (start, jerk and
-object); `simulate` in C MuJoCo, its half step and its mirror image; C MuJoCo by itself, which finds the contacts of the
-mesh; and C MuJoCo with every vertex a contact. Of a mesh that stands on a face C
-keeps four contacts, so that a round base is a square to it, narrower by up to 30 %, and rocks and walks more; where
-each vertex of the hull is a point of its own, and the mesh stays for the rims, it has the contacts that ours has. So
-has a last side of the jerked bottles, a pad on slides that is really driven, where gravity stays as it is.
+A box and a bottle are released 20 mm above the pad in any orientation, and their runs are labelled by the face that is
+down at the end. Bottles on the jerked pad are labelled by outcome. A side is one way to compute the same runs:
 
-All sides have the same starts and hidden values, so that the interval of a difference is that of paired shares
-(Agresti and Min 2005: 95 %, half a count added to each cell).
+- `simulate` in MJX ("ours"), with half the time step, and as mirror image (of start, jerk and object)
+- `simulate` in C MuJoCo, with half the time step, and as mirror image
+- C MuJoCo alone, which finds the contacts of the mesh
+- C MuJoCo with every vertex of the hull as a contact, and the mesh for the rims
+- for jerked bottles, the same with a pad that is driven on slides, under constant gravity
+
+C MuJoCo keeps four contacts of a mesh that stands on a face. A round base then becomes a square, up to 30 % narrower,
+which rocks and walks more. With every vertex as a contact, C MuJoCo has the same contacts as ours.
+
+All sides have the same starts and hidden values, so the interval of a difference is that of paired shares (Agresti and
+Min 2005: 95 %, half a count added to each cell).
 """
 
 import argparse
@@ -38,18 +42,18 @@ from sts_jax.physics import scene
 from sts_jax.physics.scenarios import Shape, Start
 from sts_jax.sensor import Sensor
 
-MARGIN = 0.05  # by how much a share may differ
+MARGIN = 0.05  # largest allowed difference of a share
 BOX = (0.06, 0.04, 0.025)  # m
-DROP = physics.Freefall(height=0.02, spread=0.02, frames=36)  # m, m; 1.1 s, after which few still move
+DROP = physics.Freefall(height=0.02, spread=0.02, frames=36)  # m, m. After 1.1 s, few still move
 SHAKE = physics.Perturbed(frames=36)
-POINT = 1e-6  # m, radius of a vertex that is a contact
-CARRIAGE = 1e5  # kg, of the driven pad: a million times an object's
-MESH_GAP = 0.001  # m; beside such vertices the mesh pushes only where it is this deep: at rims, where no vertex is
-UP = math.cos(math.radians(20))  # what leans less rests on the face that is named
+POINT = 1e-6  # m, radius of the contact sphere at each vertex
+CARRIAGE = 1e5  # kg, mass of the driven pad, a million times an object's
+MESH_GAP = 0.001  # m, depth from which the mesh pushes beside such vertices: only at rims, where no vertex is
+UP = math.cos(math.radians(20))  # cosine of the largest lean of an object that rests on a face
 
 
 class MirroredFreefall(physics.Freefall):
-    """The mirror image of each fall, for `objects.mirror` of its object."""
+    """The mirror image of each fall, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """See `Freefall.start`."""
@@ -57,7 +61,7 @@ class MirroredFreefall(physics.Freefall):
 
 
 class MirroredPerturbed(physics.Perturbed):
-    """The mirror image of each start and jerk, for `objects.mirror` of its object."""
+    """The mirror image of each start and jerk, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """See `Perturbed.start`."""
@@ -65,34 +69,34 @@ class MirroredPerturbed(physics.Perturbed):
 
 
 def mirror(start: Start) -> Start:
-    """A start and its condition in the mirror: y becomes -y."""
+    """Mirror a start and its condition: y becomes -y."""
     return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
 
 
 def mirror_shape(shape: Shape) -> Shape:
-    """The shape of `objects.mirror`'s body."""
+    """Mirror a shape, as `objects.mirror` does a body."""
     flip = np.array([1, -1, 1], np.float32)
     return shape._replace(points=shape.points * flip, rests=shape.rests * flip, coms=shape.coms * flip)
 
 
 class Case(NamedTuple):
-    """Runs of one kind, and what their ends are called."""
+    """Runs of one kind, and the labels of their ends."""
 
     name: str
     scenario: physics.Freefall | physics.Perturbed
     mirrored: physics.Freefall | physics.Perturbed
     bodies: list[objects.Body]
     labels: tuple[str, ...]
-    label: Callable[[Float[Array, "7"], Float[Array, "7"]], Array]  # of the poses of the first and the last frame
+    label: Callable[[Float[Array, "7"], Float[Array, "7"]], Array]  # index of the label, from the first and last poses
 
 
 def box() -> objects.Body:
-    """A solid box of 500 kg/m3."""
+    """A solid box of 500 kg/m^3."""
     corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * np.array(BOX) / 2
     mass = 500 * math.prod(BOX)
     x, y, z = np.square(BOX)
     return dataclasses.replace(
-        objects.make(jax.random.key(0), "fork"),  # solid; looks and category do not matter here
+        objects.make(jax.random.key(0), "fork"),  # solid. Its looks and category do not matter here
         hulls=jnp.asarray(np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None], jnp.float32),
         shell_mass=jnp.float32(mass),
         shell_com=jnp.zeros(3),
@@ -101,7 +105,7 @@ def box() -> objects.Body:
 
 
 def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
-    """0, 1, 2: the axis that is vertical at the end; 3: none; 4: it fell off."""
+    """The axis that is vertical at the end (0, 1 or 2), or 3 if none is, or 4 if the box fell off."""
     del first
     vertical = jnp.abs(geometry.quat_to_matrix(geometry.normalize(last[3:]))[2])
     face = jnp.where(jnp.max(vertical) > UP, jnp.argmax(vertical), 3)
@@ -109,7 +113,7 @@ def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
 
 
 def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
-    """0: stands, 1: on its head, 2: lies, 3: it fell off."""
+    """0 if the bottle stands, 1 if it stands on its head, 2 if it lies, 3 if it fell off."""
     del first
     up = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2]
     side = jnp.where(up > UP, 0, jnp.where(up < -UP, 1, 2))
@@ -117,7 +121,7 @@ def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
 
 
 def cases() -> list[Case]:
-    """The box, the bottle, the shaken bottles."""
+    """The cases: the box, the bottle and the jerked bottles."""
     bottles = [objects.make(jax.random.key(i), "bottle") for i in range(4)]
     squat = objects.make(jax.random.key(27), "bottle")  # 101 mm high, 44 mm wide
     small, middle, large = (f"on {1e3 * a:.0f} x {1e3 * b:.0f} mm" for a, b in ((BOX[1], BOX[2]), BOX[::2], BOX[:2]))
@@ -140,7 +144,7 @@ def roll(
     seed: int = 0,
     engine: physics.Engine = "mjx",
 ) -> physics.Trajectory:
-    """`num` runs of a case, a `Trajectory` of NumPy arrays; its own bodies and scenario unless others are given."""
+    """Simulate `num` runs of a case, with its own bodies and scenario unless others are given, as NumPy arrays."""
     items = list(case.bodies if bodies is None else bodies)
     each = -(-num // len(items))
     with tqdm(total=each * len(items), desc=case.name, leave=False, disable=None) as bar:
@@ -164,8 +168,9 @@ def halved(scenario: physics.Freefall | physics.Perturbed) -> physics.Freefall |
 
 
 def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, driven: bool) -> mujoco.MjModel:
-    """The scene for C MuJoCo, with its own contacts of the mesh, or with every vertex of the hull a contact; its pad
-    fixed or on two slides.
+    """The scene for C MuJoCo, with its own contacts of the mesh or with every vertex of the hull as a contact.
+
+    The pad is fixed or on two slides.
     """
     gel, parts = Sensor().gel.size, np.asarray(body.hulls)
     xml = scene.scene_xml(parts, (float(gel[0]), float(gel[1])), contact)
@@ -186,10 +191,10 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
 
 
 def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = False, driven: bool = False) -> np.ndarray:
-    """The last poses (n, 7) of trajectories that C MuJoCo steps from their first frames, in the pad's frame.
+    """The last poses (n, 7), in the pad's frame, of trajectories that C MuJoCo steps from their first frames.
 
-    Gravity is the scenario's or, where the pad is `driven`, it stays and the pad has its horizontal part's opposite as
-    acceleration.
+    Gravity is the scenario's. If the pad is `driven`, gravity stays vertical, and the pad accelerates with the opposite
+    of the horizontal part.
     """
     scenario = case.scenario
     times = np.arange(scenario.steps * (scenario.frames - 1)) * scenario.contact.timestep
@@ -221,7 +226,7 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
             for mass, com, inertia, friction in zip(*properties, hidden.friction, strict=True):
                 models.append(copy.copy(compiled[index]))
                 scene.set_rigid(models[-1], mujoco.MjData(models[-1]), mass, com, inertia, float(friction))
-                if driven:  # masses this far apart converge slowly
+                if driven:  # the solver converges slowly for masses this far apart
                     models[-1].stat.meaninertia = models[-1].dof_M0[2:].mean()
                     models[-1].opt.iterations, models[-1].opt.tolerance = 100, 1e-12
             starts = (traj.pose[own, 0].astype(np.float64), traj.velocity[own, 0].astype(np.float64))
@@ -236,14 +241,14 @@ def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Middle and half width of the 95 % interval of the share of b less that of a, of the same runs."""
+    """Middle and half width of the 95 % interval of the share of b minus that of a, for the same runs."""
     gained, lost, count = np.sum(b & ~a) + 0.5, np.sum(a & ~b) + 0.5, len(a) + 2
     middle = (gained - lost) / count
     return middle, 1.96 * math.sqrt((gained + lost) / count - middle**2) / math.sqrt(count)
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """The labels of every run on each side; the first side is ours."""
+    """The labels of every run on each side. The first side is ours."""
     other_hand = [objects.mirror(body) for body in case.bodies]
     rolled: dict[str, physics.Trajectory] = {}
     sides_of: dict[str, physics.Engine] = {"ours": "mjx", "simulate in C": "mujoco"}
@@ -269,7 +274,7 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print every outcome's shares and whether its difference lies within the margin; return whether all do."""
+    """Print the shares of every outcome and whether they agree within the margin. Return whether all do."""
     ours, within = found["ours"], True
     for side, theirs in list(found.items())[1:]:
         print(f"    {side}: {100 * np.mean(ours == theirs):.1f} % of the runs end alike")
@@ -287,14 +292,14 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(num: int, only: str | None) -> None:
-    """All cases, or one."""
+    """Compare the sides of all cases, or of one."""
     within = [compare(sides(case, num), case.labels) for case in cases() if only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num", type=int, default=4000, help="runs a side")
+    parser.add_argument("--num", type=int, default=4000, help="runs per side")
     parser.add_argument("--only", choices=[case.name for case in cases()], help="one case instead of all")
     arguments = parser.parse_args()
     main(arguments.num, arguments.only)

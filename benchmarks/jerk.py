@@ -1,4 +1,4 @@
-"""What sight and weight say of a lathed thing that stands on the jerked pad: features of a classifier."""
+"""Features of a lathed object that stands on the jerked pad, for a classifier: from vision and from weight."""
 
 from typing import NamedTuple
 
@@ -9,16 +9,16 @@ from sts_jax import objects, physics
 from sts_jax.physics.scenarios import G
 from sts_jax.sensor import Sensor
 
-FILLS = np.linspace(0, 1, 17)  # at which a seen shape is weighed
-NOISE = 0.05  # log kg, standard deviation of the touch that is asked about
+FILLS = np.linspace(0, 1, 17)  # fills at which mass properties are computed for a shape
+NOISE = 0.05  # log kg, standard deviation of the measured mass
 
 
 class Sight(NamedTuple):
-    """What an exact eye knows of the shape of each object, a row each."""
+    """Exact properties of each object that follow from its shape, one row each."""
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radius at seven heights
     low: np.ndarray  # (b,) m, the lowest point in the mesh frame
-    rigid: np.ndarray  # (b, FILLS, 3) mass, height of the centre of mass over the base, inertia across, if filled so
+    rigid: np.ndarray  # (b, FILLS, 3) mass, height of the centre of mass over the base and inertia across, at each fill
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
@@ -35,20 +35,19 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """What is seen of each object's shape."""
+    """`Sight` of all objects."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """What touch tells, (n, 1): the logarithm of the mass in kg."""
+    """The measurement of touch, (n, 1): the logarithm of the mass in kg."""
     return np.log(starts.mass)[:, None]
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (m) and pushes (m/s^2), (n, 2) each, in that of the pad's eight symmetries in which pushes point 0 to 45
-    degrees.
+    """Places (m) and pushes (m/s^2), (n, 2) each, under a symmetry of the pad that turns pushes to 0 to 45 degrees.
 
-    A push is what the object feels: the opposite of the pad's acceleration.
+    The push on the object is the opposite of the pad's acceleration.
     """
     push = -condition[:, :2]
     sign = np.where(push < 0, -1, 1)
@@ -58,17 +57,18 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndarray, friction: float) -> np.ndarray:
-    """How near a standing thing comes to toppling if it turns about its base's edge, two columns (n, 2).
+    """How near a standing object comes to toppling if it turns about the edge of its base, two columns (n, 2).
 
-    Its acceleration over that at which it begins to tip, g b / h; and the logarithm of its energy at the end of the
-    push over what carries its centre of mass over the edge. Friction limits the force and lets it last for longer.
+    The first is its acceleration over that at which it begins to tip, g b / h. The second is the logarithm of its
+    energy at the end of the push over the energy that carries its centre of mass over the edge. Friction limits the
+    force, which then lasts longer.
 
     Args:
         rigid: (n, 3) mass (kg), height of the centre of mass (m), inertia across it (kg m^2).
-        base: (n,) m, its radius.
+        base: (n,) m, radius of the base.
         push: (n,) m/s^2, acceleration.
-        time: (n,) s, how long it lasts.
-        friction: a usual one; its own is hidden.
+        time: (n,) s, duration of the push.
+        friction: a typical value, because the true one is hidden.
     """
     mass, height, inertia = rigid.T
     force, lasts = np.minimum(push, friction * G), time * np.maximum(1, push / (friction * G))
@@ -83,7 +83,7 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
 def shaken(
     scenario: physics.Perturbed, items: list[objects.Body], starts: Starts, touch: np.ndarray | None
 ) -> np.ndarray:
-    """Features (n, k) of jerked starts of lathed things; `touch` (n, 1) is the logarithm of the mass."""
+    """Features (n, k) of jerked starts of lathed objects. `touch` (n, 1) is the logarithm of the mass."""
     seen = sight(items)
     friction = float(np.mean(scenario.friction))
     place, push = canonical(starts.pose, starts.condition)

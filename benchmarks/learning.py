@@ -1,11 +1,12 @@
-"""How long learning takes: one training step at batch 64, one prediction at batch 1.
+"""Time of one training step at batch 64 and of one prediction at batch 1.
 
     python -m benchmarks.learning
 
-The step is that of freefall (three modalities, touch absent, every subset asked for all). Beside it stands the
-same step in the plain way: XLA's own convolutions and transposed convolutions, and all seven subsets enumerated.
-Then a step of the state-space model as freefall trains it, and its prediction with 16 samples. Medians, alternated,
-after one unmeasured call each. A few minutes on two CPU cores; `taskset -c 0` measures one core.
+The step is that of freefall (three modalities, touch absent, every subset predicts all). Beside it is a plain
+implementation of the same step: XLA's convolutions and transposed convolutions, and all seven subsets enumerated. Then
+follow a step of the state-space model as freefall trains it, and its prediction with 16 samples. The figures are
+medians of alternating calls, after one unmeasured call each. Takes a few minutes on two CPU cores. `taskset -c 0`
+measures one core.
 """
 
 import statistics
@@ -35,18 +36,18 @@ LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 
 def plain_conv(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """What `nnx.Conv` computes."""
+    """Convolution as in `nnx.Conv`."""
     return jax.lax.conv_general_dilated(x, kernel, (stride, stride), [(padding,) * 2] * 2, dimension_numbers=LAYOUT)
 
 
 def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """What `nnx.ConvTranspose` computes."""
+    """Transposed convolution as in `nnx.ConvTranspose`."""
     pads = [(len(kernel) - 1 - padding,) * 2] * 2
     return jax.lax.conv_transpose(x, kernel[::-1, ::-1], (stride, stride), pads, dimension_numbers=LAYOUT)
 
 
 def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
-    """A training step on random data, compiled."""
+    """A compiled training step on random data."""
     rng = np.random.default_rng(0)
     data: dict[str, Any] = {
         m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
@@ -71,7 +72,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """A prediction of everything from vision, compiled."""
+    """A compiled prediction of all modalities from vision."""
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
     state = nnx.merge_state(params, stats)
     run = jax.jit(lambda state, x: mvae.predict(graphdef, state, {"visual": x}))
@@ -80,7 +81,7 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """A training step of the state-space model of freefall on random data, compiled."""
+    """A compiled training step of freefall's state-space model on random data."""
     rng, model = np.random.default_rng(0), statespace.Config()
     config = training.TrainConfig(batch_size=size)
 
@@ -116,7 +117,7 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
-    """A prediction from vision by a state-space model of random weights, compiled."""
+    """A compiled prediction from vision by a state-space model with random weights."""
     config = statespace.Config()
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     view = training.Preprocessing(resolution=(config.input_size, config.input_size))
@@ -129,7 +130,7 @@ def state_predictor(num_samples: int) -> Callable[[], None]:
 
 
 def medians(calls: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
-    """Seconds per call, alternated."""
+    """Median seconds per call. The calls alternate."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for call in calls.values():
         call()

@@ -1,19 +1,19 @@
-"""Physics: steps per second beside C MuJoCo, falls per second of both engines, frames per second, and compilation.
+"""Speed of the physics: steps per second compared with C MuJoCo, falls and frames per second, and compilation.
 
     python -m benchmarks.physics                   # about 2 minutes
     python -m benchmarks.physics --engines 4       # about 2 minutes on two cores
-    python -m benchmarks.physics --pipeline 64     # about a minute on two cores; 16384 is for a GPU
-    python -m benchmarks.physics --scaling         # about 10 minutes on two cores; writes benchmarks/results/physics/
+    python -m benchmarks.physics --pipeline 64     # about a minute on two cores. Give 16384 on a GPU
+    python -m benchmarks.physics --scaling         # about 10 minutes on two cores. Writes benchmarks/results/physics/
     python -m benchmarks.physics --compile         # about 8 minutes on two cores
 
-The first drops one hull of 32 vertices, then the eight classes' of 64, from the same starts in MJX and in C MuJoCo's
-batch (`mujoco.rollout`) on all cores, measured in turn. `--engines` simulates falls of Freefall's default, so many of
-each of 16 objects, in both engines of `simulate`: falls per second, all costs but compilation. `--pipeline` drops a
-bottle so many times and draws every frame of it, vision and touch, 64x64, uint8, fetched from the device: seconds and
-frames per second of either and of both, all costs but compilation (a frame is one world at one time). `--scaling` steps
-1 to 4,096 worlds at once (65,536 on a GPU). `--compile` prints the seconds before the first step of each scenario, and
-the number of compilations for a hundred objects. It uses fresh processes: the first has an empty cache of compiled
-programs, and the second finds the programs of the first there.
+The first command drops one hull of 32 vertices, then hulls of up to 64 vertices from the eight classes, from the same
+starts in MJX and in C MuJoCo's batch (`mujoco.rollout`) on all cores, measured in turn. `--engines` measures falls per
+second of both engines of `simulate`, for this many default falls of each of 16 objects. `--pipeline` drops a bottle
+this many times and renders every frame, vision and touch, 64x64, uint8, fetched from the device. It measures seconds
+and frames per second of physics, rendering and both, where a frame is one world at one time. Both options include all
+costs except compilation. `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU). `--compile` prints the seconds
+before the first step of each scenario, and the number of compilations for a hundred objects. It uses fresh processes:
+the first has an empty cache of compiled programs, and the second finds the programs of the first there.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from sts_jax.physics import contact, scene
 from sts_jax.physics.scenarios import G
 from sts_jax.physics.scene import mjx
 
-# What `simulate` compiles is measured by itself, which it has no public way for; a break shows at this import.
+# `simulate` has no public way to measure its compiled functions separately. A break shows at this import.
 from sts_jax.physics.simulate import WORKERS, _draw, _draws, _gravity, _rigid, _roll, _shapes, _Worlds
 from sts_jax.sensor import Sensor
 
@@ -54,8 +54,8 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "perturbed": physics.Perturbed(),
     "inclined": physics.Inclined(),
 }
-GPU_BATCH = 4096  # frames drawn at once on a GPU
-TACCEL = 915  # environment steps/s of 4,096 environments on an H100, as published; ten times as many is our mark
+GPU_BATCH = 4096  # frames rendered at once on a GPU
+TACCEL = 915  # environment steps/s of 4,096 environments on an H100, as published. Our mark is ten times as many
 
 
 def rod() -> objects.Body:
@@ -65,7 +65,7 @@ def rod() -> objects.Body:
     points = np.concatenate([np.c_[ring, np.full(16, z)] for z in (-length / 2, length / 2)])
     across = mass * (radius**2 / 4 + length**2 / 12)
     return dataclasses.replace(
-        objects.make(jax.random.key(0), "fork"),  # solid; only what collides and weighs matters here
+        objects.make(jax.random.key(0), "fork"),  # solid. Only hull and mass properties matter here
         hulls=jnp.asarray(points[None], jnp.float32),
         shell_mass=jnp.float32(mass),
         shell_com=jnp.zeros(3),
@@ -74,7 +74,7 @@ def rod() -> objects.Body:
 
 
 def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics.Contact) -> tuple[list, np.ndarray]:
-    """C MuJoCo's model and first state of each trajectory."""
+    """The model and the first state of each trajectory in C MuJoCo."""
     gel, models, states = Sensor().gel.size, [], []
     pad = (float(gel[0]), float(gel[1]))
     compiled = [scene.compile_scene(np.asarray(body.hulls), pad, constants) for body in items]
@@ -93,7 +93,7 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
 
 
 def in_turn(*runs: Callable[[], object], repeats: int = 5) -> np.ndarray:
-    """Seconds of calls made in turn, after one of each that is not counted: (repeats, calls)."""
+    """Seconds of calls made in turn, (repeats, calls). The first call of each is not counted."""
     for run in runs:
         run()
     seconds = np.empty((repeats, len(runs)))
@@ -106,13 +106,13 @@ def in_turn(*runs: Callable[[], object], repeats: int = 5) -> np.ndarray:
 
 
 def speed(num: int) -> None:
-    """Steps per second of both engines, on drops of one hull of 32 vertices and of eight objects."""
+    """Print steps per second of both engines, for drops of one hull of 32 vertices and of eight objects."""
     compare_speed("one hull of 32 vertices", [rod()], 8 * num)
     compare_speed("eight objects, up to 64 vertices", bodies(objects.CATEGORIES, 8), num)
 
 
 def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
-    """Print steps per second of both engines, `num` drops of each object."""
+    """Print steps per second of both engines, for `num` drops of each object."""
     sensor, scenario = Sensor(), physics.Freefall()
     simulate = functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, engine="mjx")
     traj, steps = simulate(), scenario.frames * scenario.steps
@@ -134,7 +134,7 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
 
 
 def engines(num: int) -> None:
-    """Print falls per second of both engines of `simulate`, `num` falls of each of 16 objects."""
+    """Print falls per second of both engines of `simulate`, for `num` falls of each of 16 objects."""
     items, sensor, scenario = bodies(objects.CATEGORIES, 16), Sensor(), physics.Freefall()
     calls = [
         functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, engine=engine)
@@ -150,13 +150,13 @@ def engines(num: int) -> None:
 
 
 def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
-    """Models and states by the size of the mesh: a rollout is of models of one size."""
+    """Group models and states by the size of the mesh, because a rollout needs models of one size."""
     sizes = np.array([model.nmeshvert for model in models])
     return [([m for m, n in zip(models, sizes, strict=True) if n == k], states[sizes == k]) for k in np.unique(sizes)]
 
 
 def worlds(count: int, frames: int) -> tuple[_Worlds, mjx.Model, mjx.Data]:
-    """What `simulate` hands to MJX for drops of the rod from 2 mm."""
+    """The arguments that `simulate` passes to MJX for drops of the rod from 2 mm."""
     scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
     pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # drawn once, then repeated
     index = np.zeros(some, np.int32)
@@ -172,7 +172,7 @@ def worlds(count: int, frames: int) -> tuple[_Worlds, mjx.Model, mjx.Data]:
 
 
 def scaling(frames: int = 8, chunk: int = 32) -> None:
-    """Steps per second against the number of worlds; a table and a plot."""
+    """Measure steps per second against the number of worlds. Writes a table and a plot."""
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
     scenario = physics.Freefall(height=0.002, frames=frames)
@@ -205,7 +205,7 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
 
 
 def write_scaling(rows: np.ndarray, device: str, chunk: int) -> None:
-    """`scaling.md` and `scaling.png` of rows (worlds, steps/s at once, in chunks, of C)."""
+    """Write `scaling.md` and `scaling.png` from rows (worlds, steps/s at once, in chunks, in C MuJoCo)."""
     from matplotlib.figure import Figure
 
     names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
@@ -226,13 +226,13 @@ def write_scaling(rows: np.ndarray, device: str, chunk: int) -> None:
 
 
 def draw(body: objects.Body, traj: physics.Trajectory) -> None:
-    """Every frame of trajectories of one object, both streams, fetched to the host and let go."""
+    """Render every frame of one object's trajectories in both streams, fetch it to the host and discard it."""
     gpu = jax.default_backend() != "cpu"
     batch, threads = (GPU_BATCH, 1) if gpu else (RENDER_BATCH, os.cpu_count())
     pose, wrench = (np.asarray(x).reshape(-1, x.shape[-1]) for x in (traj.pose, traj.wrench))
 
     def one(begin: int) -> None:
-        rows = np.minimum(np.arange(begin, begin + batch), len(pose) - 1)  # one compilation: the last is repeated
+        rows = np.minimum(np.arange(begin, begin + batch), len(pose) - 1)  # repeat the last to compile only once
         images = dataset.render_uint8(Sensor(), body, pose[rows], wrench[rows], resolution=(64, 64), crop=False)
         jax.device_get(images[:2])
 
@@ -241,7 +241,7 @@ def draw(body: objects.Body, traj: physics.Trajectory) -> None:
 
 
 def pipeline(count: int) -> None:
-    """Prints frames per second of `count` drops of a bottle, of physics, of both streams, and together."""
+    """Print frames per second for `count` drops of a bottle: of the physics, of both streams, and together."""
     chunk = 32 if jax.default_backend() == "cpu" else count
     body, scenario = objects.make(jax.random.key(0), "bottle"), physics.Freefall()
     for _ in range(2):  # the first compiles
@@ -261,7 +261,7 @@ def pipeline(count: int) -> None:
 
 
 def first_call(name: str, count: int) -> None:
-    """In a fresh process: print seconds before the first step, and how often `count` objects compiled, as JSON."""
+    """Print the seconds before the first step in a fresh process and the compilations of `count` objects, as JSON."""
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]
     begin = time.perf_counter()
@@ -278,7 +278,7 @@ def first_call(name: str, count: int) -> None:
 
 
 def compilation(count: int = 100) -> None:
-    """Seconds of compilation of each scenario, without and with what an earlier process compiled."""
+    """Print the seconds of compilation of each scenario, without and with the programs of an earlier process."""
     for name in SCENARIOS:
         with tempfile.TemporaryDirectory() as folder:
             environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder, "TF_CPP_MIN_LOG_LEVEL": "3"}
@@ -295,10 +295,10 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
     parser.add_argument("--engines", type=int, metavar="FALLS", help="falls per second of both engines")
-    parser.add_argument("--pipeline", type=int, metavar="WORLDS", help="frames per second of so many drops, drawn")
+    parser.add_argument("--pipeline", type=int, metavar="WORLDS", help="frames per second of this many rendered drops")
     parser.add_argument("--scaling", action="store_true", help="steps per second against the number of worlds")
     parser.add_argument("--compile", action="store_true", help="seconds and number of compilations")
-    parser.add_argument("--count", type=int, default=100, help="objects of which compilations are counted")
+    parser.add_argument("--count", type=int, default=100, help="objects whose compilations are counted")
     parser.add_argument("--first-call", choices=SCENARIOS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.first_call:

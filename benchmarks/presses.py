@@ -1,21 +1,23 @@
-"""Our shader held against real presses of a ball on a GelSight.
+"""Our shader, compared with real presses of a ball on a GelSight.
 
-    python -m benchmarks.presses
+    python -m benchmarks.presses    # half a minute of processor time
 
-The wheel of `taxim` 1.4.1 (MIT) carries 48 pictures (480x640, 0.0295 mm a pixel) of a ball of radius 2 mm pressed into
-a GelSight, its background, and each contact's centre and radius, so that the skin's normals there are a sphere's. On
-36 of them `tactile.phong` is fitted; every fourth is held out. A picture is
+The wheel of `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm pressed into
+a GelSight, the image without contact (the background), and the centre and radius of each contact. Within the contact
+the skin has the normals of a sphere. `tactile.phong` is fitted to 36 of the presses, and every fourth is held out. An
+image is modelled by
 
     background (1 + phong(pressed) - phong(flat))
 
-so that the flat sensor is the background, and what the press changes goes with how bright it is there; all in
-the camera's own values over 255. Lights are chosen from rings of candidates around the picture by non-negative least
-squares; then places, colours, the lights' fall-off, specular share and shininess follow the gradient. These are the
-lights that explain the pictures, not where the sensor's own LEDs are: a few end up under the picture. Printed: the peak
-signal-to-noise ratio within 0.92 of the contacts' radii, of all pixels of all held-out presses together, for the
-background alone, far lights and near ones. `presses.png` has the held-out presses, a column each: real, ours, and four
-times their difference on grey; beside the contact, where the skin's shape is not known, ours is the background. Half a
-minute of processor time. What is chosen here (candidates, steps, rate) was chosen on the 36 alone.
+so that the flat sensor gives the background, and the change is proportional to the background's brightness. All values
+are the camera's, divided by 255. Non-negative least squares selects lights from rings of candidates around the image.
+Gradient descent then fits their positions and colours, the fall-off, the specular share and the shininess. The fitted
+lights explain the images and do not coincide with the LEDs of the sensor: a few end up below the image.
+
+Prints the peak signal-to-noise ratio for the background alone, far lights and near lights, over all pixels of all
+held-out presses within 0.92 of the contacts' radii. `presses.png` has a column for each held-out press: real, ours, and
+four times their difference on grey. Beside the contact the shape of the skin is unknown, and ours is the background.
+Candidates, steps and learning rate were chosen on the 36 presses alone.
 """
 
 import dataclasses
@@ -37,7 +39,7 @@ from sts_jax import tactile
 PITCH = 0.0295e-3  # m a pixel (taxim/calib/gelsight/params.json)
 RADIUS = 2e-3  # m, of the ball
 TRUSTED = 0.92  # share of a contact's radius within which its normals count as known
-EVERY = 4  # of the presses is held out: the fourth, the eighth, ...
+EVERY = 4  # one press in this many is held out: the fourth, the eighth, ...
 STEPS = 1000
 RATE = 0.1
 OUT = Path(__file__).parent / "results" / "presses"
@@ -45,7 +47,7 @@ OUT = Path(__file__).parent / "results" / "presses"
 
 @dataclasses.dataclass(frozen=True)
 class Presses:
-    """Pictures in [0, 1] and the geometry that belongs to them."""
+    """Images in [0, 1] and the geometry of their contacts."""
 
     background: Float[np.ndarray, "h w 3"]
     images: Float[np.ndarray, "n h w 3"]
@@ -56,25 +58,25 @@ class Presses:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pixels:
-    """Some pixels of some presses, in a list."""
+    """A list of pixels of several presses."""
 
     normals: Float[Array, "p 3"]  # of the skin, towards the camera
-    points: Float[Array, "p 3"]  # of the skin (m), the origin where the image's middle looks at
+    points: Float[Array, "p 3"]  # of the skin (m), with the origin in the middle of the image
     color: Float[Array, "p 3"]
     background: Float[Array, "p 3"]
 
 
 def read() -> Presses:
-    """The recordings, from the installed package, which is not imported.
+    """Read the recordings from the installed package without importing it.
 
     Raises:
-        FileNotFoundError: it is not installed.
+        FileNotFoundError: the package is not installed.
     """
     spec = importlib.util.find_spec("taxim")
     path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
     if path is None or not path.is_file():
         raise FileNotFoundError(
-            "the presses are in the package taxim 1.4.1: pip install -e '.[bench]' -c constraints.txt"
+            "the package taxim 1.4.1 has the presses. Install it: pip install -e '.[bench]' -c constraints.txt"
         )
     with np.load(path) as pack:
         background, images = (pack[name][..., ::-1] / np.float32(255) for name in ("f0", "imgs"))  # blue is first
@@ -82,7 +84,7 @@ def read() -> Presses:
 
 
 def held_out(number: int) -> np.ndarray:
-    """Which of so many presses are never fitted."""
+    """Mask of the presses that are never fitted."""
     return np.arange(number) % EVERY == EVERY - 1
 
 
@@ -94,12 +96,12 @@ def skin_under_ball(
     Args:
         centre: column and row of the contact (pixels).
         radius: of the contact (pixels).
-        row: of the pixels asked for, within the contact.
-        column: of them.
+        row: of the pixels, within the contact.
+        column: of the pixels.
         shape: (height, width) of the image.
 
     Returns:
-        Unit normals towards the camera; points (m), the contact's rim in the gel's face.
+        Unit normals towards the camera, and points (m), with the contact's rim in the gel's face.
     """
     x, y = PITCH * (column - centre[0]), PITCH * (row - centre[1])
     under = np.sqrt(RADIUS**2 - x**2 - y**2)
@@ -110,7 +112,7 @@ def skin_under_ball(
 
 
 def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float = TRUSTED) -> Pixels:
-    """Pixels within a share of the contacts' radii, of every so manieth row and column."""
+    """Pixels within a share of the contacts' radii, in each `every`-th row and column."""
     shape, found = presses.background.shape[:2], []
     rows, columns = np.meshgrid(np.arange(0, shape[0], every), np.arange(0, shape[1], every), indexing="ij")
     for index in which:
@@ -123,12 +125,12 @@ def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float
 
 
 def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """The library's constants, all in their range, of unknowns that have none.
+    """The library's constants, all in range, from unbounded unknowns.
 
     Args:
-        unknowns: `place` (m, 3), mm, of which the last is the softplus inverse of how far under the gel's face; and
-            the softplus inverses of `color` (m, 3), `falloff`, `specular` and `shininess`.
-        near: LEDs; without it the places are far lights' directions and the fall-off counts for nothing.
+        unknowns: `place` (m, 3) in mm, whose last component is the softplus inverse of the depth below the gel's face,
+            and the softplus inverses of `color` (m, 3), `falloff`, `specular` and `shininess`.
+        near: use LEDs. Otherwise the places are directions of far lights, and the fall-off is ignored.
     """
     positive = {k: jax.nn.softplus(v) for k, v in unknowns.items()}
     place = jnp.concatenate([unknowns["place"][:, :2], -positive["place"][:, 2:]], axis=1)
@@ -142,9 +144,9 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
 
 
 def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
-    """What the press changes of each light, were it white: the shader's picture less that of the flat skin.
+    """Change that the press makes to each light, if white: the shader's image less that of the flat skin.
 
-    One program for all lights: the shader's own loop over so many takes minutes to compile with its gradient.
+    One program for all lights, because the shader's own loop over so many takes minutes to compile with its gradient.
     """
     flat = jnp.broadcast_to(jnp.array([[0.0, 0, -1]]), given.normals.shape)
     normals = jnp.stack([given.normals, flat])
@@ -165,22 +167,22 @@ def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, giv
 
 @jax.jit
 def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
-    """Ours, on the real background."""
+    """Our image, on the real background."""
     return given.background * (1 + changes(constants, lights, given).T @ lights.colors)
 
 
 def psnr(image: Array, truth: Array) -> float:
-    """dB, of values in [0, 1]."""
+    """Peak signal-to-noise ratio (dB) of values in [0, 1]."""
     return float(-10 * np.log10(np.mean((np.asarray(image, np.float64) - np.asarray(truth, np.float64)) ** 2)))
 
 
 def _inverse(value: float | np.ndarray) -> Array:
-    """Of the softplus."""
+    """The inverse of the softplus."""
     return jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
 
 
 def start(given: Pixels, *, near: bool) -> dict[str, Array]:
-    """Unknowns to begin with: of candidates in rings around the picture, those that least squares lets shine."""
+    """Initial unknowns: the lights that least squares selects from candidates in rings around the image."""
     rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.2, 0.5, 1.0, 2.0)]
     angles = 2 * np.pi * np.arange(12) / 12
     rows = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
@@ -197,7 +199,7 @@ def start(given: Pixels, *, near: bool) -> dict[str, Array]:
 
 @functools.partial(jax.jit, static_argnames=("near", "steps"))
 def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int) -> dict[str, Array]:
-    """Towards the least squared error (Adam, its rate falling along a cosine)."""
+    """Minimise the squared error by Adam with a cosine schedule."""
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
 
     def loss(unknowns: dict[str, Array]) -> Array:
@@ -212,12 +214,12 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
 
 
 def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """The shader's constants for some pixels."""
+    """Fit the shader's constants to pixels."""
     return shader(refine(start(given, near=near), given, near=near, steps=steps), near=near)
 
 
 def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
-    """Real, ours and their difference, one under the other, around a contact; beyond it ours is the background."""
+    """Real, ours and their difference around a contact, one below the other. Beyond it, ours is the background."""
     given = pixels(presses, np.array([index]), within=1.0)
     column, row = (int(v) for v in presses.centres[index])
     shape = presses.background.shape[:2]
@@ -233,7 +235,7 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
 
 
 def main() -> None:
-    """Fit, print, draw."""
+    """Fit, print and draw."""
     OUT.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
 

@@ -1,4 +1,4 @@
-"""A small convolutional network that reads numbers from uint8 images; plain JAX."""
+"""A small convolutional network in plain JAX that predicts numbers from uint8 images."""
 
 import itertools
 from collections.abc import Callable
@@ -11,13 +11,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 CHANNELS = (24, 48, 64)  # after each 3 x 3 convolution
 BATCH = 64
-RATE = 2e-3  # Adam's, falls to zero as a cosine
+RATE = 2e-3  # Adam's learning rate, which falls to zero along a cosine
 
 Weights = list[tuple[Array, Array]]
 
 
 def initial(key: PRNGKeyArray, outputs: int) -> Weights:
-    """Weights of three convolutions and two dense layers (He's normal; the last is zero)."""
+    """Weights of three convolutions and two dense layers (He normal, the last one zero)."""
     widths = [12, *CHANNELS]
     shapes = [(3, 3, a, b) for a, b in itertools.pairwise(widths)]
     dense = [(2 * CHANNELS[-1], 64), (64, outputs)]
@@ -30,9 +30,9 @@ def initial(key: PRNGKeyArray, outputs: int) -> Weights:
 
 
 def apply(weights: Weights, x: Float[Array, "n h w 3"]) -> Float[Array, "n k"]:
-    """The network's outputs; sides are multiples of 8.
+    """The network's outputs for images whose sides are multiples of 8.
 
-    No convolution has a stride: XLA's gradients of those are slow on a CPU.
+    No convolution has a stride, because XLA's gradients of strided ones are slow on a CPU.
     """
     n, h, w, c = x.shape
     x = x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
@@ -52,16 +52,16 @@ _LAYOUT = ("NHWC", "HWIO", "NHWC")
 def fit(
     key: PRNGKeyArray, images: np.ndarray, targets: np.ndarray, *, steps: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Trains a network to say `targets` of `images` and returns it as a function of images.
+    """Train a network to predict `targets` from `images`, and return it as a function of images.
 
     Args:
         key: consumed.
         images: uint8 (n, h, w, 3).
-        targets: float (n, k), learned by squared error after standardising; bool (n, k), by cross-entropy.
-        steps: of Adam, BATCH images each.
+        targets: float (n, k), learned by squared error after standardising, or bool (n, k), by cross-entropy.
+        steps: of Adam, with `BATCH` images each.
 
     Returns:
-        images (m, h, w, 3) to (m, k): numbers, or logits where targets were bool.
+        Function from images (m, h, w, 3) to (m, k): numbers, or logits if `targets` is bool.
     """
     logits = targets.dtype == bool
     centre, scale = (0.0, 1.0) if logits else (targets.mean(0), targets.std(0))

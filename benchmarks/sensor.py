@@ -1,19 +1,19 @@
-"""Whole frames per second of `sense` beside embree's depth, and what they cost from small to large.
+"""Whole frames per second of `sense` beside embree's depth, and the cost of a frame from small to large.
 
     python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
-    python -m benchmarks.sensor --taxim     # a minute: touch from a height map, beside taxim's renderer in JAX
-    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory; writes a plot
-    python -m benchmarks.sensor --compile   # 2 minutes: how often a hundred objects compile
+    python -m benchmarks.sensor --taxim     # a minute: tactile images from height maps, beside taxim in JAX
+    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory. Writes a plot
+    python -m benchmarks.sensor --compile   # 2 minutes: number of compilations for a hundred objects
 
-The first draws objects at rest on the pad with the wrench of their weight: the gel's balance, both streams, depth and
-segmentation, beside three ways to have embree trace the depth alone of the same faces and poses: `traced`, with
-embreex itself, every ray of an image in one call, its scene built beforehand; `built`, the same with the scene built
-anew for each pose, as a moving object needs it; `trimesh`, as one calls it from Python (`mesh.ray`). Each in one
-thread, and in as many as there are cores: a call of ours keeps little more than one busy, and `dataset.collect` draws
-so too. All in turn, medians; a ratio is embree's seconds over ours, in as many threads. Off the CPU ours are batched
-instead. Below it, the share of each stage in ours, and at 640x480 how many times quicker than the paper's code, which
-takes 0.40 s a frame of this size on a CPU of this kind (its own renderer and shader, measured by us elsewhere, without
-its physics).
+The first command draws objects at rest on the pad with the wrench of their weight: the gel's balance, both streams,
+depth and segmentation. Beside it, embree traces the depth alone of the same faces and poses in three ways: `traced`
+calls embreex with every ray of an image at once and a scene built beforehand, `built` also builds the scene for each
+pose, as a moving object needs it, and `trimesh` uses the Python interface `mesh.ray`. Each runs in one thread and in as
+many threads as there are cores, because one call of `sense` keeps little more than one core busy and `dataset.collect`
+draws in threads too. On other devices, `sense` draws a batch. The runs alternate, and the figures are medians. A
+ratio is embree's seconds over ours, in as many threads. Below are the share of each stage in our time and, at 640x480,
+the speed relative to the paper's code, which takes 0.40 s per frame of this size on such a CPU (its renderer and shader
+without its physics, measured by us elsewhere).
 """
 
 import argparse
@@ -42,11 +42,11 @@ from embreex.rtcore_scene import EmbreeScene
 import sts_jax as sts
 from sts_jax import frame, geometry, objects, optics, tactile
 
-SIZES = {(64, 64): 41, (200, 200): 15, (480, 640): 7}  # and how often each is timed
-FACES = (None, 2000, 5000)  # None: as the class has them
+SIZES = {(64, 64): 41, (200, 200): 15, (480, 640): 7}  # image sizes, and how often each is timed
+FACES = (None, 2000, 5000)  # None: as the class generates them
 CATEGORIES = ("bottle", "scissors", "watch")
-POSES = 16  # of each object: resting on the pad, turned about the vertical
-PAPER = 0.40  # s, a frame of 640x480 of the paper's code
+POSES = 16  # per object: at rest on the pad, turned about the vertical
+PAPER = 0.40  # s, per frame of 640x480 of the paper's code
 COST_SIZES = ((64, 64), (120, 160), (240, 320), (480, 640), (960, 1280), (1232, 1640))
 COST_FACES = (500, 1000, 2000, 5000, 10000, 20000, 50000)
 RESULTS = Path(__file__).parent / "results" / "sensor"
@@ -55,14 +55,14 @@ Inputs = tuple[jax.Array, jax.Array]
 
 
 def finer(body: objects.Body, faces: int | None) -> objects.Body:
-    """The same surface with about so many faces: subdivided, then decimated."""
+    """The same surface with about this number of faces: subdivided, then decimated."""
     if faces is None:
         return body
     own = np.asarray(body.faces)
     own = own[np.any(own != own[:, :1], axis=1)]
     mesh = trimesh.Trimesh(np.asarray(body.vertices, float), own)
     longest = mesh.extents.max()
-    while len(mesh.faces) < faces:  # the longest edges first, so that faces become alike
+    while len(mesh.faces) < faces:  # the longest edges first, so that faces become equal in size
         longest *= 0.8
         mesh = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -78,7 +78,7 @@ def count(body: objects.Body) -> int:
 
 
 def resting(body: objects.Body, number: int = POSES) -> Inputs:
-    """Poses on the pad, upright, and the wrenches that carry the weight."""
+    """Upright poses on the pad, and the wrenches that carry the weight."""
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
     angles = jnp.linspace(0, 2 * jnp.pi, number, endpoint=False)
     low = jnp.min(body.vertices[body.faces.ravel(), 2])
@@ -93,7 +93,7 @@ def resting(body: objects.Body, number: int = POSES) -> Inputs:
 
 
 def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, list[Callable[[], object]]]:
-    """What gives the depth of each pose, by name of the way to ask for it."""
+    """Functions that trace the depth of each pose, for each way to call embree."""
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
@@ -126,7 +126,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
 
 
 def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each, run in turn so that a busy machine slows all alike."""
+    """Median seconds of each function. They run in turn, so that a busy machine slows all alike."""
     seconds = []
     for _ in range(repeats + 1):
         row = []
@@ -147,7 +147,7 @@ def frames(
     fields: tuple[str, ...] = (),
     batched: bool = False,
 ) -> object:
-    """Frames, one after the other or batched; of some fields, what the others alone need is left out."""
+    """Frames, one after the other or batched. With `fields`, XLA omits the work for all other fields."""
 
     def asked(inputs: Inputs) -> object:
         whole = sts.sense(sts.Sensor(), body, *inputs, resolution=shape)
@@ -157,7 +157,7 @@ def frames(
 
 
 def speed() -> None:
-    """Print one row per object and size, then stages."""
+    """Print one row per object and size, then the share of each stage."""
     cores = os.cpu_count() or 1
     on_cpu = jax.default_backend() == "cpu"
     every = f"{cores} threads" if on_cpu else "batched"
@@ -202,7 +202,7 @@ def speed() -> None:
                     + (f"   {PAPER / best:.1f} times the paper's" if shape == (480, 640) else "")
                 )
     pool.shutdown()
-    print("\nshare of each stage, %: the frame less what does without it (they need not sum to 100)")
+    print("\nshare of each stage, %: the time with it less the time without it (they need not sum to 100)")
     print(f"{'object':9} {'faces':>6} {'image':>9} | {'frame':>11} {'gel':>9} {'depth':>9} {'vision':>9} {'touch':>9}")
     print("\n".join(stages))
 
@@ -221,8 +221,8 @@ def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.nd
 
 
 def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
-    """Print how long each takes for the lit skin of a given imprint."""
-    from taxim import Taxim  # imports JAX itself, and nothing else here needs it
+    """Print the time of each renderer for the tactile image of an imprint."""
+    from taxim import Taxim  # taxim imports JAX itself, and nothing else here needs it
 
     theirs = Taxim(backend="jax")
     window = pitch * jnp.array([-shape[1] / 2, -shape[0] / 2, shape[1], shape[0]])
@@ -238,7 +238,7 @@ def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) 
     print(f"{'':6} " + " ".join(f"{name:>8}" for name in names) + " | taxim's over ours: far, LEDs, shadows")
     for name, make in (("ball", ball), ("waves", waves)):
         imprint = jnp.asarray(make(shape, pitch))
-        height = -1e3 * imprint + jnp.where(imprint > 0, 0, 1.0)  # mm, as taxim has it
+        height = -1e3 * imprint + jnp.where(imprint > 0, 0, 1.0)  # mm, as taxim expects
         ours = [
             functools.partial(jax.jit(functools.partial(sts.touch, sensor)), imprint, window)
             for sensor in sensors.values()
@@ -254,7 +254,7 @@ def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) 
 
 
 def one(faces: int, shape: tuple[int, int]) -> None:
-    """In a fresh process: print seconds a frame and the most memory held, as JSON."""
+    """Print seconds per frame and peak memory as JSON, in a fresh process."""
     body = finer(objects.make(jax.random.key(0), "bottle"), faces)
     poses, wrenches = resting(body, 1 if shape == COST_SIZES[-1] else 4)  # four of the largest are 0.2 GiB
     (seconds,) = median_seconds(lambda: frames(body, (poses, wrenches), shape=shape))
@@ -263,7 +263,7 @@ def one(faces: int, shape: tuple[int, int]) -> None:
 
 
 def cost() -> None:
-    """Print and plot what a frame costs by pixel and by face, each in a process of its own."""
+    """Print and plot the cost of a frame by pixels and by faces, each measured in a process of its own."""
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
         command = [sys.executable, "-m", "benchmarks.sensor", "--one", str(faces), *map(str, shape)]
@@ -294,13 +294,13 @@ def cost() -> None:
 
 
 def compilations(number: int = 100) -> None:
-    """Print how often so many different objects compile a frame: procedural ones and public meshes."""
+    """Print how often `sense` compiles for this number of different objects, procedural ones and public meshes."""
     from benchmarks.depth import public_meshes
 
     files = sorted(public_meshes().glob("*.obj"))
     bodies = []
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # open meshes and materials that are not there
+        warnings.simplefilter("ignore")  # open meshes and missing materials
         for path in files:
             bodies.append(objects.load(path, longest_side=0.08, up="y", faces=4096))
     for index in range(number - len(bodies)):
@@ -316,9 +316,9 @@ def compilations(number: int = 100) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--taxim", action="store_true", help="touch from a height map, beside taxim's")
+    parser.add_argument("--taxim", action="store_true", help="time of tactile images from height maps, beside taxim")
     parser.add_argument("--cost", action="store_true", help="cost per pixel and per face, memory")
-    parser.add_argument("--compile", action="store_true", help="how often a hundred objects compile")
+    parser.add_argument("--compile", action="store_true", help="number of compilations for a hundred objects")
     parser.add_argument("--one", type=int, nargs=3, metavar=("FACES", "HEIGHT", "WIDTH"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:

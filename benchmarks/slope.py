@@ -1,4 +1,4 @@
-"""What statics says of a thing laid on the slope, from sight and from its centre of pressure: features of a classifier.
+"""Features of an object laid on the slope, for a classifier: statics from vision and from the centre of pressure.
 
 Downhill is +y.
 """
@@ -15,16 +15,16 @@ from benchmarks.starts import Starts, filled, rigid
 from sts_jax import geometry, objects, physics
 from sts_jax.sensor import Sensor
 
-NOISE = 0.001  # m, standard deviation of the centre of pressure that is asked about
-SEEN = (0.0001, 0.0017)  # m, rad: how well sight tells a pose, standard deviations
-DRAWS = 128  # of contents, by which sight judges a start, ...
-FRICTIONS = 8  # ... each with as many frictions
-LEVELS = (0.0001, 0.001)  # m; what is so much higher than the lowest point supports at once, or after rocking
-SNAP = 0.9986  # cosine; what leans less than 3 degrees from a face that it may rest on is seen to lie on it
+NOISE = 0.001  # m, standard deviation of the measured centre of pressure
+SEEN = (0.0001, 0.0017)  # m, rad, standard deviations of a pose from vision
+DRAWS = 128  # draws of the hidden contents for the features of a start, ...
+FRICTIONS = 8  # ... each combined with this many frictions
+LEVELS = (0.0001, 0.001)  # m, heights above the lowest point of points that support at once, or after rocking
+SNAP = 0.9986  # cosine of 3 degrees. An object that leans less from a stable face is taken to lie on it
 
 
 def support(points: np.ndarray, level: float) -> np.ndarray:
-    """The corners (k, 2), in turn, of what an object's points (n, 3) span that are within a level of the lowest, m."""
+    """Corners (k, 2), in order, of the support polygon of the points (n, 3) within `level` (m) of the lowest one."""
     low = np.unique(points[points[:, 2] < points[:, 2].min() + level, :2].round(7), axis=0)
     try:
         return low[ConvexHull(low).vertices]
@@ -34,8 +34,9 @@ def support(points: np.ndarray, level: float) -> np.ndarray:
 
 
 def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
-    """How far (m) a place (2,) is inside what supports an object: of the nearest edge and of the nearest edge below it
-    on the slope; of the latter also its length (m) and how squarely it lies across the slope.
+    """How far (m) a place (2,) lies inside a support polygon, from the nearest edge and from the nearest downhill edge.
+
+    The list also has the length (m) of this downhill edge and the y component of its outward unit normal.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9
@@ -49,17 +50,17 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
 def balance(
     corners: np.ndarray, centre: np.ndarray, friction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What statics says of bodies that differ in what is hidden: tips (0), slides (1) or sticks (2), and the centre of
-    pressure.
+    """Predict by statics how bodies with different hidden values move, and where they press.
 
     Args:
-        corners: (k, 2) m, of what supports them.
-        centre: (m, 3) m, of mass, over the pad.
-        friction: (m,).
+        corners: (k, 2) m, corners of the support polygon.
+        centre: (m, 3) m, centres of mass, with z above the pad.
+        friction: (m,) coefficients of friction.
         slope: rad, towards +y.
 
     Returns:
-        (m,) and (m, 2) m; what tips presses on the edge that it tips over.
+        (m,) tips (0), slides (1) or sticks (2), and (m, 2) m, centres of pressure. A body that tips presses on the edge
+        over which it tips.
     """
     grip = np.minimum(friction, math.tan(slope))
     pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])
@@ -74,7 +75,7 @@ def balance(
 
 
 def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
-    """Centres of mass (DRAWS, 3) in m, mesh frame, of a body with what may be hidden in it."""
+    """Centres of mass (DRAWS, 3) in m, mesh frame, of a body with draws of its hidden contents."""
     if not body.contents_density:
         return np.tile(np.asarray(body.shell_com), (DRAWS, 1))
     hidden = jax.vmap(scenario.hidden)(jax.random.split(jax.random.key(0), DRAWS))
@@ -82,7 +83,7 @@ def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
 
 
 def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) seen, or the nearest with one of the directions (k, 3) of an object up, if that is near."""
+    """Snap a rotation (3, 3) to the nearest one with one of the object's directions (k, 3) up, if that is near."""
     up = rotation @ ups[(ups @ rotation[2]).argmax()]
     if up[2] < SNAP:
         return rotation
@@ -90,16 +91,17 @@ def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
 
 
 def pressed(starts: Starts) -> np.ndarray:
-    """What touch tells, (n, 2) in m: the normal force's centre of pressure, `(-My, Mx) / Fz`; nan without contact."""
+    """The measurement of touch, (n, 2) in m: the centre of pressure `(-My, Mx) / Fz`, nan without contact."""
     force = np.where(starts.wrench[:, 2] > 0, starts.wrench[:, 2], np.nan)
     return np.stack([-starts.wrench[:, 4], starts.wrench[:, 3]], 1) / force[:, None]
 
 
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Features (n, k) of starts on the slope, of things of any shape; `touch` (n, 2) in m is the centre of pressure.
+    """Features (n, k) of starts on the slope, for objects of any shape. `touch` (n, 2) in m is the centre of pressure.
 
-    Among them what `balance` says of DRAWS of what is hidden, all alike to sight; touch tells which are likely. Sight
-    tells the pose as well as SEEN: a pose to the last bit tells, by micrometres, what has begun to slip.
+    They include the predictions of `balance` for DRAWS of the hidden contents, all equally likely from vision. Touch
+    determines which of them are likely. The pose has noise of SEEN, because an exact pose would reveal by micrometres
+    which objects have begun to slip.
     """
     centres = [np.tile(drawn_centres(body, scenario), (FRICTIONS, 1)) for body in items]
     friction = np.repeat(np.linspace(*scenario.friction, 2 * FRICTIONS + 1)[1::2], DRAWS)
@@ -119,7 +121,7 @@ def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, 
         columns = [*pose[:2], *low[:2], *high, high[2] - low[2], pad / 2 - pose[1] - high[1]]
         columns += [int(body.category), body.shell_mass, body.contents_density, *np.ptp(face, axis=0), len(face)]
         columns += [*np.ptp(wide, axis=0), *rotation[2], *np.abs(rotation[:, 2]), np.abs(rotation[1]).max()]
-        columns += list((turn @ rotation.T)[:2, 2])  # how it leans over its face already
+        columns += list((turn @ rotation.T)[:2, 2])  # its lean from the face at the start
         felt = None if touch is None else touch[row] - pose[:2]
         (end, pressure), (rocked, _) = (
             balance(corners, centres[index] @ rotation.T - [0, 0, low[2]], friction, scenario.slope)

@@ -1,14 +1,14 @@
-"""Endurance: what becomes of very many trajectories of each scenario.
+"""Endurance: failures, outcomes and accuracy of very many trajectories of each scenario.
 
-    python -m benchmarks.soak                            # 30,000 trajectories: about two hours on two cores
+    python -m benchmarks.soak                            # 30,000 trajectories, about two hours on two cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
-    python -m benchmarks.soak --keep FOLDER              # keep finished blocks there, and go on from them
-    python -m benchmarks.soak --first-block 17           # of 20: the others were done elsewhere
+    python -m benchmarks.soak --keep FOLDER              # keep finished blocks there, and resume from them
+    python -m benchmarks.soak --first-block 17           # only blocks 17 to 19 of 20, if others ran elsewhere
 
-A new object every eight trajectories: of all classes in turn, bottles under a jerk. Counts the draws that were thrown
-away (non-finite, or deeper in the pad than the limit; no other is left), outcomes, what had not settled, and holds the
-wrench at rest against the weight, and the energy out of contact against the start's. All is simulated in whole blocks,
-of `BLOCK` trajectories, or fewer where fewer are asked for. `benchmarks.hidden --soaked` asks what decides them.
+Every eight trajectories have a new object, of all classes in turn, or a bottle on the jerked pad. The benchmark counts
+discarded draws (only those that are non-finite or deeper in the pad than the limit), outcomes and unsettled
+trajectories. It compares the wrench at rest with the weight, and the energy out of contact with that of the start.
+Blocks have `BLOCK` trajectories, or fewer if fewer are requested. `benchmarks.hidden --soaked` analyses kept blocks.
 """
 
 import argparse
@@ -33,14 +33,14 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "inclined": physics.Inclined(),
     "perturbed": physics.Perturbed(),
 }
-NUM = 8  # trajectories of an object
-BLOCK = 504  # trajectories simulated by one call, if as many are asked for
+NUM = 8  # trajectories of each object
+BLOCK = 504  # trajectories simulated by one call, unless fewer are requested
 
 
 def excess_energy(
     rigid: tuple[np.ndarray, np.ndarray, np.ndarray], pose: np.ndarray, velocity: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:
-    """Kinetic and potential energy of each frame less the first one's, in units of the weight times 50 mm.
+    """Kinetic and potential energy of each frame minus that of the first, in units of the weight times 50 mm.
 
     Args:
         rigid: mass (n,), centre of mass (n, 3), inertia (n, 3, 3).
@@ -59,7 +59,7 @@ def excess_energy(
 
 
 def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
-    """What became of one block of trajectories of a scenario, arrays (size, ...); `size` is a multiple of NUM."""
+    """Simulate a block of trajectories. Returns arrays (size, ...) of results. `size` is a multiple of NUM."""
     scenario = SCENARIOS[name]
     first = index * size // NUM
     items = bodies(("bottle",) if name == "perturbed" else objects.CATEGORIES, size // NUM, first)
@@ -93,21 +93,21 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
 
 def claim(folder: Path, name: str, size: int) -> None:
-    """Insists that a folder's blocks of a scenario are of these settings; see `dataset.claim`."""
+    """Write the settings of a folder's blocks of a scenario, or raise an error if they differ (`dataset.claim`)."""
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     dataset.claim(folder / f"{name}.json", settings)
 
 
 def soaked(folder: Path, name: str) -> Starts:
-    """What the kept blocks of a scenario began with and how they ended; nothing was rolled again.
+    """The starts and outcomes of the kept blocks of a scenario. No start was rolled again.
 
     Raises:
-        FileNotFoundError: The folder holds none.
-        ValueError: They were made with other settings; names the first that differs.
+        FileNotFoundError: the folder has no blocks.
+        ValueError: the blocks were made with other settings. The message names the first that differs.
     """
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):
-        raise FileNotFoundError(f"{folder} holds no block {name}-*.npz: run python -m benchmarks.soak --keep {folder}")
+        raise FileNotFoundError(f"{folder} has no block {name}-*.npz: run python -m benchmarks.soak --keep {folder}")
     claim(folder, name, json.loads(claimed.read_text())["block"])
     parts = []
     for path in paths:
@@ -118,7 +118,7 @@ def soaked(folder: Path, name: str) -> Starts:
 
 
 def report(name: str, found: dict[str, np.ndarray]) -> str:
-    """The figures of one scenario, as lines."""
+    """The results of one scenario as lines of text."""
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}
     lines = [
@@ -143,7 +143,7 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
 
 def main(num: int, names: list[str], keep: Path, *, first: int = 0) -> None:
-    """All blocks from the first one asked for on that are not kept yet, then the figures of these blocks."""
+    """Simulate the blocks from `first` on that are not kept yet, then print the results of these blocks."""
     size = min(BLOCK, -(-num // NUM) * NUM)
     for name in names:
         claim(keep, name, size)
@@ -162,11 +162,11 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--num", type=int, default=10_000, help="trajectories of each scenario")
     parser.add_argument("--only", choices=list(SCENARIOS), help="one scenario instead of all")
-    parser.add_argument("--first-block", type=int, default=0, help=f"leave out those before it; each is {BLOCK}")
+    parser.add_argument("--first-block", type=int, default=0, help=f"skip earlier blocks of {BLOCK} trajectories each")
     parser.add_argument("--keep", type=Path, help="folder that keeps finished blocks")
     arguments = parser.parse_args()
     if not 0 <= arguments.first_block * BLOCK < max(arguments.num, 1):
-        parser.error(f"--first-block {arguments.first_block}: there are blocks 0 to {(arguments.num - 1) // BLOCK}")
+        parser.error(f"--first-block is {arguments.first_block}, but must be 0 to {(arguments.num - 1) // BLOCK}")
     names = [arguments.only] if arguments.only else list(SCENARIOS)
     run = functools.partial(main, arguments.num, names, first=arguments.first_block)
     if arguments.keep is None:

@@ -1,4 +1,4 @@
-"""Objects by number, how their trajectories begin and end, and the frames that are seen of the beginning."""
+"""Objects by number, the starts and outcomes of their trajectories, and images of the starts."""
 
 import concurrent.futures
 import os
@@ -21,7 +21,7 @@ _settled = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))  # along +z
 
 
 class Starts(NamedTuple):
-    """What trajectories begin with and how they end, a row each."""
+    """Starts and outcomes of trajectories, one row each."""
 
     body: np.ndarray  # (n,) index of the object
     pose: np.ndarray  # (n, 7) frame 0
@@ -35,21 +35,22 @@ class Starts(NamedTuple):
 
 
 def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
-    """Objects of some families in turn, by their numbers, each from a key of its own."""
+    """Objects of the given categories in turn. The number of an object is the seed of its key."""
     numbers = range(first, first + count)
     return [objects.make(jax.random.key(i), categories[i % len(categories)]) for i in numbers]
 
 
 def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass (k,) in kg, centre of mass (k, 3) in m and inertia (k, 3, 3) of a body with a nominal shell, filled to
-    shares (k,), settled along +z.
+    """Mass (k,) in kg, centre of mass (k, 3) in m and inertia (k, 3, 3) of a body at several fills (k,).
+
+    The shell is nominal, and the contents have settled along +z.
     """
     mass, com, inertia = _settled(body, jnp.asarray(fill, jnp.float32), jnp.ones(len(fill)))
     return np.asarray(mass), np.asarray(com), np.asarray(inertia)
 
 
 def rigid_of(items: list[objects.Body], traj: physics.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass (n,) in kg, centre of mass (n, 3) in m and inertia (n, 3, 3) of each trajectory; they are body-major."""
+    """Mass (n,) in kg, centre of mass (n, 3) in m and inertia (n, 3, 3) of body-major trajectories."""
     owner, parts = np.asarray(traj.body), []
     for index, body in enumerate(items):
         own = jax.tree.map(lambda x, mine=owner == index: x[mine], traj.hidden)
@@ -67,15 +68,15 @@ def roll(
     again: int = 0,
     reroll: tuple[str, ...] = (),
 ) -> Starts:
-    """Simulates `num` starts of each object, and the first `again` of each once more with other contents.
+    """Simulate `num` starts of each object, and the first `again` of each once more with other contents.
 
     Args:
         key: consumed.
         items: the objects.
-        scenario: what happens to them.
-        num: starts of each.
-        again: how many of these are rolled again.
-        reroll: fields of `physics.Hidden` that are drawn anew then.
+        scenario: the scenario.
+        num: number of starts of each object.
+        again: number of these starts that are rolled again.
+        reroll: fields of `physics.Hidden` that are then drawn anew.
     """
     key, fresh = jax.random.split(key)
     with tqdm(total=len(items) * num, unit="starts") as bar:
@@ -107,7 +108,7 @@ def roll(
 
 
 def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndarray]:
-    """Visual and tactile first frames, uint8 (n, 64, 64, 3), of rows sorted by object."""
+    """Render visual and tactile first frames, uint8 (n, 64, 64, 3). The rows must be sorted by object."""
 
     def one(index: int) -> tuple[np.ndarray, ...]:
         own = starts.body == index
@@ -122,7 +123,7 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """What a folder keeps under a name, or what is made now (and kept)."""
+    """Load the starts that a folder keeps under a name, or make and keep them."""
     path = None if folder is None else folder / f"{name}.npz"
     if path is not None and path.exists():
         with np.load(path) as file:

@@ -1,9 +1,9 @@
-"""What a touch tells: the mass of held-out objects read from their uint8 tactile frames at rest.
+"""The mass of held-out objects, read from their uint8 tactile frames at rest.
 
     python -m benchmarks.touch [runs/freefall/dataset]
 
-Ridge regression of log mass on simple image features (sums, sizes, depths), fitted on training objects; the share of
-imprint pixels at 0 or 255; both over the last frames of settled objects on the pad.
+Ridge regression of log mass on simple image features (sums, sizes, depths), fitted on training objects, and the share
+of imprint pixels at 0 or 255. Both use the last frames of settled objects on the pad.
 """
 
 import sys
@@ -15,7 +15,7 @@ from sts_jax import dataset, objects, physics
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Simple numbers of tactile images `uint8 (n, h, w, 3)`: how much, how wide and how deep the imprint is."""
+    """Simple features of tactile images `uint8 (n, h, w, 3)`: sums, size and depth of the imprint."""
     ratio = np.clip(tactile.astype(np.float64), 1, 255) / blank.astype(np.float64)
     darkness = np.clip(-np.log(ratio).min(-1), 0, None)
     signed = -np.log(ratio).mean(-1)
@@ -29,14 +29,14 @@ def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0) -> np.ndarray:
-    """What a ridge regression of y on the standardised x says of x_new."""
+    """Predict y at `x_new` by ridge regression on the standardised x."""
     centre, scale, level = x.mean(0), x.std(0), y.mean()
     a, b = (x - centre) / scale, (x_new - centre) / scale
     return level + b @ np.linalg.solve(a.T @ a + penalty * np.eye(a.shape[1]), a.T @ (y - level))
 
 
 def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Of every imprint pixel of images `uint8 (n, h, w, 3)`, whether a channel is at 0 or 255."""
+    """Whether a channel is at 0 or 255, for every imprint pixel of images `uint8 (n, h, w, 3)`."""
     touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
     return np.any((tactile == 0) | (tactile == 255), -1)[touched]
 

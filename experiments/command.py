@@ -14,16 +14,16 @@ from experiments.progress import say
 from sts_jax import _files, dataset
 from sts_jax.compilation import cache_folder
 
-LEAST_OBJECTS = 10  # of a folder, so that whole ones can be held out to validate and to test
+LEAST_OBJECTS = 10  # smallest number of objects in a folder, so that some can be held out for validation and test
 
 
 def _folder(words: list[str]) -> Path:
     if not words[0].strip():
-        raise ValueError("the name of the folder is empty: give a path, '.' for the current directory")
+        raise ValueError("the name of the folder is empty: give a path, or '.' for the current directory")
     return Path(words[0])
 
 
-# An empty name, often that of an unset shell variable, would be the current directory.
+# An empty name, often from an unset shell variable, would be the current directory.
 Folder = Annotated[
     Path,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -38,26 +38,26 @@ Folder = Annotated[
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """What the command line of an experiment says."""
+    """Options of the command line of an experiment."""
 
     workdir: Folder
     preset: Literal["smoke", "default", "long", "paper"] = "default"
-    # the state-space model, or the paper's models; the preset "paper" has only the latter
+    # the state-space model or the paper's models (the preset "paper" has only the latter)
     model: Literal["statespace", "paper"] | None = None
-    plan: bool = False  # print seconds per stage from a short measurement, and stop
+    plan: bool = False  # print the expected seconds of each stage, from a short measurement, and stop
     hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
     objects: Folder | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
-    # objects of these classes only, of the eight or of the folder's; if not given: the experiment's own, and where a
-    # folder has none of those all of the folder's
+    # objects of these classes only, of the eight or of the folder (default: the experiment's classes, or all classes of
+    # a folder that has none of them)
     classes: tuple[str, ...] = ()
-    scale: float | None = None  # m, of one unit of a folder's files: 0.001 where they are in millimetres
-    up: Literal["x", "y", "z"] | None = None  # the axis of a folder's files that points up
-    parts: bool = False  # what a hull fits badly collides as convex parts
+    scale: float | None = None  # m, length of one unit of the folder's files: 0.001 for millimetres
+    up: Literal["x", "y", "z"] | None = None  # the axis of the folder's files that points up
+    parts: bool = False  # convex parts for objects whose hull fits badly
     debug: bool = False  # show the traceback of every error
 
 
 def run(presets: Mapping[str, stages.Config], workdir: str, description: str | None) -> None:
-    """An experiment from the command line."""
+    """Run an experiment from the command line."""
     args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
     with errors.on_one_line(debug=args.debug):
         sts.enable_compilation_cache()
@@ -69,22 +69,22 @@ def run(presets: Mapping[str, stages.Config], workdir: str, description: str | N
 
 
 def configure(config: stages.Config, args: Args) -> stages.Config:
-    """A preset as the command line asks for it; the objects of a folder are read, and listed in the work directory.
+    """Apply the options to a preset. The objects of a folder are read, and listed in the work directory.
 
     Raises:
-        FileNotFoundError: No such folder of objects.
-        ValueError: An unknown class; or the folder has too few objects that can be used.
+        FileNotFoundError: The folder of objects does not exist.
+        ValueError: A class is unknown, two options do not fit together, or the folder has too few usable objects.
     """
     scenario = sts.physics.variant(config.collection.scenario, args.hidden)
     collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)
     if args.objects is None and (args.scale is not None or args.up is not None):
-        raise ValueError("--scale and --up are of the files of a folder: give it with --objects")
+        raise ValueError("--scale and --up are for the files of a folder: give it with --objects")
     if args.objects is not None:
         collection = with_meshes(collection, args.objects, args.workdir, args.classes, scale=args.scale, up=args.up)
     elif args.classes:
         unknown = sorted(set(args.classes) - set(sts.objects.CATEGORIES))
         if unknown:
-            raise ValueError(f"unknown classes {', '.join(unknown)}: take some of {', '.join(sts.objects.CATEGORIES)}")
+            raise ValueError(f"unknown classes {', '.join(unknown)}: choose among {', '.join(sts.objects.CATEGORIES)}")
         collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
     if args.model is not None:
         if config.model == "paper" and args.model != "paper":
@@ -102,21 +102,21 @@ def with_meshes(
     scale: float | None = None,
     up: Literal["x", "y", "z"] | None = None,
 ) -> dataset.Collection:
-    """A collection of the objects of a folder, with about as many trajectories; lists them in `objects.txt`.
+    """A collection of the objects of a folder, with about as many trajectories. Lists the objects in `objects.txt`.
 
     Args:
-        collection: Of procedural objects.
+        collection: The collection of procedural objects.
         folder: See `objects.library`.
-        workdir: Where the listing goes.
-        classes: Of these classes only. If none is given, of those of the collection's that the folder has, or of all
-            where it has none of them.
-        scale, up: Of the files, see `objects.library`.
+        workdir: Folder for the listing.
+        classes: The classes to use. Empty means the classes of the collection that the folder has, or all classes of
+            the folder if it has none of them.
+        scale, up: See `objects.library`.
     """
     there = dataset.mesh_classes(folder)
     taken = classes or tuple(name for name in there if name in collection.categories) or there
     others = [name for name in there if name not in taken]
     path = workdir / "objects.txt"
-    with _files.lock(workdir):  # another run there keeps its listing
+    with _files.lock(workdir):  # another run in the folder keeps its listing
         meshes, listing = dataset.survey_meshes(
             folder,
             collection.scenario,
@@ -129,13 +129,13 @@ def with_meshes(
         )
         if others:
             listing += f"classes left out: {', '.join(others)}; --classes takes others\n"
-        # Behind the listing is what collecting left out.
+        # Collecting appends the objects that it left out to the listing.
         if not (path.exists() and path.read_text(errors="replace").startswith(listing)):
             _files.write_bytes(path, listing.encode())
     say(f"classes taken: {', '.join(taken)}" + (f"; left out: {', '.join(others)}" if others else ""))
-    say(f"{len(meshes.names)} objects can be used; {path} has them and what was left out")
+    say(f"{len(meshes.names)} objects can be used. {path} lists them and the objects left out")
     if len(meshes.names) < LEAST_OBJECTS:
-        raise ValueError(f"{folder}: {len(meshes.names)} objects are too few to hold some out: give {LEAST_OBJECTS}")
+        raise ValueError(f"{folder}: holding some out needs {LEAST_OBJECTS} usable objects, got {len(meshes.names)}")
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))
         for count in (collection.num_per_object, collection.rendered_per_object)

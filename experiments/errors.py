@@ -1,11 +1,11 @@
-"""Errors as the command line shows them."""
+"""Errors on the command line."""
 
 import contextlib
 from collections.abc import Iterator
 
 from sts_jax.dataset import LockedError
 
-# The types of the errors that the library raises on purpose.
+# The types of errors that the library raises on purpose.
 MENDABLE = (
     OSError,
     ValueError,

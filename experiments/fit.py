@@ -1,13 +1,14 @@
-"""Where an object lies on the sensor, by descending the derivatives of what the sensor would see of it.
+"""Fit the pose of an object on the sensor to a tactile image, through the derivatives of the renderer.
 
-    python -m experiments.fit scissors --out fit.png     # a minute or two; any class or mesh file, as experiments.sense
+    python -m experiments.fit scissors --out fit.png     # a minute or two
     python -m experiments.fit mug.obj --longest-side 0.1 --mass 0.3 --sensor soft.json
 
-One tactile image is the target: of the object at rest under its weight, in eight bits. Known are the object, the face
-it rests on and its weight; x, y and yaw are sought from ten starts, each 3 mm and 10 degrees off. Prints a line a start
-and how many end within 0.2 mm and 1 degree (of scissors, fork and mouse all ten; of scissors with `--seed 1` eight),
-and draws the target, the first start, where it ended and every start's way. To fit an image of your own, give it to
-`descend`.
+Takes any class or mesh file, as experiments.sense does. The target is one tactile image of the object at rest under its
+weight, in eight bits. The object, the face it rests on and its weight are known. x, y and yaw are fitted from ten
+starts, each 3 mm and 10 degrees off. Prints a line per start and the number of starts that end within 0.2 mm and 1
+degree: all ten for scissors, fork and mouse, and eight for scissors with `--seed 1`. Draws the target, the first start
+and its end, and the path of every start. To fit an image of your own, use it as the target of `slope` in the function
+that `descend` minimises.
 """
 
 import dataclasses
@@ -29,47 +30,48 @@ from experiments import sense
 from experiments.errors import on_one_line
 from sts_jax import tactile
 
-# m, of the Gaussian that images are compared under: first as far as the tips of what is 12 cm long move in 10 degrees
+# m, standard deviations of the Gaussian blur under which images are compared. The first is about the distance by which
+# the tips of a 12 cm long object move in a turn of 10 degrees.
 BLURS = (0.012, 0.006, 0.003, 0.0015)
-STEPS = 10  # at most, with each blur
-SETTLED = (1e-5, 1e-5, 1e-3)  # m, m, rad: a step that is shorter is the last with a blur
-OFF = (0.003, 10.0)  # m, degrees: how far off a start is
-GOAL = (0.0002, 1.0)  # m, degrees: what counts as found
-SEEN = 0.02  # change of a pixel's value by touch that counts as an imprint
-FAINT = 0.25  # of what 3 mm change in the image: if 10 degrees change less, there is no telling the yaw
+STEPS = 10  # largest number of steps with each blur
+SETTLED = (1e-5, 1e-5, 1e-3)  # m, m, rad: a shorter step is the last one with a blur
+OFF = (0.003, 10.0)  # m, degrees: error of a start
+GOAL = (0.0002, 1.0)  # m, degrees: largest error of a successful fit
+SEEN = 0.02  # smallest change of a pixel's value by touch that counts as an imprint
+FAINT = 0.25  # smallest image change by 10 degrees, relative to that by 3 mm, at which the yaw can be determined
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(sense.Config):
-    """What lies where, and how often it is sought."""
+    """The object, its pose, and the number of starts."""
 
     mesh: Annotated[str, tyro.conf.Positional]  # a mesh file or the name of a class
     out: Path = Path("fit.png")  # the picture
     resolution: tuple[int, int] = (240, 240)  # height and width, pixels
-    position: tuple[float, float] = (0.0073, -0.0041)  # m, of the middle of its bounding box: what is sought
-    turn: float = 23.7  # degrees, about the vertical: what is sought
+    position: tuple[float, float] = (0.0073, -0.0041)  # m, of the middle of its bounding box, to be found
+    turn: float = 23.7  # degrees, about the vertical, to be found
     starts: int = 10
 
-    # of experiments.sense alone
+    # options of experiments.sense only
     crop: Annotated[bool, tyro.conf.Suppress] = False
     light: Annotated[float, tyro.conf.Suppress] = 1.0
     height: Annotated[float, tyro.conf.Suppress] = 0.0
 
 
 class Slope(NamedTuple):
-    """How an image differs from the target, and how that changes with (x, y, yaw)."""
+    """The difference of an image from the target, and its derivatives by (x, y, yaw)."""
 
     image: jax.Array  # (h, w, 3)
     loss: jax.Array  # (), mean squared difference r
     gradient: jax.Array  # (3,), J^T r / n
-    curvature: jax.Array  # (3, 3), Gauss and Newton's J^T J / n
+    curvature: jax.Array  # (3, 3), Gauss-Newton matrix J^T J / n
 
 
 @functools.partial(jax.jit, static_argnames="resolution")
 def touch(
     sensor: sts.Sensor, body: sts.objects.Body, pose: jax.Array, wrench: jax.Array, *, resolution: tuple[int, int]
 ) -> jax.Array:
-    """The tactile image as a camera has it, in eight bits."""
+    """The tactile image, rounded to eight bits as by a camera."""
     return jnp.round(255 * sts.sense(sensor, body, pose, wrench, resolution=resolution).tactile) / 255
 
 
@@ -82,7 +84,7 @@ def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
-    """A vertical force whose line of action goes with the object, see `moved`."""
+    """The wrench of a vertical force whose line of action moves with the object, see `moved`."""
     force = wrench[2]
     x, y = -wrench[4] / force - pose[0], wrench[3] / force - pose[1]
     cos, sin = jnp.cos(at[2]), jnp.sin(at[2])
@@ -102,10 +104,10 @@ def slope(
     *,
     resolution: tuple[int, int],
 ) -> Slope:
-    """The image of the object moved by `at`, beside the target under a blur (m).
+    """Compare the image of the object moved by `at` with the target, both under a blur (m).
 
-    How deep it sinks in and how it leans is found anew wherever it is. In the derivative both stay what they are: the
-    pad is the same everywhere.
+    The depth and the tilt of the object are solved for at each place. The derivative takes them as constant, because
+    the pad is the same everywhere.
     """
     frame = sts.sense(sensor, body, moved(pose, at), carried(wrench, pose, at), resolution=resolution)
     pitch = frame.window[2:] / jnp.array([resolution[1], resolution[0]])
@@ -121,14 +123,14 @@ def slope(
 
 
 def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> list[tuple[np.ndarray, Slope]]:
-    """Levenberg and Marquardt's steps down the slope, with less and less blur.
+    """Minimise the loss by Levenberg-Marquardt steps, with less and less blur.
 
     Args:
-        look: the slope at (x, y, yaw) under a blur (m).
+        look: function that returns the slope at (x, y, yaw) under a blur (m).
         start: (x, y, yaw): m, m, rad.
 
     Returns:
-        Where it was, and what it saw there; the start first, and again with each blur.
+        The accepted (x, y, yaw) and their slopes, beginning with the start. Each blur begins with the last ones again.
     """
     path, at = [], start
     for blur in BLURS:
@@ -150,12 +152,12 @@ def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> li
 
 
 def errors(at: np.ndarray) -> tuple[float, float]:
-    """How far off (x, y, yaw) is: mm and degrees."""
+    """Errors of (x, y, yaw): distance (mm) and angle (degrees)."""
     return 1e3 * float(np.hypot(at[0], at[1])), float((np.rad2deg(at[2]) + 180) % 360 - 180)
 
 
 def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
-    """The target, the first start and where it ended, what they lack of it, and all ways in x and y."""
+    """Draw the target, the first start and its end, their differences from the target, and all paths in x and y."""
     (_, first), (_, last) = paths[0][0], paths[0][-1]
     flat = np.median(target, axis=(0, 1))
     touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN
@@ -189,16 +191,16 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 
 
 def main(config: Config) -> None:
-    """Lay the object on the pad, look once, seek it from every start, draw.
+    """Place the object on the pad, render the target, fit it from every start, and draw the result.
 
     Raises:
-        ValueError: see `sense.check`; or nothing presses on the pad, or there is no start.
+        ValueError: see `sense.check`, or nothing presses on the pad, or there is no start.
     """
     sense.check(config)
     if config.starts < 1:
-        raise ValueError(f"starts is {config.starts}: give at least 1")
+        raise ValueError(f"starts is {config.starts}, but it must be at least 1")
     if config.force == 0:
-        raise ValueError("force is 0: what does not press leaves no imprint to fit, give one above 0")
+        raise ValueError("force is 0, but it must be > 0 to leave an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     body = sense.read(config, config.mesh)
     pose, wrench, words = sense.lay(config, sensor, body)
@@ -206,7 +208,7 @@ def main(config: Config) -> None:
     target = touch(sensor, body, *given, resolution=config.resolution)
     empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)
     if np.abs(target - empty).max() < SEEN:
-        raise ValueError(f"{config.mesh} leaves no imprint in view: press with more force, or lay it elsewhere")
+        raise ValueError(f"{config.mesh} leaves no imprint in view: increase force or change position")
     print(f"{config.mesh} on {words}", flush=True)
 
     def look(at: np.ndarray, blur: float) -> Slope:
@@ -219,7 +221,7 @@ def main(config: Config) -> None:
     if by_turn < FAINT * by_shift:
         print(
             f"note: {OFF[1]:g} degrees change the image {by_turn / by_shift:.2f} times as much as {1e3 * OFF[0]:g} mm: "
-            "the footprint is nearly round, and there is no telling its yaw"
+            "the footprint is nearly round, and its yaw cannot be determined"
         )
     random = np.random.default_rng(config.seed)
     paths, found = [], 0

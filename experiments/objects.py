@@ -1,11 +1,12 @@
-"""A contact sheet of the object families: one row each, from a key; and how well what collides fits what is seen.
+"""Draw a contact sheet of procedural objects, one row per class, and print how well their collision hulls fit.
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-About half a minute on two CPU cores for 8 x 10 objects. `--view side` is what a person sees, `--view below` what the
-sensor faces; `--shuffle` deals the objects out without rows or names, for someone else to tell apart. Prints a line an
-object: size, faces, collision hull, and how far the surface sticks out of the hull at most / how far the hull stands
-off the surface; `--parts` makes convex parts first of what a hull fits badly (some ten seconds each).
+About half a minute on two CPU cores for 8 x 10 objects. `--view side` is the view of a person, `--view below` that of
+the sensor. `--shuffle` draws the objects in random order without names, so that others can try to recognise them.
+Prints a line per object: size, faces, collision hull, and how far the surface sticks out of the hull at most / how far
+the hull stands off the surface. `--parts` first decomposes objects whose hull fits badly into convex parts (some ten
+seconds each).
 """
 
 import dataclasses
@@ -22,9 +23,9 @@ import sts_jax as sts
 from experiments import errors, output
 from sts_jax import optics
 
-DISTANCE = 0.42  # m, from the photographer to the object
+DISTANCE = 0.42  # m, from the camera to the object
 FIELD = 0.36  # rad, so that 150 mm fill the frame
-EYES = {  # direction to the photographer: x right, y back, z up
+EYES = {  # direction to the camera: x right, y back, z up
     "quarter": (-0.45, -0.75, 0.5),
     "side": (-0.45, -0.85, 0.2),
     "above": (0.0, -0.05, 1.0),
@@ -34,21 +35,21 @@ EYES = {  # direction to the photographer: x right, y back, z up
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """A contact sheet."""
+    """A contact sheet of procedural objects."""
 
     out: Path = Path("objects.png")  # the picture
     seed: int = 0
-    num: int = 10  # objects of each family
+    num: int = 10  # objects per class
     categories: tuple[str, ...] = sts.objects.CATEGORIES
     view: Literal["quarter", "side", "above", "below"] = "quarter"
     size: int = 160  # pixels, side of one object's picture
-    parts: bool = False  # what a hull fits badly collides as convex parts
-    shuffle: bool = False  # in random order, numbered instead of named; the answers go to OUT with suffix .txt
+    parts: bool = False  # convex parts for objects whose hull fits badly
+    shuffle: bool = False  # random order, numbers instead of names (the answers go to OUT with suffix .txt)
 
 
 @jax.jit(static_argnames=("size",))
 def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.Array:
-    """One body on white, (size, size, 3); what lies flat is looked at from higher up."""
+    """One body on white, (size, size, 3). Flat objects are shown from higher up."""
     extent = jnp.max(body.vertices, 0) - jnp.min(body.vertices, 0)
     flat = (extent[2] < 0.3 * jnp.maximum(extent[0], extent[1])) & (direction[2] > 0) & (direction[2] < 0.9)
     direction = direction + jnp.where(flat, jnp.array([0.0, 0.0, 0.5]), jnp.zeros(3))
@@ -68,7 +69,7 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
 
 
 def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
-    """The line of one object, as `sts.objects.describe` has it; with `parts` as `dataset.make_bodies` makes it."""
+    """The line of one object, as in `sts.objects.describe`, with `parts` decomposed as in `dataset.make_bodies`."""
     found = sts.objects.facts(body, apart := sts.objects.gaps(body))
     if parts and apart[1] > sts.objects.HOLLOW:
         body = sts.objects.decompose(body)
@@ -77,12 +78,12 @@ def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool)
 
 
 def main(config: Config) -> None:
-    """Make the objects, describe them, take their portraits, compose the sheet."""
+    """Make the objects, print their descriptions, render them, and compose the sheet."""
     if config.num < 1:
-        raise ValueError(f"num is {config.num}: give at least 1 object of each family")
+        raise ValueError(f"num is {config.num}, but it must be at least 1 object per class")
     unknown = set(config.categories) - set(sts.objects.CATEGORIES)
     if unknown:
-        raise ValueError(f"unknown categories {sorted(unknown)}: take some of {', '.join(sts.objects.CATEGORIES)}")
+        raise ValueError(f"unknown categories {sorted(unknown)}: choose among {', '.join(sts.objects.CATEGORIES)}")
     output.check_picture(config.out)
     key = jax.random.key(config.seed)
     drawn = []

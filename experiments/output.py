@@ -1,9 +1,9 @@
-"""Where an experiment writes: checked before any work is done."""
+"""Checks of output paths before any work is done."""
 
 import tempfile
 from pathlib import Path
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf")  # written by Pillow and by Matplotlib
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf")  # formats that Pillow and Matplotlib write
 
 
 def check_picture(path: Path) -> None:
@@ -11,32 +11,32 @@ def check_picture(path: Path) -> None:
 
     Raises:
         OSError: its folder does not exist or is not writable, or the path is a folder.
-        ValueError: the suffix is of no known format.
+        ValueError: the suffix is not that of a known format.
     """
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; give the name of a picture, such as {path / 'picture.png'}")
+        raise IsADirectoryError(f"{path} is a folder: give the name of a picture, such as {path / 'picture.png'}")
     if path.suffix.lower() not in PICTURES:
-        raise ValueError(f"{path}: its suffix is {path.suffix!r}; it must be one of {', '.join(PICTURES)}")
+        raise ValueError(f"{path} has the suffix {path.suffix!r}, but it must be one of {', '.join(PICTURES)}")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder for {path.name}: make it, or give --out")
+        raise FileNotFoundError(f"{path.parent} does not exist: make it for {path.name}, or give another --out")
     _write(path.parent)
     if path.exists():
         try:
             path.open("ab").close()
         except OSError as error:
-            raise type(error)(f"{path}: cannot be overwritten ({error.strerror}): give another --out") from error
+            raise type(error)(f"{path} cannot be overwritten ({error.strerror}): give another --out") from error
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, or raise an error unless an existing one can be written to.
+    """Make a folder if it does not exist, and check that it can be written to.
 
     Raises:
-        OSError: it cannot be made or written to.
+        OSError: the folder cannot be made or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise type(error)(f"{path}: cannot be made ({error.strerror}): give another --out") from error
+        raise type(error)(f"{path} cannot be made ({error.strerror}): give another --out") from error
     _write(path)
 
 
@@ -44,4 +44,4 @@ def _write(folder: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise type(error)(f"{folder}: cannot be written to ({error.strerror}): give another --out") from error
+        raise type(error)(f"{folder} cannot be written to ({error.strerror}): give another --out") from error

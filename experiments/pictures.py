@@ -1,4 +1,4 @@
-"""A trajectory from outside and through the sensor, as an experiment shows it."""
+"""Pictures and descriptions of a trajectory, from outside and through the sensor."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +11,7 @@ from sts_jax import dataset, evaluation
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
-    """The first fully rendered trajectory with the most telling outcome; there must be one."""
+    """Draw the first fully rendered trajectory with the most informative outcome. There must be one."""
     full = data.full_trajectories()
     rank = [collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
     index = int(full[np.argmin(rank)])
@@ -31,9 +31,9 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
 
 
 def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
-    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the gravity of its end drawn downwards.
+    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the final gravity pointing down.
 
-    What fell off and was frozen is no longer drawn.
+    An object that fell off is not drawn once its pose is frozen.
     """
     size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
@@ -42,7 +42,7 @@ def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor:
 
 
 def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]) -> str:
-    """One trajectory in words: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
+    """Describe one trajectory: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
     outcome = sts.physics.Outcome(int(trajectory["outcome"])).name.lower().replace("_", " ")
     words = [f"a {name} {outcome}"]
     words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]

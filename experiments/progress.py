@@ -1,4 +1,4 @@
-"""What a user sees while work goes on."""
+"""Progress that is shown to the user."""
 
 import sys
 import time
@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 
 class Bar:
-    """A progress bar on a terminal, a plain line every ten seconds or so elsewhere."""
+    """A progress bar on a terminal, and elsewhere a plain line about every ten seconds."""
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
@@ -37,5 +37,5 @@ class Bar:
 
 
 def say(text: str) -> None:
-    """One line for the user, on standard error."""
+    """Print one line for the user, on standard error."""
     print(text, file=sys.stderr, flush=True)

@@ -1,12 +1,12 @@
-"""One object on the sensor and all that it sees of it, in one picture: what one tries first.
+"""Render one object on the sensor, with all outputs in one picture. Try this first.
 
-    python -m experiments.sense bottle --out bottle.png     # one of the eight classes; 20 s, the next time 5
+    python -m experiments.sense bottle --out bottle.png     # one of the eight classes, 20 s (5 s the next time)
     python -m experiments.sense mug.obj --longest-side 0.1 --mass 0.3 --resolution 1232 1640
     python -m experiments.sense classes --out classes.png --resolution 1232 1640    # all eight, about a minute
 
-The object lies at rest under its own weight, unless it is told otherwise; the picture has both streams, the image half
-way between them, depth, segmentation and pressure, each pixel for pixel. Prints what it is, how it rests and how deep
-it sinks in.
+The object is at rest under its own weight unless options change this. The picture shows both streams, the image halfway
+between them, depth, segmentation and pressure, pixel for pixel. Prints the size of the object, how it rests and how
+deep it sinks in.
 """
 
 import dataclasses
@@ -30,48 +30,49 @@ from experiments import errors, output
 from sts_jax import tactile
 
 G = 9.81  # m/s^2
-FILL = 0.5  # share of its interior that a container holds
-HEAD = 22  # pixels, height of the line over a panel
-SHEET = (234, 312)  # pixels, one picture on the sheet of all classes
-NARROWEST = 160  # pixels, of a panel: smaller images are shown with larger pixels
+FILL = 0.5  # share of a container's interior that is filled
+HEAD = 22  # pixels, height of the caption above a panel
+SHEET = (234, 312)  # pixels, size of one picture on the sheet of all classes
+NARROWEST = 160  # pixels, width of a panel, to which smaller images are magnified
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """What is shown."""
+    """The object, its pose and load, and the picture."""
 
     mesh: Annotated[str, tyro.conf.Positional]  # a mesh file, the name of a class, or `classes` for all eight
     out: Path = Path("sense.png")  # the picture
-    sensor: Path | None = None  # a file of Sensor.save; the paper's sensor if not given
+    sensor: Path | None = None  # a file written by Sensor.save (default: the paper's sensor)
     resolution: tuple[int, int] = (480, 640)  # height and width, pixels
-    crop: bool = False  # the square (the image's aspect) around the object
+    crop: bool = False  # show only a window around the object, in the image's aspect ratio
     light: float = 0.5  # share of the LEDs' power in the picture between the streams
 
-    rest: int = 0  # on which of the faces that it can rest on, the likeliest first
+    rest: int = 0  # index of the face that it rests on, the likeliest first
     position: tuple[float, float] = (0.0, 0.0)  # m, of the middle of its bounding box
-    height: float = 0.0  # m, of its lowest point over the gel
+    height: float = 0.0  # m, of its lowest point above the gel
     turn: float = 0.0  # degrees, about the vertical
     tilt: tuple[float, float] = (0.0, 0.0)  # degrees, from rest, about x and about y
 
-    mass: float | None = None  # kg; if not given: of a shell with half of it full of water
-    force: float | None = None  # N, upwards on its centre of mass; if not given its weight, or 0 where it is in the air
+    mass: float | None = None  # kg (default: that of a shell half full of water)
+    force: float | None = None  # N, upwards on its centre of mass (default: its weight, or 0 in the air)
 
-    longest_side: float | None = None  # m, to which a mesh file is scaled
-    scale: float | None = None  # m, of one unit of a mesh file: 0.001 where it is in millimetres
-    up: Literal["x", "y", "z"] | None = None  # the axis of a mesh file that points up; y in glTF, else z
-    faces: int | None = None  # decimate a mesh file that has more
-    texture: Path | None = None  # an image to lay on a mesh file's texture coordinates
-    seed: int = 0  # which object of a class
+    longest_side: float | None = None  # m, longest side to which a mesh file is scaled
+    scale: float | None = None  # m, length of one unit of a mesh file: 0.001 for millimetres
+    up: Literal["x", "y", "z"] | None = None  # the axis of a mesh file that points up (default: y for glTF, else z)
+    faces: int | None = None  # decimate a mesh file that has more faces
+    texture: Path | None = None  # an image to use as the texture of a mesh file
+    seed: int = 0  # selects the object of a class
 
 
 def check(config: Config) -> None:
-    """Insists on what can be shown.
+    """Check that an object can be shown as configured.
 
     Raises:
-        ValueError: something cannot; it is named.
+        ValueError: an option is out of range. The message names it.
+        OSError: the picture cannot be written.
     """
     if min(config.resolution) < 1:
-        raise ValueError(f"resolution is {config.resolution}: give a height and a width of at least 1 pixel")
+        raise ValueError(f"resolution is {config.resolution}, but height and width must be at least 1 pixel")
     numbers = {
         "position": config.position,
         "height": (config.height,),
@@ -82,24 +83,24 @@ def check(config: Config) -> None:
     }
     for name, values in numbers.items():
         if not all(math.isfinite(value) for value in values):
-            raise ValueError(f"{name} is {getattr(config, name)}: give finite numbers")
+            raise ValueError(f"{name} is {getattr(config, name)}, but it must be finite")
     for name, value in (("mass", config.mass), ("force", config.force)):
         if value is not None and (value < 0 or (name == "mass" and value == 0)):
-            raise ValueError(f"{name} is {value}: give one above 0" + (", or 0" if name == "force" else ""))
+            raise ValueError(f"{name} is {value}, but it must be > 0" + (" or 0" if name == "force" else ""))
     output.check_picture(config.out)
 
 
 def read(config: Config, name: str) -> sts.objects.Body:
-    """The object: of a file, or of a class.
+    """Load the object from a file, or make one of a class.
 
     Raises:
-        FileNotFoundError: it is neither.
-        ValueError: see `objects.load`; or an option of files is given for a class.
+        FileNotFoundError: the name is neither a file nor a class.
+        ValueError: see `objects.load`, or an option for files is given for a class.
     """
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
         if not path.exists() and not path.suffix:
-            raise FileNotFoundError(f"{name}: no such file, nor one of the classes {', '.join(sts.objects.CATEGORIES)}")
+            raise FileNotFoundError(f"{name} is neither a file nor a class ({', '.join(sts.objects.CATEGORIES)})")
         return sts.objects.load(
             path,
             longest_side=config.longest_side,
@@ -111,7 +112,7 @@ def read(config: Config, name: str) -> sts.objects.Body:
         )
     for option in ("longest_side", "scale", "up", "faces", "texture"):
         if getattr(config, option) is not None:
-            raise ValueError(f"{option} is of a mesh file, and {name} is a class: leave it out")
+            raise ValueError(f"{option} is for mesh files, but {name} is a class: leave it out")
     index = sts.objects.CATEGORIES.index(name)
     body = sts.objects.make(jax.random.fold_in(jax.random.key(config.seed), index), name)
     if config.mass is None:
@@ -122,16 +123,16 @@ def read(config: Config, name: str) -> sts.objects.Body:
 
 
 def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.ndarray, np.ndarray, str]:
-    """Where the object lies: its pose and the wrench that carries it, and the face it rests on in words.
+    """The pose of the object, the wrench that supports it, and a description of how it rests.
 
-    The object is placed at rest by `physics.place`, then tilted, turned and moved as the configuration asks.
+    The object is placed at rest by `physics.place`, then tilted, turned and moved as configured.
 
     Raises:
-        ValueError: there is no such face to rest on.
+        ValueError: the object has no such face to rest on.
     """
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
-        raise ValueError(f"rest is {config.rest}: it rests on {len(shares)} faces, give 0 to {len(shares) - 1}")
+        raise ValueError(f"rest is {config.rest}, but it can rest on {len(shares)} faces: give 0 to {len(shares) - 1}")
     rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
     turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)
     turn = Rotation.from_rotvec([*config.tilt, 0], degrees=True) * turn
@@ -162,13 +163,13 @@ def see(
     crop: bool,
     light: float,
 ) -> tuple[sts.Frame, jax.Array]:
-    """The frame, and the image between its streams."""
+    """Render the frame, and the image between its streams."""
     frame = sts.sense(sensor, body, pose, wrench, resolution=resolution, crop=crop)
     return frame, sts.expose(sensor, frame, light)
 
 
 def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[sts.Frame, np.ndarray, str]:
-    """The frame, the image between its streams, and what there is to say of it."""
+    """The frame, the image between its streams, and a description."""
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     seconds = []
@@ -189,7 +190,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """All streams as images in [0, 1] with a line each; depth from bright (near) to dark, pressure on its own grid."""
+    """All outputs as captioned images in [0, 1]: depth from bright (near) to dark, and pressure on its own grid."""
     seen = np.asarray(frame.segmentation)
     depth = np.where(seen, np.asarray(frame.depth), np.nan)
     near, far = (np.nanmin(depth), np.nanmax(depth)) if seen.any() else (0.0, 1.0)
@@ -208,7 +209,7 @@ def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[st
 
 
 def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image:
-    """Panels in rows, pixel for pixel, each with its line above; the last one, on another grid, fitted in."""
+    """Panels in rows, pixel for pixel, each below its caption. A panel of another size is fitted in."""
     height, width = pictures[0][1].shape[:2]
     times = -(-NARROWEST // width)
     height, width = height * times, width * times
@@ -226,7 +227,7 @@ def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image
 
 
 def main(config: Config) -> None:
-    """Read the object, lay it on the pad, look, say what is seen, draw."""
+    """Make the object, place it on the pad, render it, print a description, and draw."""
     check(config)
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     names = sts.objects.CATEGORIES if config.mesh == "classes" else (config.mesh,)

@@ -1,8 +1,8 @@
-"""A few trajectories to look at: each as a strip of pictures and as an animation, from outside and through the sensor.
+"""Draw a few trajectories, each as a strip of pictures and as an animation, from outside and through the sensor.
 
     python -m experiments.show perturbed --num 4 --out show    # about a minute on two CPU cores
 
-Writes OUT/SCENARIO-NUMBER.png and .gif, of the first objects of the scenario's default experiment with another seed.
+Writes OUT/SCENARIO-NUMBER.png and .gif. The objects are the first ones of the default experiment with another seed.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ SCENARIOS = {
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """What is shown."""
+    """Scenario, number and size of the pictures."""
 
     scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined or perturbed
     num: int = 4  # trajectories, each of another object
@@ -37,11 +37,11 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Simulate, look from both sides, draw."""
+    """Simulate, render from outside and through the sensor, and draw."""
     if config.scenario not in SCENARIOS:
-        raise ValueError(f"scenario is {config.scenario!r}: give one of {', '.join(SCENARIOS)}")
+        raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")
     if config.num < 1:
-        raise ValueError(f"num is {config.num}: give at least 1")
+        raise ValueError(f"num is {config.num}, but it must be at least 1")
     output.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)

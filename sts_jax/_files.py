@@ -1,4 +1,4 @@
-"""Files that are whole or absent, JSON that cannot change unnoticed, checksums, and a lock on a folder."""
+"""Atomic writing of files, JSON files that cannot change unnoticed, checksums, and a lock on a folder."""
 
 import contextlib
 import errno
@@ -39,7 +39,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error}. {remedy(error)}, then start again; everything that was finished before is "
+            f"cannot write {path}: {error}. {remedy(error)}, then start again. Everything that was finished before is "
             "kept."
         ) from error
     finally:
@@ -53,7 +53,7 @@ _IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 
 
 def remedy(error: Exception) -> str:
-    """The remedy for a file that cannot be written, by the error's number; an error without one may be a full disk."""
+    """The remedy for a failed write, by the error's number. An error without a number may mean a full disk."""
     number = getattr(error, "errno", None)
     if number in _FULL:
         return "Free some disk space"
@@ -83,18 +83,18 @@ def read_json(path: Path, remedy: str) -> Any:
 
     Args:
         path: the file.
-        remedy: what to do about a damaged file; ends the error message.
+        remedy: remedy for a damaged file, with which the error message ends.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        TornFileError: the file cannot be read or is no JSON.
+        TornFileError: the file cannot be read or is not JSON.
     """
     try:
         return json.loads(path.read_bytes().decode())
     except FileNotFoundError:
         raise
-    except (OSError, ValueError) as error:  # ValueError: invalid UTF-8, no JSON, or an integer of thousands of digits
-        raise TornFileError(f"{path} cannot be read as JSON ({error}); {remedy}.") from error
+    except (OSError, ValueError) as error:  # ValueError: invalid UTF-8 or JSON, or an integer of thousands of digits
+        raise TornFileError(f"{path} cannot be read as JSON ({error}): {remedy}.") from error
 
 
 def claim(path: Path, content: dict) -> None:
@@ -102,7 +102,7 @@ def claim(path: Path, content: dict) -> None:
 
     Raises:
         ValueError: the content differs. The message names the first field that differs, both values, and the remedy.
-        TornFileError: the existing file is no JSON.
+        TornFileError: the existing file is not JSON.
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
@@ -113,7 +113,7 @@ def claim(path: Path, content: dict) -> None:
     if difference is not None:
         field, old, new = difference
         raise ValueError(
-            f"{path} was made with {field or 'content'} = {old!r}, and the current settings have {new!r}: "
+            f"{path} was made with {field or 'content'} = {old!r}, but the current settings have {new!r}: "
             f"choose another folder than {path.parent}, or delete it to start anew."
         )
 
@@ -135,18 +135,18 @@ def sha256(path: Path) -> str:
 
 
 def digest(content: Any) -> str:
-    """SHA-256 of a JSON file's content, in hexadecimal digits, however the file is laid out."""
+    """SHA-256 of a JSON file's content, in hexadecimal digits, independent of the file's layout."""
     plain = json.loads(json.dumps(content))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Hold a folder for this process; the lock ends with the block or with the process.
+    """Lock a folder for this process until the block or the process ends.
 
     Raises:
-        LockedError: another process, or another part of this one, holds the folder.
-        OSError: the folder cannot be made or written to.
+        LockedError: another process, or another part of this one, holds the lock.
+        OSError: the folder cannot be created or written to.
     """
     owner, held = folder / ".lock-owner", filelock.FileLock(folder / ".lock", timeout=0)
     try:

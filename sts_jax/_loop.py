@@ -1,9 +1,9 @@
-"""`looped`: a function of which `jax.vmap` makes a loop on a CPU, its derivatives included.
+"""`looped`: a function that `jax.vmap` turns into a loop on a CPU, including its derivatives.
 
-A function with a data-dependent loop inside, such as the rasteriser, runs a whole batch for as many turns as its
-slowest item needs when `jax.vmap` batches it. On a CPU one item after the other is several times as fast. JAX has
-`jax.custom_batching.sequential_vmap` for this, which has no reverse derivative. Here the derivative is a linear
-primitive with its own rule for batches. It keeps the arguments of the function, not the intermediate values, and
+Under `jax.vmap`, a function with a data-dependent loop, such as the rasteriser, runs the whole batch for as many
+iterations as its slowest item needs. On a CPU, one item after the other is several times as fast. JAX has
+`jax.custom_batching.sequential_vmap` for this, but without a reverse-mode derivative. Here the derivative is a linear
+primitive with its own batching rule. It keeps the arguments of the function, not the intermediate values, and
 evaluates the function once more in the backward pass.
 """
 
@@ -47,8 +47,8 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _looped(function: Flat) -> Flat:
-    # JAX passes flags and symbolic zeros in the place of arrays. As leaves of the caller's trees they would be of
-    # another type than the trees' fields, so everything from here on is a list.
+    # JAX passes flags and symbolic zeros in place of arrays. As leaves of the caller's trees they would have the wrong
+    # type for the trees' fields, so everything from here on is a list.
     @jax.custom_batching.custom_vmap
     def primal(*leaves: Array) -> list[Array]:
         return function(*leaves)
@@ -93,7 +93,7 @@ def _is_zero(tangent: Any) -> bool:
 def _over_batch(
     single: Flat, dense: Flat, size: int, flags: Sequence[bool], leaves: Sequence[ArrayLike]
 ) -> list[Array]:
-    """A function over the first axis of the flagged arguments: a loop on a CPU, `jax.vmap` elsewhere."""
+    """Map a function over the first axis of the flagged arguments: a loop on a CPU, `jax.vmap` elsewhere."""
     if jax.default_backend() != "cpu" or not any(flags):
         return jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
 
@@ -104,8 +104,8 @@ def _over_batch(
     return jax.lax.map(one, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
 
 
-# The derivative of a function at its arguments, applied to the tangents of the active ones; or, transposed, applied to
-# cotangents of its results. Operands: the arguments, then tangents or cotangents.
+# The derivative of a function at its arguments, applied to the tangents of the active arguments, or transposed and
+# applied to cotangents of its results. Operands: the arguments, then tangents or cotangents.
 _linear = Primitive("looped_derivative")
 _linear.multiple_results = True
 
@@ -131,7 +131,7 @@ def _abstract(*operands: Any, **params: Any) -> list[Any]:
 def _derivative(
     primals: Sequence[ArrayLike], tangents: Sequence[Any], **params: Any
 ) -> tuple[list[Array], list[Array]]:
-    """The second derivative, from the function itself: the operation is linear in its vectors only."""
+    """The second derivative, taken from the function itself, because `_linear` is linear in its vectors only."""
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
 
     def of_moving(*values: Array) -> list[Array]:
@@ -162,7 +162,7 @@ def _batch(operands: Sequence[ArrayLike], axes: Sequence[Any], **params: Any) ->
     dense = functools.partial(_apply, **params)
     if any(flags[: len(params["active"])]):
         result = _over_batch(functools.partial(_linear.bind, **params), dense, size, flags, moved)
-    else:  # several tangents at one place, as in `jax.jacfwd`: the function itself is evaluated once
+    else:  # several tangents at one point, as in `jax.jacfwd`: the function itself is evaluated once
         result = jax.vmap(dense, in_axes=[0 if flag else None for flag in flags])(*moved)
     return result, [0] * len(result)
 

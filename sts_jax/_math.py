@@ -1,4 +1,4 @@
-"""Reductions in the form that XLA's CPU backend vectorises, and an eigenvector in closed form."""
+"""Reductions in a form that XLA's CPU backend vectorises, and an eigenvector in closed form."""
 
 import functools
 from collections.abc import Callable
@@ -7,21 +7,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-_LANES = 32  # numbers that a reduction takes one by one
+_LANES = 32  # row length in `running_sum`, and half the length from which `_fold` splits a vector
 
 
 def least(values: Array) -> Array:
-    """`jnp.min` of a vector, part against part: so a CPU's vector units can; XLA's own goes number by number."""
+    """`jnp.min` of a vector by elementwise minima of its parts, which a CPU vectorises. XLA's own is sequential."""
     return _fold(jnp.minimum, jnp.min, values)
 
 
 def most(values: Array) -> Array:
-    """`jnp.max` of a vector, as `least`."""
+    """`jnp.max` of a vector, computed like `least`."""
     return _fold(jnp.maximum, jnp.max, values)
 
 
 def running_sum(counts: Array) -> Int[Array, "n"]:
-    """`jnp.cumsum` of whole numbers whose sum is below 2^24, by products with triangles of ones: quicker on a CPU."""
+    """`jnp.cumsum` of integers whose sum is below 2^24, as products with triangular matrices. Faster on a CPU."""
     size = len(counts)
     rows = -(-size // _LANES)
     table = jnp.pad(counts.astype(jnp.float32), (0, rows * _LANES - size)).reshape(rows, _LANES)
@@ -33,7 +33,7 @@ def running_sum(counts: Array) -> Int[Array, "n"]:
 
 
 def positions(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
-    """Which flags are set, in order; what is left is filled with their number, n."""
+    """Indices of the set flags in order, padded with n to the length of `flags`."""
     size = len(flags)
     place = jnp.where(flags, running_sum(flags) - 1, size)
     return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
@@ -59,14 +59,14 @@ def smallest_eigenvector(
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
     """Unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices A, in closed form.
 
-    The eigenvalue is the smallest root of the cubic, `mean + spread b` with `b^3 - 3 b = 2 h` (a polynomial in
-    `sqrt(1 - h)` and one Newton step); the vector is the largest column of
-    `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. Its derivative needs the smallest eigenvalue
-    to be simple and no more: the other two may be equal, as they are for points that lie in a plane. Where it is not
-    simple, some unit vector is returned, with zero gradient.
+    The eigenvalue lambda is the smallest root of the characteristic cubic, `mean + spread b` with `b^3 - 3 b = 2 h`,
+    computed as a polynomial in `sqrt(1 - h)` and one Newton step. The vector is the largest column of
+    `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. The derivative only needs lambda to be simple.
+    The other two eigenvalues may be equal, as for points spread evenly in a plane. If lambda is not simple, some unit
+    vector is returned, with zero gradient.
 
     Args:
-        xx: with the other five, the elements of A, each an array of its own (which is how a CPU is quick).
+        xx: with the other five, the elements of A. Separate arrays are faster on a CPU.
         yy: see above.
         zz: see above.
         xy: see above.
@@ -74,7 +74,7 @@ def smallest_eigenvector(
         yz: see above.
 
     Returns:
-        The vector's three components; its sign is arbitrary.
+        The vector's three components. Its sign is arbitrary.
     """
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
@@ -88,7 +88,7 @@ def smallest_eigenvector(
     root = root - jnp.where(slope > 1e-3, (root * (root * root - 3) - 2 * h) / jnp.where(slope > 1e-3, slope, 1), 0)
     shift = spread * root
     a, b, c = a - shift, b - shift, c - shift
-    # the adjugate: diagonal p, q, t; off it u (01), v (02), w (12)
+    # The adjugate: diagonal p, q, t, off-diagonal u (01), v (02), w (12).
     p, q, t = b * c - yz * yz, a * c - xz * xz, a * b - xy * xy
     u, v, w = xz * yz - xy * c, xy * yz - xz * b, xy * xz - a * yz
     third, second = (t >= p) & (t >= q), q >= p
@@ -105,8 +105,8 @@ def smallest_eigenvector(
 
 @smallest_eigenvector.defjvp
 def _smallest_eigenvector_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[tuple, tuple]:
-    # dv = -(A - lambda I)^+ dA v: the inverse of a 2x2 matrix on the plane across v, which p and q span
-    # (Duff et al. 2017: a basis without a case where it vanishes).
+    # dv = -(A - lambda I)^+ dA v, through the inverse of a 2x2 matrix on the plane orthogonal to v, which p and q span
+    # (Duff et al. 2017: a basis without singular cases).
     v = smallest_eigenvector(*primals)
     sign = jnp.where(v[2] < 0, -1.0, 1.0).astype(v[2].dtype)
     k = -1 / (sign + v[2])

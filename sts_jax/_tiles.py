@@ -1,8 +1,8 @@
-"""Work where there is something to see: an image function on the tiles that need it, with the whole image's gradient.
+"""Evaluation of an image function on the tiles with active pixels only, with the gradient of the whole image.
 
-Most of a sensor's image is empty. `where_active` cuts it into square tiles and walks, batch by batch, those that hold
-an active pixel, so that an image costs what is on it and not its size. Where much of it is active, and under `vmap`,
-the function is called once, with the whole image.
+Most of a sensor's image is empty. `where_active` cuts it into square tiles and evaluates those with an active pixel,
+batch by batch, so that the cost depends on the active area and not on the image's size. If many tiles are active, and
+under `vmap`, the function is called once with the whole image.
 """
 
 import functools
@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool
 from sts_jax import _math
 
 TILE = 4  # pixels, side of a tile
-BATCH = 64  # tiles done at a time
-CROWDED = 0.4  # of the tiles; with more of them active the whole image is done at once, on all cores
+BATCH = 64  # tiles evaluated at a time
+CROWDED = 0.4  # share of active tiles above which the whole image is evaluated at once, on all cores
 
 Images = Any  # a tree of images (height, width)
 Function = Callable[[Any, Images], Images]
@@ -26,19 +26,19 @@ Function = Callable[[Any, Images], Images]
 def where_active(
     function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images, *, ring: int = 0
 ) -> Images:
-    """`jnp.where(active, function(params, images), otherwise)`, for the price of the tiles that hold an active pixel.
+    """`jnp.where(active, function(params, images), otherwise)`, at the cost of the tiles with an active pixel.
 
-    Derivatives are those of this expression, taken over the whole image.
+    Derivatives are those of this expression over the whole image.
 
     Args:
-        function: `(params, images) -> images'`, from images of any size (a + 2 ring, b + 2 ring) to images (a, b), of
-            which each pixel depends on those within `ring` of it alone. A third axis of its images, tiles, it leaves as
-            it is. It must close over no tracer: what it needs comes by its arguments.
-        active: where the result is wanted.
-        params: passed on, whole.
-        images: tree of (h + 2 ring, w + 2 ring); one of a single row or column stands for an image of such.
-        otherwise: tree of (h, w), as `function` returns them.
-        ring: pixels around each pixel.
+        function: `(params, images) -> images'`, from images of any size (a + 2 ring, b + 2 ring) to images (a, b). An
+            output pixel must depend only on the input pixels within `ring` of it. A third axis of the images, over
+            tiles, must be preserved. `function` must not close over tracers: pass all values as arguments.
+        active: pixels where the result is needed.
+        params: passed to `function` unchanged.
+        images: tree of (h + 2 ring, w + 2 ring). An image of one row or one column is broadcast.
+        otherwise: tree of (h, w) with the values of the other pixels, of the same structure as `function` returns.
+        ring: number of neighbouring pixels in each direction that `function` needs.
 
     Returns:
         Tree of (h, w).
@@ -66,7 +66,7 @@ def _where_active(
 
     @chosen.def_vmap
     def batched(_size: int, in_batched: list[bool], *leaves: Array) -> tuple[Images, Images]:
-        # A loop over batched tiles goes on until the last image is done, and copies all of them in every turn.
+        # A batched loop over tiles would run until the last image is done, and copy all images in every iteration.
         def whole(*leaves: Array) -> Images:
             return _dense(function, *jax.tree.unflatten(structure, leaves))
 
@@ -86,14 +86,14 @@ def _sparse(
     used = jnp.any(flags.reshape(rows, TILE, columns, TILE), axis=(1, 3)).reshape(number)
     end = jnp.sum(used)
     order = jnp.pad(_math.positions(used), (0, -number % BATCH), constant_values=number)
-    # The last row and column of tiles overlap those before them, so that a tile lies in the image; what fills up the
-    # last batch is one of them, done once more.
+    # The last row and column of tiles overlap those before them, so that every tile lies in the image. The last batch
+    # is filled up with repetitions of one of these tiles.
     first_row = jnp.minimum(order // columns * TILE, height - TILE)
     first_column = jnp.minimum(order % columns * TILE, width - TILE)
 
     def body(state: tuple[Array, Images]) -> tuple[Array, Images]:
         base, result = state
-        # Tiles along the last axis: there a processor's vector units work best.
+        # Tiles lie along the last axis, where a CPU vectorises best.
         row, column = (jax.lax.dynamic_slice(first, (base,), (BATCH,)) for first in (first_row, first_column))
         inside = jnp.arange(TILE, dtype=jnp.int32)[:, None]
         own = (row[None, :] + inside)[:, None] * width + (column[None, :] + inside)[None, :]
@@ -102,7 +102,7 @@ def _sparse(
             side = jnp.arange(TILE + 2 * ring, dtype=jnp.int32)[:, None]
             down = (row[None, :] + side)[:, None] * (image.shape[1] if image.shape[0] > 1 else 0)
             across = (column[None, :] + side)[None, :] * (1 if image.shape[1] > 1 else 0)
-            # Where no neighbours take part a batch is one line of pixels.
+            # Without neighbours, a batch is a single row of pixels.
             place = down + across if ring else (down + across).reshape(1, -1)
             return image.reshape(-1).at[place].get(mode="promise_in_bounds")
 

@@ -9,7 +9,7 @@ import jax
 
 
 def cache_folder() -> Path:
-    """Folder for files that can be made again: `sts_jax` in XDG_CACHE_HOME, which is ~/.cache unless it is set."""
+    """Folder for files that can be recreated: `sts_jax` in XDG_CACHE_HOME, or in ~/.cache if that is not set."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sts_jax"
 
 
@@ -24,9 +24,9 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     set before `import jax`, silences it.
 
     Args:
-        folder: of the cache. By default JAX_COMPILATION_CACHE_DIR decides, and keeps nothing if it is empty. Where it
-            is not set, the cache is in `~/.cache/sts_jax`, in a folder for this kind of processor, since a program that
-            was compiled for one kind may not run on another.
+        folder: folder of the cache, by default JAX_COMPILATION_CACHE_DIR. If that variable is empty, nothing is
+            cached. If it is not set, the cache is in `~/.cache/sts_jax`, in a folder for this kind of processor,
+            because a program compiled for one kind may not run on another.
 
     Returns:
         The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.
@@ -40,20 +40,20 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
         if not folder:
             return None
     if folder is not None and not os.fspath(folder):
-        raise ValueError("folder is empty: give a path, '.' for the current directory.")
+        raise ValueError("folder is empty: give a path, such as '.' for the current directory.")
     path = cache_folder() / processor() if folder is None else Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise type(error)(f"{path} cannot be made ({error.strerror}): give another folder for the cache.") from error
+        raise type(error)(f"{path} cannot be created ({error.strerror}): give another folder for the cache.") from error
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # By default JAX keeps only programs that took a second; a session runs hundreds of smaller ones.
+    # By default JAX keeps only programs that took a second to compile, but a session runs hundreds of smaller ones.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     return path
 
 
 def processor() -> str:
-    """Name for this kind of processor, the same wherever the same compiled programs run."""
+    """Name of this kind of processor, equal on all machines that run the same compiled programs."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

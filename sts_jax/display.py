@@ -1,4 +1,4 @@
-"""Look at results and keep them: `show` draws a figure, `save` and `load` write and read one file."""
+"""Display and storage of results: `show` draws a figure, `save` and `load` write and read one file."""
 
 import io
 import os
@@ -40,9 +40,9 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
     A notebook displays the figure. Elsewhere call `figure.savefig(path)`.
 
     Args:
-        thing: a `Frame`: both streams, depth (mm) and pressure (kPa); a `Body`: a view from outside as it stands on a
-            pad; a `Prediction`: the images that the model predicts; or one image `(height, width, 3)` in [0, 1].
-            One item each: index a batch with `jax.tree.map(lambda x: x[i], frames)`.
+        thing: a `Frame` (both streams, depth in mm and pressure in kPa), a `Body` (a view from outside, standing on a
+            pad), a `Prediction` (the predicted images) or an image `(height, width, 3)` in [0, 1]. It must be one item:
+            index a batch with `jax.tree.map(lambda x: x[i], frames)`.
         title: of the figure.
 
     Returns:
@@ -50,7 +50,7 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
 
     Raises:
         TypeError: `thing` is none of these.
-        ValueError: `thing` has leading axes.
+        ValueError: `thing` has leading axes or no image, or an image has another shape or range.
     """
     panels: list[tuple[str, np.ndarray, str | None]]
     if isinstance(thing, Frame):
@@ -76,7 +76,7 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
         for _, image, _ in panels:
             _one("Prediction", image, 3)
         if not panels:
-            raise ValueError("the prediction has no image: the model predicts the pose alone; print it instead")
+            raise ValueError("the prediction has no image, because the model predicts the pose alone. Print it instead")
     else:
         panels = [("", _image(thing), None)]
     height = _INCH if len(panels) > 1 else 1.5 * _INCH
@@ -93,17 +93,17 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
 
 
 def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayLike) -> None:
-    """Write one thing to a file, complete or not at all.
+    """Write one object to a file, completely or not at all.
 
     Args:
         path: `.npz` keeps all arrays of a `Frame`, a `Body` or a `Trajectory` for `load`. `.png` keeps the picture of a
-            `Frame` (the visual and the tactile image side by side) or of an image `(height, width, 3)` in [0, 1], with
-            8 bits a channel.
+            `Frame` (the visual and the tactile image side by side) or an image `(height, width, 3)` in [0, 1], with 8
+            bits per channel.
         thing: the object to write.
 
     Raises:
-        TypeError: this kind of thing cannot be written to this kind of file.
-        ValueError: another suffix, or the image has another shape or range.
+        TypeError: an object of this type cannot be written to this type of file.
+        ValueError: the path has another suffix, or the image has another shape or range.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -113,7 +113,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
             image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
         elif isinstance(thing, tuple(_KINDS.values())):
             raise TypeError(
-                f"a .png file keeps the picture of a Frame or an image, got a {type(thing).__name__}: save it as .npz, "
+                f"a .png file keeps the picture of a Frame or an image, got a {type(thing).__name__}. Save it as .npz, "
                 "or draw it with sts.show(...).savefig(path)"
             )
         else:
@@ -129,7 +129,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         data = io.BytesIO()
         np.savez_compressed(data, allow_pickle=False, **arrays)
     else:
-        raise ValueError(f"path is {str(path)!r}; it must end in .npz (arrays) or .png (picture)")
+        raise ValueError(f"path is {str(path)!r}, but it must end in .npz (arrays) or .png (picture)")
     write_bytes(path, data.getvalue())
 
 
@@ -143,23 +143,23 @@ def load(path: str | os.PathLike[str]) -> Any:
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file; sts.save writes one")
+        raise FileNotFoundError(f"{path}: no such file. Write it with sts.save")
     if path.is_dir() or path.suffix.lower() != ".npz":
-        raise ValueError(f"path is {str(path)!r}; it must be an .npz file that sts.save wrote")
+        raise ValueError(f"path is {str(path)!r}, but it must be an .npz file that sts.save wrote")
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             arrays = dict(file)
         kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
         if version != _FORMAT:
-            raise ValueError(f"it has format {version}, this version of sts_jax reads {_FORMAT}")
+            raise ValueError(f"it has format {version}, but this version of sts_jax reads {_FORMAT}")
         return _built(kind, {key: jnp.asarray(value) for key, value in arrays.items()})
     except Exception as error:  # a damaged zip file raises one of many types
         reason = f"{type(error).__name__}: {error}"
-        raise TornFileError(f"{path} is damaged or was not written by sts.save ({reason}); save it again.") from error
+        raise TornFileError(f"{path} is damaged or was not written by sts.save ({reason}). Save it again.") from error
 
 
 def _built(kind: type, arrays: dict[str, Any]) -> Any:
-    """An instance from its leaves by their paths; `hidden/fill` belongs to the field `hidden`."""
+    """Build an instance from its leaves, given by their paths. `hidden/fill` belongs to the field `hidden`."""
     fields: dict[str, Any] = {}
     for key, value in arrays.items():
         name, _, rest = key.partition("/")
@@ -174,21 +174,23 @@ def _built(kind: type, arrays: dict[str, Any]) -> Any:
 def _one(name: str, array: Any, rank: int) -> None:
     if np.ndim(array) != rank:
         raise ValueError(
-            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}; give one item, such as "
+            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}. Give one item, such as "
             "jax.tree.map(lambda x: x[0], ...)"
         )
 
 
 def _image(thing: Any) -> np.ndarray:
     if not isinstance(thing, np.ndarray | jax.Array):
-        raise TypeError(f"a Frame, a Body, a Prediction or an image is needed, got {type(thing).__name__}")
+        raise TypeError(
+            f"an image must be an array, got {type(thing).__name__}. sts.show also draws a Frame, Body or Prediction"
+        )
     image = np.asarray(thing)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-        raise ValueError(f"the image has shape {image.shape}; it must be (height, width, 3)")
+        raise ValueError(f"the image has shape {image.shape}, but it must be (height, width, 3)")
     if image.dtype == np.uint8:
         return image / 255
     if image.dtype.kind != "f" or not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
         raise ValueError(
-            f"the image is {image.dtype} in [{image.min()}, {image.max()}]; it must be uint8, or floats in [0, 1]"
+            f"the image is {image.dtype} in [{image.min()}, {image.max()}], but it must be uint8, or floats in [0, 1]"
         )
     return image

@@ -1,4 +1,4 @@
-"""What the sensor sees of an object: both streams, depth, segmentation."""
+"""The sensor's images of an object: both streams, depth and segmentation."""
 
 import dataclasses
 import functools
@@ -17,9 +17,9 @@ from sts_jax._tiles import where_active
 from sts_jax.objects.body import FACE_CLASSES, Body, is_traced
 from sts_jax.sensor import Sensor
 
-# vertices' column and row on the screen and a third value; faces' corners
+# column, row and a third value of each vertex, and the corner indices of each face
 _Corners = tuple[tuple[Float[Array, "v"], Float[Array, "v"], Float[Array, "v"]], Int[Array, "f 3"]]
-_UNTOUCHED = 1e-8  # m, an imprint that changes no picture: what the skin's coupling leaves far from a contact
+_UNTOUCHED = 1e-8  # m, an imprint too shallow to change an image, such as the tail of the skin's coupling
 
 
 @jax.tree_util.register_dataclass
@@ -29,14 +29,14 @@ class Frame:
 
     visual: Float[Array, "*n h w 3"]  # lights off: the view through the skin, sRGB
     tactile: Float[Array, "*n h w 3"]  # lights on: the skin itself
-    # m along the optical axis from the pinhole to the object, inf where there is none; through the housing's walls too
+    # m along the optical axis from the pinhole to the object, also behind the housing's walls, inf where there is none
     depth: Float[Array, "*n h w"]
-    segmentation: Bool[Array, "*n h w"]  # the object: where depth is finite
-    pose: Float[Array, "*n 7"]  # the pose drawn: the object's mesh frame in the sensor frame, gel in balance
-    # whether the gel carries the wrench within its limits; False for a non-finite input or a sensor that cannot be
+    segmentation: Bool[Array, "*n h w"]  # pixels of the object, where depth is finite
+    pose: Float[Array, "*n 7"]  # mesh frame in the sensor frame, as drawn, with the gel in balance
+    # whether the gel carries the wrench within its limits, False for a non-finite input or an invalid sensor
     balanced: Bool[Array, "*n"]
     pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid (tactile.cell_centres)
-    window: Float[Array, "*n 4"]  # m, (left, top, width, height) on the gel's face that the images show
+    window: Float[Array, "*n 4"]  # m, (left, top, width, height) of the part of the gel's face in the images
 
     def __repr__(self) -> str:
         if not hasattr(self.depth, "shape") or len(self.depth.shape) < 2:  # JAX also builds trees of other leaves
@@ -63,40 +63,41 @@ def sense(
     crop: bool = False,
     moving_edges: bool = False,
 ) -> Frame:
-    """What the sensor sees of one object.
+    """Render one object as the sensor sees it.
 
-    With a wrench the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`); without one the
-    imprint follows from the pose alone. Both streams show the balanced pose. An object that lies wholly below the
-    gel's face has fallen off: the images are those of an empty sensor. So they are where pose or wrench are not
-    finite, where the quaternion is so long or short that its square is not a positive number, and where a traced body
-    has a vertex, normal or colour that is not finite; `balanced` is False then.
+    With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`). Without one, the
+    imprint follows from the pose alone. Both streams show the balanced pose. An object that is wholly below the gel's
+    face has fallen off, and the images are those of an empty sensor.
 
-    It compiles itself, once for every resolution and size class of bodies (their faces and texture), and serves as
-    well inside other compiled functions, `vmap` and `grad`.
+    The images are also empty, and `balanced` is False, if the pose or the wrench is not finite, the squared length of
+    the quaternion is zero or overflows, or a traced body has a vertex, normal or colour that is not finite.
 
-    A sensor that cannot be (`Sensor.check`) raises an error. Constants that are traced, as all are when a sensor is an
-    argument of a jitted function, are not known in time for that: where they make a sensor that cannot be, the images
-    are those of an empty one with the default's constants in their place, never NaN, and `balanced` is False.
+    It compiles itself once for each resolution and size class of bodies (faces and texture), and works inside other
+    compiled functions, `vmap` and `grad`.
+
+    An invalid sensor (`Sensor.check`) raises an error. Traced constants, such as those of a jitted function's argument,
+    have no values to check. If they are invalid, the images are those of an empty sensor with the default constants in
+    their place, never NaN, and `balanced` is False.
 
     Args:
-        sensor: its constants.
-        body: what touches it.
+        sensor: constants of the sensor.
+        body: the object.
         pose: mesh frame in the sensor frame: position (m), quaternion.
         wrench: of the pad on the object: force (N) and moment about the sensor's origin (N m), sensor frame.
-        resolution: (height, width), pixels. Another aspect than the camera's shows the largest centred part.
-        crop: show the square (the image's aspect) around the object.
-        moving_edges: to fit poses. Images are the same, and derivatives by default those of each pixel, which knows
-            nothing of an edge that moves towards it. With this, that of the tactile image by the pose has what the
-            imprint's edges make of it, right on the average over some pixels (`_carried`).
+        resolution: (height, width), pixels. Another aspect ratio than the camera's shows the largest centred part.
+        crop: show a window of the image's aspect ratio around the object.
+        moving_edges: for fitting poses. Adds the effect of the imprint's moving edges to the derivative of the tactile
+            image by the pose, accurate on average over a few pixels (`_carried`). The default derivative is that of
+            each pixel and ignores them. The images are the same.
 
     Returns:
         Frame.
 
     Raises:
-        ValueError: the resolution is not two whole numbers above 0, pose or wrench are not of their shape, the body has
-            more faces than can be drawn, all of this under `jit` too; or `check` of the sensor or the body
+        ValueError: the resolution is not two whole numbers above 0, the pose or the wrench has a wrong shape, or the
+            body has more faces than can be drawn (all checked under `jit` too), or `check` of the sensor or the body
             raises an error. Traced values are not checked.
-        TypeError: an argument is no sensor, no body or no array of numbers.
+        TypeError: `sensor` is not a `Sensor`, `body` is not a `Body`, or `pose` or `wrench` is not an array of numbers.
     """
     _check_kinds(sensor, body)
     pose = _numbers("pose", pose, "(7,), position (m), quaternion")
@@ -107,21 +108,21 @@ def sense(
     if is_traced(body):
         for values in (body.vertices, body.normals, body.colors):
             sound &= jnp.all(jnp.isfinite(values))
-    # What is not drawn is left out: things of one size then share a program, whatever collides or is inside.
+    # Hulls and interior are not drawn. Without them, bodies of one size class share a program.
     body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
     height, width = (int(n) for n in resolution)
-    # Two programs: the first one serves every resolution.
+    # Two programs, so that the first one serves every resolution.
     resting = _balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
     return _draw(sensor, body, resting, resolution=(height, width), crop=bool(crop), moving_edges=bool(moving_edges))
 
 
 class _Resting(NamedTuple):
-    """An object in balance on the gel, before it is drawn: independent of the images' size."""
+    """An object in balance on the gel, before it is drawn and independent of the resolution."""
 
     points: Float[Array, "v 3"]  # m, vertices, sensor frame
-    pose: Float[Array, "7"]  # in balance; some pose beneath the pad where the given one is not finite
-    shown: Float[Array, "7"]  # in balance, or the given one where it is not finite
-    heights: Float[Array, "r c"]  # m, its underside over the gel's grid
+    pose: Float[Array, "7"]  # in balance, or a pose below the pad if the given one is not finite
+    shown: Float[Array, "7"]  # in balance, or the given one if it is not finite
+    heights: Float[Array, "r c"]  # m, of its underside over the gel's grid
     present: Bool[Array, ""]  # some part is above the gel's face
     pressing: Bool[Array, ""]  # it presses on the gel
     balanced: Bool[Array, ""]
@@ -177,15 +178,15 @@ _balance = jax.jit(looped(_balanced))
 def _placed(
     so: Bool[Array, ""], pose: Float[Array, "7"], vertices: Float[Array, "v 3"], otherwise: Float[Array, "v 3"]
 ) -> Float[Array, "v 3"]:
-    """Vertices in the sensor frame, x, y and z each by itself in memory."""
-    # What comes out of a condition is kept; else XLA works it out anew wherever it is needed.
+    """Vertices in the sensor frame if `so`, else `otherwise`, with separate memory for x, y and z."""
+    # XLA keeps the result of a condition. It would recompute any other value at each use.
     planes = jax.lax.cond(so, lambda: tuple(geometry.transform(pose, vertices).T), lambda: tuple(otherwise.T))
     return jnp.stack(planes, axis=-1)
 
 
 def _check_sensor(sensor: Any) -> None:
     if not isinstance(sensor, Sensor):
-        raise TypeError(f"sensor is {sensor!r}; it takes a Sensor, for instance sts.Sensor()")
+        raise TypeError(f"sensor is {sensor!r}, but it must be a Sensor, for instance sts.Sensor()")
 
 
 def _check_kinds(sensor: Any, body: Any) -> None:
@@ -193,80 +194,82 @@ def _check_kinds(sensor: Any, body: Any) -> None:
     if not isinstance(body, Body):
         several = isinstance(body, Sequence) and not isinstance(body, str)
         remedy = "For several use objects.stack and jax.vmap" if several else "objects.load reads a mesh file"
-        raise TypeError(f"body is {body!r}; it takes one Body. {remedy}")
+        raise TypeError(f"body is {body!r}, but it must be one Body. {remedy}")
     if body.vertices.ndim != 2 or not is_traced(body):
         body.check()
 
 
 def _numbers(name: str, value: Any, wanted: str) -> Array:
-    """The value as floating-point numbers; a tuple of arrays, such as a whole `Placement`, is none."""
+    """The value as a floating-point array. A named tuple, such as a whole `Placement`, raises an error."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        raise TypeError(f"{name} is a {type(value).__name__}; it takes {wanted}. Unpack it with *")
+        raise TypeError(f"{name} is a {type(value).__name__}, but must be an array of shape {wanted}. Unpack it with *")
     try:
         return jnp.asarray(value, float)
     except (TypeError, ValueError):
-        raise TypeError(f"{name} is {value!r}; it takes {wanted}") from None
+        raise TypeError(f"{name} is {value!r}, but it must be an array of shape {wanted}") from None
 
 
 def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:
     whole = isinstance(resolution, Sequence) and all(isinstance(n, int | np.integer) for n in resolution)
     if not whole or len(resolution) != 2 or min(resolution) < 1:
         raise ValueError(
-            f"resolution is {resolution!r}; it takes two whole numbers of pixels, (height, width), above 0"
+            f"resolution is {resolution!r}, but it must be two whole numbers of pixels, (height, width), both > 0"
         )
     if pose.shape != (7,):
         raise ValueError(
-            f"pose has the shape {pose.shape}; it takes (7,), position (m), quaternion. For several use jax.vmap"
+            f"pose has the shape {pose.shape}, but it must be (7,), position (m), quaternion. For several poses use "
+            "jax.vmap"
         )
     if wrench is not None and wrench.shape != (6,):
         raise ValueError(
-            f"wrench has the shape {wrench.shape}; it takes (6,), force (N) and moment (N m). For several use jax.vmap"
+            f"wrench has the shape {wrench.shape}, but it must be (6,), force (N) and moment (N m). For several "
+            "wrenches use jax.vmap"
         )
     if len(body.faces) > FACE_CLASSES[-1]:
         raise ValueError(
-            f"body has {len(body.faces):,} faces; at most {FACE_CLASSES[-1]:,} can be drawn. objects.load decimates a "
-            "mesh file with faces="
+            f"body has {len(body.faces):,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn. Decimate the mesh "
+            "file with objects.load(..., faces=)"
         )
 
 
 def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n h w 3"]:
     """The image with the internal light between off, `Frame.visual`, and full, `Frame.tactile`.
 
-    The LEDs add to what comes through the skin, in linear light. Of the two streams V and T the camera exposes V for k
-    times as long (`Room.exposure`); at a share l of the LEDs' power it exposes so that what is as bright in both is so
-    in between:
+    The LEDs' light adds to the light through the skin, in linear values. The camera exposes the visual stream V k times
+    as long as the tactile stream T (`Room.exposure`). At a share l of the LEDs' power, the exposure preserves the
+    brightness of pixels that are equally bright in both streams:
 
         image = ((1 - l) V + l k T) / (1 - l + l k)
 
     Args:
-        sensor: what took the frame.
-        frame: one, or any leading axes.
+        sensor: the sensor of the frame.
+        frame: one frame or a batch, with any leading axes.
         light: share of the LEDs' full power, 0 to 1. Under `jit` and `vmap`, where no error can be raised, it is
-            clipped, and not a number is 0.
+            clipped, and NaN counts as 0.
 
     Returns:
-        Image, sRGB in [0, 1]; the streams themselves at 0 and 1.
+        Image, sRGB in [0, 1], which equals `frame.visual` at 0 and `frame.tactile` at 1.
 
     Raises:
-        ValueError: `light` is outside [0, 1] or not one number; or `Sensor.check` raises an error. Traced values
-            are not checked; where a traced sensor is out of range, the default's exposure counts.
+        ValueError: `light` is outside [0, 1] or not one number, or `Sensor.check` raises an error. Traced values are
+            not checked. If the constants of a traced sensor are invalid, the default exposure is used.
     """
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
     if not isinstance(frame, Frame):
-        raise TypeError(f"frame is a {type(frame).__name__}; it takes the Frame that sense returns")
+        raise TypeError(f"frame is a {type(frame).__name__}, but it must be the Frame that sense returns")
     if not isinstance(light, jax.core.Tracer) and np.asarray(light).dtype.kind not in "iuf":
-        raise TypeError(f"light is {light!r}; it takes one number, from 0 (visual) to 1 (tactile)")
+        raise TypeError(f"light is {light!r}, but it must be one number from 0 (visual) to 1 (tactile)")
     if jnp.ndim(light):
-        raise ValueError(f"light has the shape {jnp.shape(light)}; it takes one number. For several use jax.vmap")
+        raise ValueError(f"light has the shape {jnp.shape(light)}, but it must be one number. For several use jax.vmap")
     if not isinstance(light, jax.core.Tracer) and not 0 <= np.asarray(light) <= 1:
-        raise ValueError(f"light is {light}; it is a share of the LEDs' full power, from 0 (visual) to 1 (tactile)")
+        raise ValueError(f"light is {light}, but it must be a share of the LEDs' power, from 0 (visual) to 1 (tactile)")
     light = jnp.asarray(light, jnp.float32)
     light = jnp.where(light >= 0, jnp.where(light <= 1, light, 1), 0)
     bright = light * sensor.room.exposure
     share = bright / (1 - light + bright)
     mixed = optics.to_srgb((1 - share) * optics.to_linear(frame.visual) + share * optics.to_linear(frame.tactile))
-    # Going to linear light and back rounds: what is missing to the streams, at their ends.
+    # The conversion to linear light and back rounds. At 0 and 1 the difference to the stream is added back.
     ends = jnp.where(share == 0, frame.visual - mixed, jnp.where(share == 1, frame.tactile - mixed, 0))
     return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)
 
@@ -274,45 +277,47 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
 def touch(
     sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"] | None = None
 ) -> Float[Array, "h w 3"]:
-    """What the camera sees of the lit skin under a given imprint, from whatever made it.
+    """Render the tactile image of a given imprint, whatever its source.
 
     Args:
-        sensor: its camera, skin, lights and reflectance.
-        imprint: how deep the skin is pressed in at each pixel (m), 0 where nothing presses; the camera sees it along
-            its rays. Clipped to the gel's thickness; not a number is 0.
-        window: what the image shows, (left, top, width, height) on the gel's face (m); the whole view if not given.
+        sensor: constants of the camera, gel, skin, lights, reflectance and housing.
+        imprint: depth of the imprint (m) where the ray of each pixel meets the skin, 0 without contact. Clipped to the
+            gel's thickness. NaN counts as 0.
+        window: part of the gel's face in the image, (left, top, width, height) (m). Default: the whole view.
 
     Returns:
-        Image, in [0, 1]: `Frame.tactile` of this imprint, where images are not so small that `sense` samples finer.
-        Where constants or window are traced and cannot be, that of a flat skin in the whole view, with the default's
-        constants.
+        Image in [0, 1], equal to `Frame.tactile` of this imprint, except that `sense` samples small images more finely
+        (`Sensor.fine_below`). If traced constants or a traced window are invalid, it shows flat skin in the whole view,
+        with default constants in the place of invalid ones.
 
     Raises:
-        ValueError: the imprint is no image or has whole numbers, the window has no area or is not finite, or
+        ValueError: the imprint is not an image or has whole numbers, the window has no area or is not finite, or
             `Sensor.check` raises an error. Traced values are not checked.
     """
     _check_sensor(sensor)
     try:
         imprint = jnp.asarray(imprint)
     except (TypeError, ValueError):
-        raise TypeError(f"imprint is {imprint!r}; it takes an array (height, width) in metres") from None
+        raise TypeError(f"imprint is {imprint!r}, but it must be an array (height, width) in metres") from None
     if not jnp.issubdtype(imprint.dtype, jnp.floating):
         raise ValueError(
-            f"imprint has the type {imprint.dtype}; it takes floating-point numbers in metres, 0.0005 for half a "
-            "millimetre. Multiply a depth image of whole numbers by the metres of one unit first"
+            f"imprint has the type {imprint.dtype}, but it must be floating-point, in metres (0.0005 is half a "
+            "millimetre). Multiply a depth image of whole numbers by the metres of one unit first"
         )
     imprint = jnp.asarray(imprint, float)
     if imprint.ndim != 2 or 0 in imprint.shape:
-        raise ValueError(f"imprint has the shape {imprint.shape}; it takes (height, width). For several use jax.vmap")
+        raise ValueError(
+            f"imprint has the shape {imprint.shape}, but it must be (height, width). For several use jax.vmap"
+        )
     sensor, sound = sensor.guard()
     rows, columns = imprint.shape
     full = optics.full_window(sensor.camera, (rows, columns))
     window = full if window is None else _numbers("window", window, "(4,), left, top, width, height (m)")
     if window.shape != (4,):
-        raise ValueError(f"window has the shape {window.shape}; it takes (4,), left, top, width, height (m)")
+        raise ValueError(f"window has the shape {window.shape}, but it must be (4,), left, top, width, height (m)")
     somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)
     if not isinstance(somewhere, jax.core.Tracer) and not somewhere:
-        raise ValueError(f"window is {window}; it takes finite left, top, width, height (m), the last two above 0")
+        raise ValueError(f"window is {window}, but it needs finite left, top, width, height (m), the last two > 0")
     sound &= somewhere
     window = jnp.where(sound, window, full)
     return _touch(sensor, jnp.where(sound, imprint, 0), window)
@@ -341,19 +346,19 @@ def underside(
     """Heights of an object's underside over the gel's face, on the gel's grid.
 
     Args:
-        gel: whose grid.
-        faces: of the object, three vertices each.
-        two_sided: whether its faces are seen from behind too.
-        points: its vertices, sensor frame (m).
-        present: whether there is anything at all.
+        gel: the gel, which has the grid.
+        faces: vertex indices of the object's faces.
+        two_sided: whether faces are visible from behind too.
+        points: vertices, sensor frame (m).
+        present: whether there is an object at all.
 
     Returns:
-        Heights (m) of what lies within the gel's reach, which alone can press, and of everything, which light meets;
-        `inf` where nothing lies over a cell.
+        Two height maps (m): of the faces within the gel's reach, which alone can press on it, and of all faces, which
+        block the light. Both are `inf` where no face lies over a cell.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))
-    # No part can reach the gel that is higher over first touch than depth and tilts bring it down.
+    # Parts that are farther above the lowest point than the largest depth and tilt can lower them never press.
     extent = sum(_math.most(part) - _math.least(part) for part in (across, down))
     reach = _math.least(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
     across = (across / gel.size[0] + 0.5) * columns - 0.5
@@ -385,8 +390,8 @@ def _drawn(
     else:
         window = optics.full_window(sensor.camera, resolution)
     camera, gel = sensor.camera, sensor.gel
-    # Samples: a pixel each, or, in small images, every other one is a pixel's centre and the others lie half way
-    # between. A ring of one more around all of them is there for the normals of the outermost.
+    # One sample per pixel. In small images every second sample is a pixel centre, and the others lie half-way between.
+    # One more ring of samples is needed for the normals of the outermost ones.
     stride = 2 if min(resolution) < sensor.fine_below else 1
     shape = (stride * resolution[0] + stride + 1, stride * resolution[1] + stride + 1)
     pitch = window[2:] / jnp.array([resolution[1], resolution[0]], jnp.float32) / stride
@@ -396,7 +401,7 @@ def _drawn(
     inverse = 1 / jnp.maximum(far, camera.near)
     winner = optics.rasterise(pixels, -inverse, body.faces, present & (far > camera.near), body.two_sided, shape)
 
-    # seen through the skin
+    # the visual stream: the view through the skin
     slopes = _lines(optics.rays(camera, seen, shape))
     x, y = (slope * camera.distance for slope in slopes)  # where the rays cross the gel's face
     on_pad, walls = _pad(sensor, x, y)
@@ -411,7 +416,7 @@ def _drawn(
     visual = _pixels([channel[1:-1, 1:-1] for channel in visual], stride)
     visual = [jnp.clip(optics.to_srgb(channel), 0, 1) for channel in visual]
 
-    # the skin itself
+    # the tactile stream: the skin itself
     face = jnp.asarray(camera.distance)
     touched = on_pad & pressing & (depth < face)
     followed = jax.lax.stop_gradient(depth) if moving_edges else depth
@@ -437,11 +442,11 @@ def _drawn(
 def _pad(
     sensor: Sensor, x: Float[Array, "1 b"], y: Float[Array, "a 1"]
 ) -> tuple[Bool[Array, "a b"], Float[Array, "a b"]]:
-    """Where rays pass through the pad, and how bright what lies beyond it is over the pad."""
+    """Whether each ray passes through the pad, and the brightness relative to the pad: 1 on it, less on the walls."""
     width, height = sensor.gel.size
-    # Its edge is the image's: no rounding.
+    # The pad's edge coincides with the image's, so a margin absorbs rounding.
     on_pad = (jnp.abs(x * 2 / width) <= 1.0001) & (jnp.abs(y * 2 / height) <= 1.0001)
-    # Of two walls the one is seen that the ray is farther out over: the darker.
+    # In a corner the ray meets the wall beyond whose edge it is farther out, which is the darker one.
     sides = (jnp.stack([x, 0 * x], axis=-1), jnp.stack([0 * y, y], axis=-1))
     walls = (
         optics.housing(sensor.room, jnp.zeros(side.shape[:-1], bool), side, sensor.gel.size, sensor.camera.distance)
@@ -457,7 +462,7 @@ def _lit(
     pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """The lit skin on samples of an imprint, without the outermost, which are there for their neighbours' normals."""
+    """The lit skin at the samples of an imprint, without the outermost, which serve for their neighbours' normals."""
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
     shares = tactile.shadows(sensor.skin, sensor.lights, imprint, window) if sensor.skin.shadow_steps else ()
@@ -479,15 +484,15 @@ def _carried(
     on_pad: Bool[Array, "h w"],
     follows: Bool[Array, "h w"],
 ) -> Float[Array, "h w"]:
-    """The imprint as it is; by the faces' corners it has the derivative of a shape that is carried along.
+    """Return the imprint, with the derivative of a shape that moves along with the faces' corners.
 
-    Interpolated depth alone knows nothing of an edge that moves, and a flat thing with upright walls has nothing but
-    its edges. With the velocity v of what is seen (pixels) and the rate at which it sinks,
+    The derivative of interpolated depth ignores edges that move, and the imprint of a flat object with upright walls
+    changes at its edges alone. With the velocity v of the visible surface (pixels) and the rate at which it sinks,
 
         d imprint = rate - v . grad imprint
 
-    where the difference between two neighbouring pixels counts half for each, with the v of the nearer of the two: a
-    micro-edge (Pidhorskyi et al. 2024, "Rasterized Edge Gradients"). Right on the average over a few pixels.
+    where each of two neighbouring pixels gets half of their difference, with the v of the one nearer to the camera: a
+    micro-edge (Pidhorskyi et al. 2024, "Rasterized Edge Gradients"). It is accurate on average over a few pixels.
     """
     return imprint
 
@@ -517,7 +522,7 @@ def _carried_jvp(primals: tuple, tangents: tuple) -> tuple[Float[Array, "h w"], 
 
 
 def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tuple[Array, ...]) -> list[Array]:
-    """The object's depth, and its colour through the skin, linear light."""
+    """The object's depth, and its colour through the skin in linear light."""
     sensor, (normals, colors, uv, texture, two_sided), corners, turn = params
     winner, on_pad, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
@@ -531,7 +536,7 @@ def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tup
         of_corner = [[share * of_face[..., size * k + i] for k, share in enumerate(shares)] for i in range(size)]
         return [first + second + third for first, second, third in of_corner]
 
-    # Plane by plane, and stacked for what takes vectors: an axis of three, if worked on, is slow on a CPU.
+    # Plane by plane, and stacked only for functions of vectors: arithmetic along an axis of three is slow on a CPU.
     across = inside(normals)
     nx, ny, nz = (row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in turn)
     square = nx * nx + ny * ny + nz * nz
@@ -546,7 +551,7 @@ def _look(params: tuple[Sensor, tuple[Array, ...], _Corners, Array], images: tup
 
 
 def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Array]:
-    """The lit skin, from the rays, its imprint and the lights' shares, with one more pixel on each side."""
+    """The lit skin from the rays, the imprint and the lights' shares, which have one more pixel on each side."""
     slope_x, slope_y, imprint, *shares = images
     depth = sensor.camera.distance - imprint
     surface = slope_x * depth, slope_y * depth, -imprint
@@ -558,14 +563,14 @@ def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Array]:
 
 
 def _height(corners: _Corners, images: tuple[Array, Array, Array]) -> Float[Array, "h w"]:
-    """Height of the winning faces, linear on the gel's grid."""
+    """Height of the winning faces, interpolated linearly on the gel's grid."""
     return functools.reduce(operator.add, _shares(corners, *images))
 
 
 def _shares(
     corners: _Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """Weight of each corner of the winning face times its third value; its first two are its place on the screen."""
+    """Weight of each corner of the winning face times the corner's third value (`_Corners`)."""
     values, faces = corners
     of_face = faces[jnp.maximum(winner, 0)]
     corner = [of_face[..., k] for k in range(3)]
@@ -574,7 +579,7 @@ def _shares(
 
 
 def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array, "h w"]]:
-    """Of samples half a pixel apart by a tent one pixel wide at half height; else samples are pixels."""
+    """Filter samples half a pixel apart by a tent that is one pixel wide at half height. At stride 1, do nothing."""
     if stride == 1:
         return samples
     rows = [0.5 * s[1:-1:2] + 0.25 * (s[:-2:2] + s[2::2]) for s in samples]
@@ -582,7 +587,7 @@ def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array
 
 
 def _lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
-    """Of an image of columns and one of rows, one row and one column: the others are alike."""
+    """The first row of an image of x values and the first column of one of y values, since all others are equal."""
     return images[0][:1], images[1][:, :1]
 
 
@@ -591,6 +596,6 @@ def _planes(image: Float[Array, "h w *n 3"]) -> list[Float[Array, "h w *n"]]:
 
 
 def _near(flags: Bool[Array, "a b"]) -> Bool[Array, "h w"]:
-    """Whether any of a pixel's 3x3 neighbourhood is flagged; without the outermost."""
+    """Whether any pixel of a 3x3 neighbourhood is flagged, for all but the outermost pixels."""
     rows = flags[:-2] | flags[1:-1] | flags[2:]
     return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]

@@ -2,7 +2,7 @@
 
 A quaternion is `[w, x, y, z]`, shape `(4,)`, unit length. A pose is a position (m), then a quaternion, shape `(7,)`. It
 maps points of the mesh frame to the sensor frame. All functions broadcast over leading axes and have finite gradients,
-also at zero and at the identity. They take lists of numbers too, and raise a ValueError for an array of another shape.
+also at zero and at the identity. They accept lists of numbers, and raise a ValueError for an array of the wrong shape.
 """
 
 from typing import Any
@@ -20,7 +20,7 @@ def norm(x: Float[Array, "*n d"]) -> Float[Array, "*n"]:
 
 
 def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-    """`x` over its norm; zero, with zero gradient, where `x` is zero."""
+    """`x` divided by its norm, or zero with zero gradient where `x` is zero."""
     length = norm(x)[..., None]
     ok = length > 0
     return jnp.where(ok, x / jnp.where(ok, length, 1), 0)
@@ -49,7 +49,7 @@ def quat_inverse(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
 
 
 def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """The same rotation, unit, with `w >= 0`."""
+    """The unit quaternion of the same rotation with `w >= 0`."""
     q = _checked("q", q, 4)
     q = normalize(q)
     return jnp.where(q[..., :1] < 0, -q, q)
@@ -68,7 +68,7 @@ def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
-    """Unit quaternion, `w >= 0`, of a rotation matrix; of any other 3x3 matrix, that of the nearest rotation.
+    """Unit quaternion with `w >= 0` of a rotation matrix, or of the rotation nearest to any other 3x3 matrix.
 
     The nearest rotation R has the largest `sum(R * matrix)`. Its quaternion is the eigenvector of the largest
     eigenvalue of Davenport's K (Markley and Mortari 2000, "Quaternion attitude estimation using vector observations").
@@ -84,14 +84,15 @@ def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
 
 @jax.custom_jvp
 def _largest_eigenvector(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4"]:
-    """Unit eigenvector of the largest eigenvalue of symmetric matrices; the other eigenvalues may be equal."""
+    """Unit eigenvector of the largest eigenvalue of symmetric matrices. The other eigenvalues may be equal."""
     return jnp.linalg.eigh(matrix)[1][..., :, -1]
 
 
 @_largest_eigenvector.defjvp
 def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # dv = sum_i v_i (v_i . dA v) / (lambda - lambda_i), over the other eigenvectors; 0 where the largest is not simple.
-    # The derivative of `eigh` divides by the differences of all pairs, and for a rotation three eigenvalues are equal.
+    # dv = sum_i v_i (v_i . dA v) / (lambda - lambda_i) over the other eigenvectors. A term is 0 if its eigenvalue is
+    # equal to the largest. The derivative of `eigh` cannot be used, because it divides by the differences of all pairs,
+    # and for a rotation three eigenvalues are equal.
     values, vectors = jnp.linalg.eigh(primals[0])
     largest = vectors[..., :, -1]
     gap = values[..., -1:] - values[..., :-1]
@@ -103,7 +104,7 @@ def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> t
 
 
 def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """Quaternion of the rotation by `|v|` radians about `v`; differentiable at zero."""
+    """Quaternion of the rotation by `|v|` radians about `v`, differentiable at zero."""
     v = _checked("v", v, 3)
     half = 0.5 * norm(v)[..., None]
     return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
@@ -120,7 +121,7 @@ def quat_to_rotvec(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
 
 
 def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """A rotation drawn uniformly; `w >= 0`."""
+    """A uniformly drawn rotation with `w >= 0`."""
     return quat_canonical(jax.random.normal(key, (4,)))
 
 
@@ -128,8 +129,8 @@ def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Ar
     """Points of the mesh frame in the sensor frame."""
     pose, points = _checked("pose", pose, 7), _checked("points", points, 3)
     if pose.ndim != 1:
-        raise ValueError(f"pose has the shape {pose.shape}; it must be (7,). For several poses use jax.vmap")
-    # Component by component: as a product of matrices it is several times slower on a CPU, and rounded on some GPUs.
+        raise ValueError(f"pose has the shape {pose.shape}, but it must be (7,): use jax.vmap for several poses")
+    # Component by component, because a matrix product is several times slower on a CPU and rounds on some GPUs.
     x, y, z = (points[..., k] for k in range(3))
     rows = zip(quat_to_matrix(pose[3:]), pose[:3], strict=True)
     return jnp.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
@@ -150,7 +151,7 @@ def pose_from_matrix(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 7"]:
 
 
 def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """Composition of two poses: the pose `b`, then the pose `a`. Its matrix is the product of theirs."""
+    """Composition of two poses: the pose `b`, then the pose `a`. Its matrix is the product of their matrices."""
     a, b = _checked("a", a, 7), _checked("b", b, 7)
     quat = quat_multiply(a[..., 3:], b[..., 3:])
     turned = jnp.einsum("...ij,...j->...i", quat_to_matrix(a[..., 3:]), b[..., :3], precision="highest")
@@ -166,14 +167,14 @@ def pose_inverse(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
 
 
 def _checked(name: str, value: Any, *tail: int) -> Array:
-    """The value as an array whose last axes have the given sizes."""
+    """Convert a value to an array, and check that its last axes have the sizes `tail`."""
     if not hasattr(value, "shape"):
         try:
             value = jnp.asarray(value, float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{name} is {value!r}; it must be an array of {_shape(tail)} numbers") from error
+            raise ValueError(f"{name} is {value!r}, but it must be an array of {_shape(tail)} numbers") from error
     if value.shape[max(value.ndim - len(tail), 0) :] != tail:
-        raise ValueError(f"{name} has the shape {value.shape}; it must be {_shape(tail)}")
+        raise ValueError(f"{name} has the shape {value.shape}, but it must be {_shape(tail)}")
     return value
 
 

@@ -1,4 +1,4 @@
-"""A trained model as one function: from any of vision, touch and pose to what the sensor will see at rest."""
+"""A trained model as a function from any subset of vision, touch and pose to a prediction of the last moment."""
 
 import dataclasses
 import functools
@@ -18,25 +18,25 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 from sts_jax import _files, mvae, statespace, training
 
 MODALITIES = ("visual", "tactile", "pose")
-MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # the models of the library, a folder each
+MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # the models of the library, one folder each
 _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
-_FARTHEST = 10.0  # m, of a position: beyond it the numbers are no metres
-_LARGEST_CONDITION = 100.0  # in units of the condition's usual size
-_POSES = 64  # samples of a state-space model's final pose, among which the predicted one is chosen
-_DRAWN = 16  # of them are drawn where `num_samples` is 0; the predicted images are their means
-_TURN = 0.02  # m, by which one radian counts in the choice of the pose
+_FARTHEST = 10.0  # m, largest coordinate of a position (larger numbers cannot be metres)
+_LARGEST_CONDITION = 100.0  # largest condition, in units of its usual size
+_POSES = 64  # samples of the final pose, from which the prediction of a state-space model is chosen
+_DRAWN = 16  # samples that are drawn as images if `num_samples` is 0 (the predicted images are their means)
+_TURN = 0.02  # m, weight of one radian in the choice of the pose
 
 
 class Prediction(NamedTuple):
-    """The last moment, as a model expects it; None for what the model does not speak of."""
+    """A predicted last moment. Modalities that the model lacks are None."""
 
     visual: Float[Array, "*n h w 3"] | None  # [0, 1]
     tactile: Float[Array, "*n h w 3"] | None  # [0, 1]
-    pose: Float[Array, "*n 7"] | None  # m, unit quaternion with w >= 0; mesh frame in the sensor frame
-    mean: Float[Array, "*n latent"]  # of the fused posterior
-    log_var: Float[Array, "*n latent"]
-    samples: "Prediction | None" = None  # the same with a leading axis of samples, each from its own latent
-    # Of each outcome, in the order of the scenario's `outcomes`; None for a model of the paper's kind
+    pose: Float[Array, "*n 7"] | None  # m, unit quaternion with w >= 0, mesh frame in the sensor frame
+    mean: Float[Array, "*n latent"]  # mean of the fused posterior
+    log_var: Float[Array, "*n latent"]  # its log variance
+    samples: "Prediction | None" = None  # samples on a leading axis, each from its own latent
+    # Probability of each of the scenario's `outcomes`, in their order (None for a model of the paper's kind)
     outcome_probability: Float[Array, "*n outcomes"] | None = None
 
     def __repr__(self) -> str:
@@ -60,20 +60,22 @@ def predict(
     num_samples: int = 0,
     shape: tuple[int, ...] = (),
 ) -> Prediction:
-    """What a model expects, from the mean of the fused posterior; pure, compiled once a shape and subset.
+    """Predict with a model of the paper's kind, from the mean of the fused posterior.
+
+    The function is pure, and is compiled once per shape and subset of the inputs.
 
     Args:
         graphdef: The model's definition.
         state: Its parameters and running batch statistics.
-        preprocessing: What it was trained on.
+        preprocessing: The preprocessing of its training.
         blank: The tactile image of the untouched sensor, [0, 1].
         inputs: Some of `visual`, `tactile` `(*n, height, width, 3)` in [0, 1] and `pose` `(*n, 7)`.
-        present: Which items of an input count, `(*n,)`; all where not given. A touch without contact never does,
-            unless the model was trained to be fed the blank one.
+        present: Which items of an input count, `(*n,)` (default: all). A touch without contact never counts, unless
+            the model was trained with blank images as inputs.
         condition: `(*n, c)`, SI units, for models that have one.
-        key: For the samples; consumed.
-        num_samples: How many latents to draw besides the mean.
-        shape: The leading axes where there is no input at all; the prediction is then the prior's.
+        key: The random key of the samples, consumed.
+        num_samples: Number of latents to draw besides the mean.
+        shape: The leading axes if there is no input. The prediction is then that of the prior.
     """
     lead = shape
     for name, value in inputs.items():
@@ -120,11 +122,11 @@ def predict_samples(
     num_samples: int = 0,
     shape: tuple[int, ...] = (),
 ) -> Prediction:
-    """The prediction of a state-space model: images are means over samples, the pose is the most central sample.
+    """Predict with a state-space model. Images are means over samples, and the pose is the most central sample.
 
     Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
-    prediction. Arguments as of `predict`, but for `empty`, both images of the untouched sensor, [0, 1]; `inputs` has
-    all that the model takes (see `_completed`), and `shape` their leading axes.
+    prediction. The arguments are those of `predict`, with three differences: `empty` holds both images of the untouched
+    sensor, [0, 1], `inputs` holds all inputs of the model (see `_completed`), and `shape` is their leading axes.
     """
     lead = shape
     flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
@@ -169,7 +171,7 @@ def _completed(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """All inputs of a model and their masks, so that one compiled program serves every subset.
 
-    What is not given counts for no item.
+    Inputs that are not given are masked for all items.
     """
     lying = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
     nothing = {
@@ -188,7 +190,7 @@ def _flat(
     lead: tuple[int, ...],
     blank: Float[Array, "h w 3"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Inputs as the networks see them and which items of them count, with one leading axis."""
+    """Encoded inputs and their masks, with one leading axis."""
     flat, counts = {}, {}
     for name, value in inputs.items():
         value = preprocessing.encode_pose(value) if name == "pose" else value
@@ -239,17 +241,17 @@ class Predictor:
         resolution: tuple[int, int] | None = None,
         crop: bool | None = None,
     ) -> "Predictor":
-        """Read a trained model.
+        """Load a trained model.
 
         Args:
-            folder: The `workdir` of a training, or the folder of `save`, such as `runs/freefall/models/mvae`. Or the
-                name of a model that comes with the library, such as `freefall`: it is loaded unless the current
-                directory has a folder of this name with a `config.json`.
-            resolution: The images that will be given; refused if the model was trained on another.
-            crop: The view that will be given (True: the square around the object); refused likewise.
+            folder: The `workdir` of a training or the folder of `save`, such as `runs/freefall/models/mvae`, or the
+                name of a model that comes with the library, such as `freefall`. A folder of this name in the current
+                directory takes precedence if it has a `config.json`.
+            resolution: The resolution of the images that will be given. A model of another resolution is refused.
+            crop: The view that will be given (True: the square around the object). A model of another view is refused.
 
         Raises:
-            FileNotFoundError: There is no model in the folder, nor one of this name in the library.
+            FileNotFoundError: The folder holds no model, and the library has none of this name.
             OSError: A file is damaged, missing or not listed in `manifest.json`.
             ValueError: The model was trained on another view, by another version of sts_jax, or has no manifest.
         """
@@ -263,21 +265,21 @@ class Predictor:
             there = getattr(preprocessing, field)
             if asked is not None and asked != there:
                 raise ValueError(
-                    f"{folder} was trained on {field}={there}, asked for is {field}={asked}: "
-                    "render that view, or train a model on this one."
+                    f"{folder} was trained on {field}={there}, but {field}={asked} was requested: "
+                    "render the first view, or train a model on the second."
                 )
         if isinstance(model.config, statespace.Config):
             _check_view(str(folder), model.config, preprocessing)
         blank = training.load_blank(path)
         if any(image.shape[:2] != preprocessing.resolution for image in blank):
             raise ValueError(
-                f"{path / 'blank.npz'} has images of {blank[0].shape[:2]}, the model takes "
-                f"{preprocessing.resolution}: it is of another model; delete {path} and train again."
+                f"{path / 'blank.npz'} has images of {blank[0].shape[:2]}, but the model takes "
+                f"{preprocessing.resolution}: the file belongs to another model. Delete {path} and train again."
             )
         return cls(model, preprocessing, blank, str(folder))
 
     def save(self, folder: str | Path, *, compact: bool = False) -> None:
-        """Write a folder that `load` reads. Training cannot go on from it: it lacks the optimiser's state.
+        """Write a folder that `load` reads. It lacks the optimiser's state, so that training cannot resume from it.
 
         Args:
             folder: A new or an empty folder.
@@ -290,7 +292,7 @@ class Predictor:
         """
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise FileExistsError(f"{folder} is not an empty folder; give the name of a new one.")
+            raise FileExistsError(f"{folder} is not an empty folder: give the name of a new one.")
         settings = {**self.model.settings, "preprocessing": dataclasses.asdict(self.preprocessing)}
         params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
         training.save_blank(folder, *self._images)
@@ -323,20 +325,20 @@ class Predictor:
         would raise an error outside gives a prediction of NaN, and the other items are not affected.
 
         Args:
-            visual: `(*n, height, width, 3)` in [0, 1], any leading axes, the same for all that is given.
-            tactile: `(*n, height, width, 3)` in [0, 1]; items without contact are ignored.
+            visual: `(*n, height, width, 3)` in [0, 1], any leading axes, the same for all inputs.
+            tactile: `(*n, height, width, 3)` in [0, 1]. Items without contact are ignored.
             pose: `(*n, 7)` m and unit quaternion, mesh frame in the sensor frame.
             condition: `(*n, c)`, the scenario's input in SI units, for models that have one. For a jerk: acceleration
                 of the pad along x and y (m/s^2) and its duration (s).
             state: `(*n, code)`, the true pose, shape and mass, from `statespace.encode`, for state-space models. A
-                simulation provides them. The error that remains is that of the learned physics and of the drawing.
-            present: By name, which items of a modality count, bool `(*n,)`; what does not count may be NaN.
-            key: For `num_samples`; consumed.
+                simulation provides them. The remaining error is that of the learned physics and of the decoder.
+            present: By name, which items of a modality count, bool `(*n,)`. Items that do not count may be NaN.
+            key: The random key for `num_samples`, consumed.
             num_samples: Draw this many predictions. A state-space model's images are then the means over them.
 
         Raises:
-            ValueError: Nothing given, a modality the model does not have or was never given in training, a wrong
-                type or shape, a value out of range, NaN. The message names it and the remedy.
+            ValueError: No input is given, the model lacks a modality or was trained without it, or a value has a wrong
+                type or shape, or is out of range or NaN. The message names the argument and the remedy.
         """
         given = {
             name: value for name, value in zip(MODALITIES, (visual, tactile, pose), strict=True) if value is not None
@@ -347,9 +349,9 @@ class Predictor:
         leads = {name: array.shape[: -1 if name == "pose" else -3] for name, array in arrays.items()}
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
-            raise ValueError(f"the leading axes differ: {leads}; give the same number of items of each modality.")
+            raise ValueError(f"the leading axes differ: {leads}. Give the same number of items of each modality.")
         masks = _checked_masks(present, arrays, lead)
-        valid: Array | None = None  # items to be believed, (*n,); None while no value is traced
+        valid: Array | None = None  # valid items, (*n,), or None if no value is traced
         for name, array in arrays.items():
             mask = masks.get(name)
             if _traced(array) or _traced(mask):
@@ -368,21 +370,21 @@ class Predictor:
         return result if valid is None else _flagged(result, valid)
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
-        """The prediction without any measurement: the mean of the prior, for items of any leading `shape`.
+        """Predict from the prior, without any measurement, for items of any leading `shape`.
 
         Args:
             shape: Leading axes of the items.
             condition: `(*shape, c)`, as in a call.
 
         Raises:
-            ValueError: A size is no positive whole number, or the condition is missing, superfluous or out of range.
+            ValueError: A size is not a positive whole number, or the condition is missing, superfluous or out of range.
         """
         try:
             shape = tuple(operator.index(size) for size in shape)
         except TypeError:
-            raise ValueError(f"shape is {shape!r}; give a tuple of whole numbers, such as (3,).") from None
+            raise ValueError(f"shape is {shape!r}, but it must be a tuple of whole numbers, such as (3,).") from None
         if min(shape, default=1) < 1:
-            raise ValueError(f"shape is {shape}; each size must be at least 1.")
+            raise ValueError(f"shape is {shape}, but each size must be at least 1.")
         condition, plausible = self._checked_condition(condition, shape)
         result = self._predicted({}, {}, shape, condition, None, 0)
         return result if plausible is None else _flagged(result, plausible)
@@ -417,74 +419,74 @@ class Predictor:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The modalities that this model can be given: those it has and was given in training."""
+        """The modalities that the model accepts: its inputs, except those that were absent in training."""
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
-        """The value as float32, if type and shape are right; a traced one stays traced."""
+        """Check type and shape of an input and return it as float32. A traced value stays traced."""
         if name not in (*self._inputs, *self.preprocessing.absent):
             raise ValueError(f"{self.name} takes no {name}: it was trained on {', '.join(self._inputs)}.")
         if name in self.preprocessing.absent:
             raise ValueError(
-                f"{self.name} cannot use {name}: no first moment it was trained on had any (in freefall nothing "
+                f"{self.name} cannot use {name}: no first moment of its training had any (in freefall nothing "
                 f"touches the pad yet). Leave {name}= out, or use a model of another scenario."
             )
         array = _checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(
-                f"{name} is {array.dtype}; give floats" + ("." if name == "pose" else " in [0, 1] (uint8 / 255).")
+                f"{name} is {array.dtype}: give floats" + ("." if name == "pose" else " in [0, 1] (uint8 / 255).")
             )
         height, width = self.preprocessing.resolution
         tail = (7,) if name == "pose" else (height, width, 3)
         if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
             raise ValueError(
-                f"{name} has shape {array.shape}; {self.name} needs (..., {', '.join(map(str, tail))})"
+                f"{name} has shape {array.shape}, but {self.name} needs (..., {', '.join(map(str, tail))})"
                 + ("." if name == "pose" else f": render with resolution={self.preprocessing.resolution}.")
             )
         if math.prod(array.shape) == 0:
-            raise ValueError(f"{name} has shape {array.shape}: there is no item in it.")
+            raise ValueError(f"{name} has shape {array.shape}, so there is no item in it: give at least one.")
         return _float32(array)
 
     def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
-        """The state code as float32."""
+        """Check a state code and return it as float32."""
         if isinstance(self.model.config, mvae.Config):
             raise ValueError(f"{self.name} takes no state: it is a model of the paper's kind, which has none.")
         array = _checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
         if array.shape != (*lead, statespace.STATE_CODE):
-            raise ValueError(f"state has shape {array.shape}; it needs {(*lead, statespace.STATE_CODE)}.")
+            raise ValueError(f"state has shape {array.shape}, but it needs {(*lead, statespace.STATE_CODE)}.")
         if not _traced(array) and not np.isfinite(array).all():
-            raise ValueError("state has NaN or infinite values; every item needs its true state.")
+            raise ValueError("state has NaN or infinite values, but every item needs its true state.")
         return _float32(array)
 
     def _checked_condition(
         self, value: Any, lead: tuple[int, ...]
     ) -> tuple[np.ndarray | Array | None, Bool[Array, "*n"] | None]:
-        """The condition as float32, and which items are plausible if it is traced."""
+        """Check a condition. Return it as float32 and, if it is traced, which items are plausible."""
         width = self.model.config.condition
         array = None if value is None else _checked_array("condition", value, f"{width} numbers in SI units")
         shape = None if array is None else array.shape
         if shape != (None if width == 0 else (*lead, width)):
-            raise ValueError(f"condition has shape {shape}; {self.name} needs {(*lead, width) if width else 'none'}.")
+            raise ValueError(f"condition has shape {shape}: {self.name} needs {(*lead, width) if width else 'none'}.")
         if array is None:
             return None, None
         if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-            raise ValueError(f"condition is {array.dtype}; give numbers in SI units.")
+            raise ValueError(f"condition is {array.dtype}, but it must be numbers in SI units.")
         condition = _float32(array)
         scale = np.array(self.preprocessing.condition_scale)
         if _traced(condition):
             return condition, jnp.all(jnp.abs(condition) <= _LARGEST_CONDITION * scale, axis=-1)
         if not np.isfinite(condition).all():
-            raise ValueError("condition has NaN or infinite values; every item needs one.")
+            raise ValueError("condition has NaN or infinite values, but every item needs a condition.")
         if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
             raise ValueError(
-                f"condition has {np.abs(condition).reshape(-1, width).max(0).tolist()}, where {scale.tolist()} is "
-                "usual; are these SI units?"
+                f"condition has {np.abs(condition).reshape(-1, width).max(0).tolist()}, but {scale.tolist()} is "
+                "usual: give it in SI units."
             )
         return condition, None
 
 
 def _located(folder: str | Path) -> Path:
-    """The folder of a model, given this folder, or the name of a model of the library."""
+    """The folder of a model, given the folder itself or the name of a model of the library."""
     path, name = Path(folder), str(folder)
     if name != path.name or (path / "config.json").exists():
         return path
@@ -498,7 +500,7 @@ def _located(folder: str | Path) -> Path:
 
 
 def _check_view(name: str, config: statespace.Config, preprocessing: training.Preprocessing) -> None:
-    """Raise a ValueError where the networks presume another view or another code of a pose."""
+    """Raise a ValueError if the networks were made for another view or another code of a pose."""
     presumed = {
         "resolution": (config.input_size,) * 2,
         "crop": False,
@@ -523,20 +525,20 @@ def _checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
         return value
     if isinstance(value, str | bytes | Path):
         raise ValueError(
-            f"{name} is {value!r}; give an array of {wanted}, not a path (for a picture: "
+            f"{name} is {value!r}, but it must be an array of {wanted}, not a path (for a picture: "
             "np.asarray(PIL.Image.open(path)) / 255)."
         )
     try:
         array = np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is no array ({error}); give an array of {wanted}.") from error
+        raise ValueError(f"{name} is not an array ({error}): give an array of {wanted}.") from error
     if array.dtype.kind in "OUSMm":
-        raise ValueError(f"{name} is a {type(value).__name__}; give an array of {wanted}.")
+        raise ValueError(f"{name} is a {type(value).__name__}, but it must be an array of {wanted}.")
     return array
 
 
 def _float32(array: np.ndarray | Array) -> np.ndarray | Array:
-    with np.errstate(over="ignore"):  # a number beyond float32 becomes infinite, and is refused as such
+    with np.errstate(over="ignore"):  # a number beyond the range of float32 becomes infinite, and is refused later
         return array.astype(np.float32)
 
 
@@ -544,17 +546,17 @@ def _checked_masks(
     present: Any, arrays: dict[str, np.ndarray | Array], lead: tuple[int, ...]
 ) -> dict[str, np.ndarray | Array]:
     if not isinstance(present, Mapping | None):
-        raise ValueError(f"present is a {type(present).__name__}; give a dict of bool arrays by modality.")
+        raise ValueError(f"present is a {type(present).__name__}, but it must be a dict of bool arrays by modality.")
     masks = {}
     for name, value in (present or {}).items():
         mask = _checked_array(f"present[{name!r}]", value, "bool")
         if name not in arrays or mask.shape != lead:
             raise ValueError(
-                f"present[{name!r}] has shape {mask.shape}; it must mask a given modality, one of "
+                f"present[{name!r}] has shape {mask.shape}, but it must mask a given modality, one of "
                 f"{list(arrays)}, with shape {lead}."
             )
         if mask.dtype != bool:
-            raise ValueError(f"present[{name!r}] is {mask.dtype}; give bool, True for the items that count.")
+            raise ValueError(f"present[{name!r}] is {mask.dtype}, but it must be bool, True for the items that count.")
         masks[name] = mask
     return masks
 
@@ -564,16 +566,16 @@ def _checked_samples(num_samples: Any, key: Any) -> int:
         number = operator.index(num_samples)
     except TypeError:
         raise ValueError(
-            f"num_samples={num_samples!r}; give a whole number, which cannot be an argument of a function inside "
-            "jax.jit (static_argnames makes it a constant)."
+            f"num_samples={num_samples!r}, but it must be a whole number. Inside jax.jit it must be a constant "
+            "(static_argnames makes it one)."
         ) from None
     if number < 0 or (number > 0 and key is None):
-        raise ValueError(f"num_samples={number} needs a key and a number that is not negative.")
+        raise ValueError(f"num_samples={number}, but it must be >= 0, and needs a key if it is > 0.")
     if key is not None and not (
         isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
     ):
         shown = f"{key.dtype} of shape {key.shape}" if isinstance(key, jax.Array | np.ndarray) else repr(key)
-        raise ValueError(f"key is {shown}; give one key, such as jax.random.key(0).")
+        raise ValueError(f"key is {shown}, but it must be one key, such as jax.random.key(0).")
     return number
 
 
@@ -587,24 +589,24 @@ def _plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
 
 def _check_values(name: str, array: np.ndarray) -> None:
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} has NaN or infinite values; mask such items with present={{{name!r}: ...}}.")
+        raise ValueError(f"{name} has NaN or infinite values: mask such items with present={{{name!r}: ...}}.")
     if name == "pose":
         lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
         if lengths.size and np.abs(lengths - 1).max() > _QUAT_TOLERANCE:
             raise ValueError(
-                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}; "
-                "give position (m) and a unit quaternion [w, x, y, z]."
+                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}: "
+                "give a position (m) and a unit quaternion [w, x, y, z]."
             )
         if array.size and np.abs(array[..., :3]).max() > _FARTHEST:
-            raise ValueError(f"pose has a position {np.abs(array[..., :3]).max():.3g} m away; are these millimetres?")
+            raise ValueError(f"pose has a position {np.abs(array[..., :3]).max():.3g} m away: give metres, not mm.")
     elif array.size and (array.min() < 0 or array.max() > 1):
         raise ValueError(
-            f"{name} has values in [{array.min():.3g}, {array.max():.3g}]; images are in [0, 1] (divide by 255?)."
+            f"{name} has values in [{array.min():.3g}, {array.max():.3g}], but images are in [0, 1] (divide by 255?)."
         )
 
 
 def _flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
-    """NaN in every number of the items that are not valid."""
+    """Set every number of the invalid items to NaN."""
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)

@@ -46,14 +46,14 @@ def test_soaked_blocks_are_read_in_turn(tmp_path):
 
 def test_blocks_of_other_settings_are_refused(tmp_path, monkeypatch):
     kept(tmp_path, "inclined", soak.BLOCK)
-    with pytest.raises(ValueError, match=r"inclined.json was made with block = 504, and the current settings have 104"):
+    with pytest.raises(ValueError, match=r"inclined.json was made with block = 504, but the current settings have 104"):
         soak.main(100, ["inclined"], tmp_path)
     monkeypatch.setattr(soak, "NUM", 4)
-    with pytest.raises(ValueError, match=r"inclined.json was made with num = 8, and the current settings have 4"):
+    with pytest.raises(ValueError, match=r"inclined.json was made with num = 8, but the current settings have 4"):
         soak.soaked(tmp_path, "inclined")
     other = dataclasses.replace(physics.Inclined(), tries=1)
     monkeypatch.setitem(soak.SCENARIOS, "inclined", other)
     with pytest.raises(
-        ValueError, match=r"inclined.json was made with scenario = .*tries=16.*and the current settings have .*tries=1,"
+        ValueError, match=r"inclined.json was made with scenario = .*tries=16.*but the current settings have .*tries=1,"
     ):
         soak.soaked(tmp_path, "inclined")

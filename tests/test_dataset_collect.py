@@ -261,7 +261,7 @@ def test_a_scenario_with_a_mirror_alone_takes_any_pad(tmp_path, monkeypatch):
 
 def test_another_collection_in_the_same_folder_is_refused(folder):
     other = dataclasses.replace(SMALL, scenario=sts.physics.Freefall(frames=12, spread=0.02))
-    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, and the current settings have 0\.02"):
+    with pytest.raises(ValueError, match=r"scenario\.spread = 0\.05, but the current settings have 0\.02"):
         dataset.collect(other, sts.Sensor(), folder)
 
 
@@ -318,10 +318,10 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
     [
         (
             lambda split: split["test"].append(split["train"][0]),
-            "object . must be in one part, and it is there 2 times",
+            "object . must be in one part, but it occurs 2 times",
         ),
-        (lambda split: split["train"].pop(), "object . must be in one part, and it is there 0 times"),
-        (lambda split: split["test"].append(4), "test holds object 4, and the objects are 0 to 3"),
+        (lambda split: split["train"].pop(), "object . must be in one part, but it occurs 0 times"),
+        (lambda split: split["test"].append(4), "test holds object 4, but the objects are 0 to 3"),
         (lambda split: split["test"].append(-1), "test holds object -1"),
         (lambda split: split["test"].append(1.5), "test must be a list of whole numbers"),
         (lambda split: split.pop("validation"), "must have the parts train, validation, test, got 'train', 'test'"),

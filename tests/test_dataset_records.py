@@ -135,7 +135,7 @@ def test_both_files_of_another_shard_are_refused(tmp_path):
     one, other = shard(tmp_path, 0), shard(tmp_path, 1)
     for ending in (".array_record", ".npz"):
         one.with_suffix(ending).write_bytes(other.with_suffix(ending).read_bytes())
-    with pytest.raises(dataset.TornFileError, match=r"0\.npz holds shard 1 instead of shard 0; delete 0\.npz and"):
+    with pytest.raises(dataset.TornFileError, match=r"0\.npz holds shard 1 instead of shard 0: delete 0\.npz and"):
         records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
 
 
@@ -174,12 +174,12 @@ def test_an_array_that_is_not_there_is_named(tmp_path):
     arrays = records.read_arrays(path.with_suffix(".npz"))
     del arrays["trajectory/pose"]
     records.write_arrays(path.with_suffix(".npz"), arrays)
-    with pytest.raises(dataset.TornFileError, match=r"0\.npz lacks trajectory/pose; delete"):
+    with pytest.raises(dataset.TornFileError, match=r"0\.npz lacks trajectory/pose: delete"):
         records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
 
 
 def test_images_that_are_gone_are_named(tmp_path):
     path = shard(tmp_path, 0)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"0\.array_record is missing; delete 0\.npz and collect again"):
+    with pytest.raises(FileNotFoundError, match=r"0\.array_record is missing: delete 0\.npz and collect again"):
         records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))

@@ -80,7 +80,7 @@ def test_every_re_roll_begins_at_its_items_start_and_ends_are_samples(engine):
 def test_a_start_that_the_engine_draws_otherwise_is_refused(engine, monkeypatch):
     real = rerolls.physics.simulate
     monkeypatch.setattr(rerolls.physics, "simulate", lambda key, *rest, **k: real(jax.random.key(9), *rest, **k))
-    with pytest.raises(RuntimeError, match="draws its starts otherwise"):
+    with pytest.raises(RuntimeError, match="simulate changed its keys"):
         evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), TIMES, jax.random.key(0))
 
 

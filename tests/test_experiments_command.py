@@ -100,7 +100,7 @@ def test_a_folder_of_other_classes_is_taken_whole(folder, tmp_path):
     meshes = command.configure(freefall.SMOKE, small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
-    with pytest.raises(ValueError, match="--scale and --up are of the files of a folder"):
+    with pytest.raises(ValueError, match="--scale and --up are for the files of a folder"):
         command.configure(perturbed.SMOKE, command.Args(tmp_path, up="y"))
 
     (folder / "bottle").rename(folder / "jar")
@@ -111,11 +111,11 @@ def test_a_folder_of_other_classes_is_taken_whole(folder, tmp_path):
 
 def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
     args = command.Args(tmp_path / "run", classes=("bottle", "teapot"))
-    with pytest.raises(ValueError, match=r"unknown classes teapot: take some of .*bottle"):
+    with pytest.raises(ValueError, match=r"unknown classes teapot: choose among .*bottle"):
         command.configure(freefall.SMOKE, args)
     with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
         command.configure(freefall.SMOKE, dataclasses.replace(args, objects=folder))
-    with pytest.raises(ValueError, match="3 objects are too few to hold some out: give 4"):
+    with pytest.raises(ValueError, match="holding some out needs 4 usable objects, got 3"):
         command.configure(freefall.SMOKE, dataclasses.replace(args, objects=folder, classes=("box",)))
 
 

@@ -32,9 +32,9 @@ MAINS = {
 @pytest.mark.usefixtures("no_work")
 def test_a_picture_that_cannot_be_written_is_named_before_any_work(name, tmp_path, monkeypatch):
     for path, kind, message in (
-        (tmp_path, IsADirectoryError, "is a folder; give the name of a picture"),
-        (tmp_path / "nowhere" / "a.png", FileNotFoundError, r"nowhere: no such folder for a\.png: make it"),
-        (tmp_path / "a.xyz", ValueError, r"its suffix is '\.xyz'; it must be one of \.png"),
+        (tmp_path, IsADirectoryError, "is a folder: give the name of a picture"),
+        (tmp_path / "nowhere" / "a.png", FileNotFoundError, r"nowhere does not exist: make it for a\.png"),
+        (tmp_path / "a.xyz", ValueError, r"has the suffix '\.xyz', but it must be one of \.png"),
     ):
         with pytest.raises(kind, match=message):
             MAINS[name](path)

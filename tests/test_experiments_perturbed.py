@@ -97,7 +97,7 @@ def test_a_model_answers_a_jerk_in_si_units(workdir):
     out = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition)
     other = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition * [-1, -1, 1])
     assert np.abs(out.pose - other.pose).max() > 1e-4
-    with pytest.raises(ValueError, match=r"condition has shape None; .* needs \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"condition has shape None: .* needs \(1, 3\)"):
         predictor(tactile=pairs.tactile[:, 0] / 255)
 
 
@@ -119,7 +119,7 @@ def test_what_is_shown_is_a_strip_and_an_animation(name, scenario, tmp_path, mon
 
 
 def test_an_unknown_scenario_cannot_be_shown(tmp_path):
-    with pytest.raises(ValueError, match="give one of freefall, inclined, perturbed"):
+    with pytest.raises(ValueError, match="must be one of freefall, inclined, perturbed"):
         show.main(show.Config("sideways", out=tmp_path))
 
 

@@ -133,21 +133,21 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mesh": "teapot"}, "teapot: no such file, nor one of the classes bottle, camera"),
+        ({"mesh": "teapot"}, r"teapot is neither a file nor a class \(bottle, camera"),
         ({"mesh": "teapot.obj"}, r"teapot\.obj: no such mesh file"),
         ({"resolution": (0, 64)}, r"resolution is \(0, 64\).*at least 1 pixel"),
-        ({"mass": 0.0}, "mass is 0.0: give one above 0"),
-        ({"mass": np.nan}, "mass is nan: give finite"),
-        ({"force": -1.0}, "force is -1.0: give one above 0, or 0"),
+        ({"mass": 0.0}, "mass is 0.0, but it must be > 0"),
+        ({"mass": np.nan}, "mass is nan, but it must be finite"),
+        ({"force": -1.0}, "force is -1.0, but it must be > 0 or 0"),
         ({"position": (0.0, np.inf)}, "position is .*finite"),
         ({"light": 1.5}, "light is 1.5"),
-        ({"rest": 99}, r"rest is 99: it rests on \d+ faces, give 0 to"),
-        ({"mesh": "bottle", "longest_side": 0.1}, "longest_side is of a mesh file, and bottle is a class"),
+        ({"rest": 99}, r"rest is 99, but it can rest on \d+ faces: give 0 to"),
+        ({"mesh": "bottle", "longest_side": 0.1}, "longest_side is for mesh files, but bottle is a class"),
         ({"longest_side": 0.2}, "longest_side is 0.2 m, the pad is 0.15 m wide"),
         ({"scale": 100.0}, r"longest side is 4 m, the pad is 0.15 m wide: give longest_side"),
-        ({"out": "nowhere/a.png"}, "nowhere: no such folder"),
-        ({"out": "."}, "is a folder; give the name of a picture"),
-        ({"out": "a.xyz"}, r"a\.xyz: its suffix is '\.xyz'; it must be one of \.png"),
+        ({"out": "nowhere/a.png"}, "nowhere does not exist"),
+        ({"out": "."}, "is a folder: give the name of a picture"),
+        ({"out": "a.xyz"}, r"a\.xyz has the suffix '\.xyz', but it must be one of \.png"),
         ({"sensor": "none.json"}, r"none\.json"),
     ],
 )
@@ -169,5 +169,5 @@ def test_meshes_that_are_broken_or_too_many_faces(tmp_path):
     record = np.zeros(1_000_000, [("numbers", "<f4", 12), ("attribute", "<u2")])
     record["numbers"][:, 3:] = np.random.default_rng(0).uniform(0, 0.1, (1_000_000, 9))
     (tmp_path / "many.stl").write_bytes(bytes(80) + np.uint32(1_000_000).tobytes() + record.tobytes())
-    with pytest.raises(ValueError, match=r"many\.stl: 1,000,000 faces, at most 131,072 can be drawn: give faces="):
+    with pytest.raises(ValueError, match=r"many\.stl: has 1,000,000 faces, but at most 131,072 can be drawn: give"):
         sense.main(sense.Config(str(tmp_path / "many.stl"), out=tmp_path / "a.png"))

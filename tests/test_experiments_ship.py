@@ -69,7 +69,7 @@ def test_an_earlier_model_stays_where_the_new_one_is_refused(models, workdir, mo
         error, message = OSError, r"blank\.npz is not the file"
     else:
         model.rename(workdir / "elsewhere")
-        error, message = FileNotFoundError, r"statespace: has no config\.json"
+        error, message = FileNotFoundError, r"statespace has no config\.json"
     with pytest.raises(error, match=message):
         ship.ship(workdir, "falls")
     assert content(models) == {"falls/config.json": b"earlier"}

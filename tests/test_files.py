@@ -80,7 +80,7 @@ def test_json_comes_back(tmp_path):
 def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
     path = tmp_path / "a.json"
     path.write_bytes(content)
-    with pytest.raises(_files.TornFileError, match=r"a\.json cannot be read as JSON .*; delete it\.$"):
+    with pytest.raises(_files.TornFileError, match=r"a\.json cannot be read as JSON .*: delete it\.$"):
         _files.read_json(path, "delete it")
     with pytest.raises(_files.TornFileError, match=r"a\.json"):
         _files.claim(path, {"seed": 0})
@@ -99,9 +99,9 @@ def test_other_settings_are_refused_and_equal_ones_are_not(tmp_path):
     before = path.stat().st_mtime_ns
     _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 2)}})
     assert path.stat().st_mtime_ns == before
-    with pytest.raises(ValueError, match=r"config\.json was made with seed = 0, and the current settings have 1"):
+    with pytest.raises(ValueError, match=r"config\.json was made with seed = 0, but the current settings have 1"):
         _files.claim(path, {"seed": 1, "gel": {"sizes": (1, 2)}})
-    with pytest.raises(ValueError, match=r"gel\.sizes = \[1, 2\], and the current settings have \[1, 3\]"):
+    with pytest.raises(ValueError, match=r"gel\.sizes = \[1, 2\], but the current settings have \[1, 3\]"):
         _files.claim(path, {"seed": 0, "gel": {"sizes": (1, 3)}})
     path.write_text("[]")
     with pytest.raises(ValueError, match=r"content = \[\]"):

@@ -68,25 +68,25 @@ def test_a_body_with_too_many_faces_is_refused():
     many = {name: jnp.zeros((number, *getattr(BODY, name).shape[1:])) for name in ("normals", "colors", "uv")}
     body = dataclasses.replace(BODY, faces=jnp.zeros((number, 3), jnp.int32), **many)
     for call in (sense, jax.jit(sense)):
-        with pytest.raises(ValueError, match=r"body has 131,073 faces; at most 131,072.*faces="):
+        with pytest.raises(ValueError, match=r"body has 131,073 faces, but at most 131,072.*faces="):
             call(SENSOR, body, POSE, WRENCH)
 
 
 def test_what_is_no_sensor_or_body_is_named():
     cases = [
-        ((SENSOR, "mug.obj"), r"body is 'mug\.obj'; it takes one Body\. objects\.load reads a mesh file"),
-        ((SENSOR, [BODY, BODY]), r"body is .*; it takes one Body\. For several use objects\.stack and jax\.vmap"),
-        ((SENSOR, None), "body is None; it takes one Body"),
-        (("sensor.json", BODY), r"sensor is 'sensor\.json'; it takes a Sensor"),
-        ((BODY, SENSOR), r"sensor is Body\(.*; it takes a Sensor"),
+        ((SENSOR, "mug.obj"), r"body is 'mug\.obj', but it must be one Body\. objects\.load reads a mesh file"),
+        ((SENSOR, [BODY, BODY]), r"body is .*, but it must be one Body\. For several use objects\.stack and jax\.vmap"),
+        ((SENSOR, None), "body is None, but it must be one Body"),
+        (("sensor.json", BODY), r"sensor is 'sensor\.json', but it must be a Sensor"),
+        ((BODY, SENSOR), r"sensor is Body\(.*, but it must be a Sensor"),
     ]
     for given, message in cases:
         with pytest.raises(TypeError, match=message):
             sense(*given, POSE, WRENCH)
-    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\); one body .* jax\.vmap"):
+    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\), but one body .* jax\.vmap"):
         sense(SENSOR, objects.stack([BODY, BODY]), POSE, WRENCH)
     for call in (touch, expose):
-        with pytest.raises(TypeError, match="sensor is None; it takes a Sensor"):
+        with pytest.raises(TypeError, match="sensor is None, but it must be a Sensor"):
             call(None, jnp.zeros((4, 4)), 0.5)
 
 
@@ -94,13 +94,13 @@ def test_what_is_no_array_of_numbers_is_named():
     cases = [
         (
             lambda: sense(SENSOR, BODY, sts.physics.rest.Placement(POSE, WRENCH)),
-            r"pose is a Placement; .* Unpack it with \*",
+            r"pose is a Placement, .* Unpack it with \*",
         ),
-        (lambda: sense(SENSOR, BODY, None), r"pose is None; it takes \(7,\)"),
-        (lambda: sense(SENSOR, BODY, POSE, "heavy"), r"wrench is 'heavy'; it takes \(6,\)"),
-        (lambda: touch(SENSOR, "imprint.png"), r"imprint is 'imprint\.png'; it takes an array"),
-        (lambda: touch(SENSOR, jnp.zeros((4, 4)), "all"), r"window is 'all'; it takes \(4,\)"),
-        (lambda: expose(SENSOR, jnp.zeros((4, 4, 3)), 0.5), "frame is a .*; it takes the Frame"),
+        (lambda: sense(SENSOR, BODY, None), r"pose is None, but it must be an array of shape \(7,\)"),
+        (lambda: sense(SENSOR, BODY, POSE, "heavy"), r"wrench is 'heavy', but it must be an array of shape \(6,\)"),
+        (lambda: touch(SENSOR, "imprint.png"), r"imprint is 'imprint\.png', but it must be an array"),
+        (lambda: touch(SENSOR, jnp.zeros((4, 4)), "all"), r"window is 'all', but it must be an array of shape \(4,\)"),
+        (lambda: expose(SENSOR, jnp.zeros((4, 4, 3)), 0.5), "frame is a .*, but it must be the Frame"),
     ]
     for call, message in cases:
         with pytest.raises(TypeError, match=message):
@@ -134,7 +134,7 @@ def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_se
 def test_an_imprint_of_whole_numbers_is_refused(kind):
     imprint = np.ones((5, 6), kind)
     for call in (touch, jax.jit(touch)):
-        with pytest.raises(ValueError, match=rf"imprint has the type {np.dtype(kind)}; .* metres"):
+        with pytest.raises(ValueError, match=rf"imprint has the type {np.dtype(kind)}, .* metres"):
             call(SENSOR, imprint)
 
 

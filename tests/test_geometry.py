@@ -107,17 +107,17 @@ def test_the_gradient_through_a_matrix_and_back_is_that_of_differences(vector):
 @pytest.mark.parametrize(
     ("name", "given", "message"),
     [
-        ("pose_from_matrix", (jnp.eye(3),), r"matrix has the shape \(3, 3\); it must be \(..., 4, 4\)"),
-        ("quat_from_matrix", (jnp.eye(2),), r"matrix has the shape \(2, 2\); it must be \(..., 3, 3\)"),
-        ("quat_from_rotvec", (jnp.zeros(4),), r"v has the shape \(4,\); it must be \(..., 3\)"),
-        ("quat_canonical", (jnp.ones(3),), r"q has the shape \(3,\); it must be \(..., 4\)"),
+        ("pose_from_matrix", (jnp.eye(3),), r"matrix has the shape \(3, 3\), but it must be \(..., 4, 4\)"),
+        ("quat_from_matrix", (jnp.eye(2),), r"matrix has the shape \(2, 2\), but it must be \(..., 3, 3\)"),
+        ("quat_from_rotvec", (jnp.zeros(4),), r"v has the shape \(4,\), but it must be \(..., 3\)"),
+        ("quat_canonical", (jnp.ones(3),), r"q has the shape \(3,\), but it must be \(..., 4\)"),
         (
             "transform",
             (
                 jnp.zeros((2, 7)),
                 jnp.zeros(3),
             ),
-            r"pose has the shape \(2, 7\); .* jax\.vmap",
+            r"pose has the shape \(2, 7\), but .* jax\.vmap",
         ),
         (
             "transform",
@@ -125,9 +125,9 @@ def test_the_gradient_through_a_matrix_and_back_is_that_of_differences(vector):
                 jnp.zeros(7),
                 [0, 0],
             ),
-            r"points has the shape \(2,\); it must be \(..., 3\)",
+            r"points has the shape \(2,\), but it must be \(..., 3\)",
         ),
-        ("pose_inverse", ("upright",), r"pose is 'upright'; it must be an array of \(..., 7\) numbers"),
+        ("pose_inverse", ("upright",), r"pose is 'upright', but it must be an array of \(..., 7\) numbers"),
     ],
 )
 def test_an_array_of_another_shape_is_named(name, given, message):

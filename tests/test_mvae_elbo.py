@@ -204,8 +204,8 @@ def test_a_condition_reaches_the_decoders():
     ("options", "message"),
     [
         ({"absent": ("sound",)}, "sound"),
-        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "masks named"),
-        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "masks named"),
+        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "masks are named"),
+        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "masks are named"),
         ({"condition": jnp.ones((BATCH, 2))}, "width 2"),
     ],
 )
@@ -219,9 +219,9 @@ def test_nothing_given_and_unknown_names_are_errors():
     graphdef, params, stats = mvae.init(jax.random.key(0), VECTORS)
     state = nnx.merge_state(params, stats)
     for inputs in ({}, {"sound": jnp.ones((2, 3))}):
-        with pytest.raises(ValueError, match="give at least one"):
+        with pytest.raises(ValueError, match="Give at least one"):
             mvae.predict(graphdef, state, inputs)
-    with pytest.raises(ValueError, match="targets named"):
+    with pytest.raises(ValueError, match="targets are named"):
         gradient(VECTORS, batch(VECTORS), {})
     with pytest.raises(ValueError, match="sound"):
         gradient(VECTORS, batch(VECTORS) | {"sound": jnp.ones((BATCH, 3))}, batch(VECTORS))

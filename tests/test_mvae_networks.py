@@ -43,7 +43,7 @@ def test_any_size_of_image_comes_back(shape):
     assert posterior.mean.shape == (3, 6)
     z = jnp.zeros((5, 3, 6))
     assert mvae.decode(graphdef, state, z, condition=jnp.ones((5, 3, 2)))["a"].shape == (5, 3, *shape)
-    with pytest.raises(ValueError, match="condition of width 0"):
+    with pytest.raises(ValueError, match="condition has width 0"):
         mvae.decode(graphdef, state, z)
 
 

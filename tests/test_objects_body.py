@@ -80,9 +80,9 @@ def test_a_body_is_described_in_a_line_with_or_without_values(jar):
     ("changes", "message"),
     [
         ({"colors": np.nan}, "colors has 9,216 values that are not finite"),
-        ({"shell_mass": np.inf}, "shell_mass is inf; all must be finite"),
-        ({"faces": 1024}, "faces has indices from 1024 to 1024; there are 1024 vertices"),
-        ({"category": 8}, "category is 8; it must be from 0 to 7, an index into objects.CATEGORIES"),
+        ({"shell_mass": np.inf}, "shell_mass is inf, but all must be finite"),
+        ({"faces": 1024}, "faces has indices from 1024 to 1024, but with 1024 vertices"),
+        ({"category": 8}, "category is 8, but it must be from 0 to 7, an index into objects.CATEGORIES"),
         ({"category": -2}, "category is -2"),
     ],
 )
@@ -92,7 +92,7 @@ def test_a_body_that_cannot_be_is_named(changes, message):
     changes = {name: jnp.full_like(getattr(body, name), value) for name, value in changes.items()}
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(body, **changes).check()
-    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\); one body .* jax.vmap"):
+    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\), but one body .* jax.vmap"):
         objects.stack([body, body]).check()
 
 

@@ -107,12 +107,12 @@ def test_categories_and_what_is_left_out(tmp_path):
     assert listed.items[3].notes == ("no front in the table: ShapeNet's default",)
     reasons = dict(listed.skipped)
     for name, reason in (
-        ("h", "of several classes (fork, spoon)"),
+        ("h", "it has several classes (fork, spoon)"),
         ("i", "unit is missing"),
         ("j", "unit is 'inch'"),
-        ("k", "lie in one line"),
+        ("k", "must not be parallel"),
         ("l", "its up is"),
-        ("m", "models-OBJ/models/m.obj is not there"),
+        ("m", "models-OBJ/models/m.obj does not exist"),
         ("d", "twice"),
         ("o", "_BAD"),
         ("metadata.csv", "2 of 15 models are of none"),
@@ -144,7 +144,7 @@ def test_image_of_the_texture_folder(tmp_path):
     np.testing.assert_allclose(entry.body.texture[128, 128], linear(np.array(paint) / 255), atol=1e-5)
     np.testing.assert_allclose(entry.body.colors[0], 1)  # and not the Kd
     (tmp_path / "models-textures" / "textures" / "a.png").unlink()
-    assert "a.png, not there" in objects.read(objects.library(tmp_path), 0).notes[0]
+    assert "a.png, not found" in objects.read(objects.library(tmp_path), 0).notes[0]
 
 
 def test_what_is_larger_is_scaled_down_and_said(tmp_path):
@@ -393,7 +393,7 @@ def test_decimation_samples_the_texture(tmp_path):
     uv = np.stack([0.5 + mesh.vertices[:, 0] * 12, np.full(len(mesh.vertices), 0.5)], axis=1)
     mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
     mesh.export(tmp_path / "ball.glb")
-    with pytest.warns(UserWarning, match="decimated from 20,480 to .* faces; its texture became colours"):
+    with pytest.warns(UserWarning, match="decimated from 20,480 to .* faces, and its texture to one colour"):
         body = objects.load(tmp_path / "ball.glb", faces=2000)
     assert body.texture.shape == (1, 1, 3)
     drawn = surface(body)
@@ -435,8 +435,8 @@ def test_decimation_names_its_package(tmp_path, monkeypatch):
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
         ({"faces": 2}, "faces must be a whole number, at least 4"),
         ({"up": (0.0, 0.0, 0.0)}, "not all zero"),
-        ({"up": (0.0, 1.0, 0.0)}, "lie in one line"),
-        ({"up": "z", "front": (0.0, -1.0, 0.0)}, "three numbers where front is given"),
+        ({"up": (0.0, 1.0, 0.0)}, "must not be parallel"),
+        ({"up": "z", "front": (0.0, -1.0, 0.0)}, "three numbers if front is given"),
     ],
 )
 def test_bad_arguments_of_load(tmp_path, arguments, message):

@@ -265,12 +265,12 @@ def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
         ({"longest_side": 0.0}, "longest_side must be a positive"),
         ({"longest_side": -0.1}, "longest_side must be a positive"),
         ({"longest_side": 0.2}, "the pad is 0.15 m"),
-        ({"longest_side": 0.004}, "longest_side is 0.004 m, the smallest object is 0.005 m"),
-        ({"scale": 0.001}, r"longest side is 0\.1 mm, and the smallest object is 5 mm long.*longest_side, or scale"),
-        ({"category": 99}, "category is 99; it must be from 0 to 7"),
-        ({"category": -2}, "category is -2; it must be from 0 to 7"),
-        ({"category": "mouse"}, r"category is 'mouse'; .*CATEGORIES\.index\('mouse'\)"),
-        ({"category": 1.5}, "category is 1.5; it must be from 0 to 7"),
+        ({"longest_side": 0.004}, "longest_side is 0.004 m, but the smallest object is 0.005 m"),
+        ({"scale": 0.001}, r"longest side is 0\.1 mm, but the smallest object is 5 mm long.*longest_side, or scale"),
+        ({"category": 99}, "category is 99, but it must be from 0 to 7"),
+        ({"category": -2}, "category is -2, but it must be from 0 to 7"),
+        ({"category": "mouse"}, r"category is 'mouse', but .*CATEGORIES\.index\('mouse'\)"),
+        ({"category": 1.5}, "category is 1.5, but it must be from 0 to 7"),
         ({"mass": True}, "mass must be a positive number of kilograms, got True"),
         ({"longest_side": "10 cm"}, "longest_side must be a positive number of metres, got '10 cm'"),
     ],
@@ -330,7 +330,7 @@ def test_an_off_of_random_bytes_is_said_to_be_damaged(tmp_path):
 
 def test_a_folder_an_empty_file_and_an_unreadable_one_are_named(tmp_path, box, monkeypatch):
     for folder in (tmp_path, ""):
-        with pytest.raises(IsADirectoryError, match=r"is a folder; give a mesh file in it.*objects\.library"):
+        with pytest.raises(IsADirectoryError, match=r"is a folder: give a mesh file in it.*objects\.library"):
             objects.load(folder)
     (tmp_path / "empty.obj").write_bytes(b"")
     with pytest.raises(ValueError, match=r"empty\.obj: is empty"):
@@ -357,7 +357,7 @@ def test_nan_vertices(tmp_path):
 def test_too_many_faces(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "FACE_CLASSES", (2048, 4096))
     trimesh.creation.icosphere(subdivisions=4, radius=0.04).export(tmp_path / "fine.stl")
-    with pytest.raises(ValueError, match=r"fine\.stl: 5,120 faces, at most 4,096.*decimate"):
+    with pytest.raises(ValueError, match=r"fine\.stl: has 5,120 faces, but at most 4,096.*decimate"):
         objects.load(tmp_path / "fine.stl")
 
 

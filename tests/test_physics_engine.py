@@ -220,7 +220,7 @@ def test_it_is_the_engine_of_a_cpu_and_another_name_is_refused(drops: physics.Tr
     if jax.default_backend() == "cpu":
         found = physics.simulate(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), 1)
         np.testing.assert_array_equal(found.pose, drops.pose[:1])
-    with pytest.raises(ValueError, match="engine is 'bullet'; it takes 'mjx', 'mujoco' or None"):
+    with pytest.raises(ValueError, match="engine is 'bullet', but it must be 'mjx', 'mujoco' or None"):
         inspect.unwrap(physics.simulate)(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), engine="bullet")
 
 

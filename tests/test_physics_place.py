@@ -113,14 +113,14 @@ def test_more_shell_or_contents_weigh_more(bodies):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"face": 99}, r"face is 99: it rests on \d+ faces, 0 \(the most likely\) to \d+"),
-        ({"face": -1}, r"face is -1: it rests on \d+ faces"),
-        ({"face": "sideways"}, r"face is 'sideways'; it takes a number or 'upright'"),
+        ({"face": 99}, r"face is 99, .* no such face: it rests on \d+ faces, 0 \(the most likely\) to \d+"),
+        ({"face": -1}, r"face is -1, but the body has no such face: it rests on \d+ faces"),
+        ({"face": "sideways"}, r"face is 'sideways', but it must be a number or 'upright'"),
         ({"position": (0.2, 0.0)}, r"position is \(0.2, 0.0\) m, .* beyond the pad"),
         ({"position": (0.0, float("nan"))}, "position is .* 2 finite numbers"),
-        ({"yaw": float("inf")}, "yaw is inf; it takes one finite number"),
-        ({"fill": 1.5}, "fill is 1.5; .* from 0 to 1"),
-        ({"shell_scale": 0.0}, "shell_scale is 0.0; it must be above 0"),
+        ({"yaw": float("inf")}, "yaw is inf, but it must be one finite number"),
+        ({"fill": 1.5}, "fill is 1.5, .* from 0 to 1"),
+        ({"shell_scale": 0.0}, "shell_scale is 0.0, but it must be > 0"),
         ({"up": (0.0, 0.0, 2.0)}, r"up is .* unit vector"),
     ],
 )
@@ -145,9 +145,9 @@ def test_bodies_that_cannot_be_placed_are_named(bodies):
 def test_arguments_of_place_of_another_kind_are_named(bodies):
     sensor, place = sts.Sensor(), inspect.unwrap(physics.place)
     for given, message in (
-        (("mug.obj", sensor), r"body is 'mug\.obj'; it takes one Body: .* objects\.load reads a mesh file"),
-        ((sensor, bodies[0]), r"body is Sensor\(.*; it takes one Body"),
-        ((bodies[0], None), "sensor is None; it takes a Sensor"),
+        (("mug.obj", sensor), r"body is 'mug\.obj', but it must be one Body: .* objects\.load reads a mesh file"),
+        ((sensor, bodies[0]), r"body is Sensor\(.*, but it must be one Body"),
+        ((bodies[0], None), "sensor is None, but it must be a Sensor"),
     ):
         with pytest.raises(TypeError, match=message):
             place(*given)

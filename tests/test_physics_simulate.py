@@ -330,14 +330,14 @@ def test_the_outcome_is_read_from_the_last_pose() -> None:
         ({"fill": (0.0, 1.5)}, 1, r"scenario.fill"),
         ({"height": float("nan")}, 1, r"scenario.height"),
         ({"tilt": -0.1}, 1, r"scenario.tilt"),
-        ({"rate": 30.0}, 1, "rate 30"),
+        ({"rate": 30.0}, 1, "rate is 30"),
         ({"frames": 0}, 1, r"scenario.frames"),
         (
             {"frames": 1},
             1,
-            r"scenario.frames is 1, which last 0 s; .* 0.05 m .* at least 0.301 s .* at least 11 frames",
+            r"scenario.frames is 1, which last 0 s, .* 0.05 m .* at least 0.301 s .* at least 11 frames",
         ),
-        ({"height": 1000.0}, 1, r"scenario.frames is 60, which last 1.89 s; .* 1000 m .* at least 14.5 s"),
+        ({"height": 1000.0}, 1, r"scenario.frames is 60, which last 1.89 s, .* 1000 m .* at least 14.5 s"),
     ],
 )
 def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:
@@ -354,7 +354,7 @@ def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: 
         ({"hulls": jnp.zeros((1, 64, 3))}, "body 1: the collision hull spans no volume"),
         ({"hulls": jnp.zeros((3, 64, 3))}, "body 1: hulls has shape"),
         ({"vertices": jnp.full((1024, 3), jnp.nan)}, "body 1: vertices has 3,072 values that are not finite"),
-        ({"category": jnp.int32(99)}, "body 1: category is 99; it must be from 0 to 7"),
+        ({"category": jnp.int32(99)}, "body 1: category is 99, but it must be from 0 to 7"),
         ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
     ],
 )
@@ -386,21 +386,21 @@ def test_the_fewest_frames_that_are_allowed_let_an_object_settle() -> None:
 def test_fields_of_another_kind_are_named(field: str, value: object, wanted: str) -> None:
     scenario = physics.Freefall()
     object.__setattr__(scenario, field, value)  # past the tests' own checks of types
-    with pytest.raises(ValueError, match=rf"scenario\.{field} is .*it takes {wanted}"):
+    with pytest.raises(ValueError, match=rf"scenario\.{field} is .*it must be {wanted}"):
         scenario.check()
 
 
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"body": "bottle.obj"}, r"body 0 is 'bottle\.obj'; it takes a Body .*objects\.load"),
-        ({"sensor": None}, "sensor is None; it takes a Sensor"),
-        ({"scenario": "freefall"}, r"scenario is 'freefall'; it takes Freefall\(\)"),
-        ({"scenario": physics.Freefall}, r"scenario is <class .*Freefall'>; it takes Freefall\(\)"),
+        ({"body": "bottle.obj"}, r"body 0 is 'bottle\.obj', but it must be a Body: .*objects\.load"),
+        ({"sensor": None}, "sensor is None, but it must be a Sensor"),
+        ({"scenario": "freefall"}, r"scenario is 'freefall', but it must be Freefall\(\)"),
+        ({"scenario": physics.Freefall}, r"scenario is <class .*Freefall'>, but it must be Freefall\(\)"),
         ({"key": 0}, r"key is 0; it takes a JAX key: jax\.random\.key\(0\)"),
-        ({"num": 1.5}, "num is 1.5; it takes a whole number"),
-        ({"chunk": 0}, "chunk is 0; it takes a whole number"),
-        ({"progress": "bar"}, "progress is 'bar'; it takes True, False or a function"),
+        ({"num": 1.5}, "num is 1.5, but it must be a whole number"),
+        ({"chunk": 0}, "chunk is 0, but it must be a whole number"),
+        ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
     ],
 )
 def test_arguments_of_another_kind_are_named(bodies: list[objects.Body], changes: dict, match: str) -> None:
@@ -433,11 +433,11 @@ def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:
     good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2), np.tile(np.float32([0, 0, 1]), (2, 1)))
     with pytest.raises(ValueError, match=r"hidden.fill has shape \(2,\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 3, hidden=good)
-    with pytest.raises(ValueError, match=r"hidden.friction has the value -1.0; it must be positive"):
+    with pytest.raises(ValueError, match=r"hidden.friction has the value -1.0, but it must be > 0"):
         physics.simulate(
             jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(friction=-np.ones(2))
         )
-    with pytest.raises(ValueError, match=r"hidden.up has rows that are no unit vectors"):
+    with pytest.raises(ValueError, match=r"hidden.up has rows that are not unit vectors"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.ones((2, 3))))
     with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 2\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.eye(2)))

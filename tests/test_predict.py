@@ -154,7 +154,7 @@ def broken(name, change):
         (broken("tactile", lambda x: x * np.nan), "tactile has NaN"),
         (broken("pose", lambda x: x * 2), "quaternion of length 2"),
         (broken("pose", lambda x: x[:, :6]), r"pose has shape \(2, 6\)"),
-        (broken("pose", lambda x: x + np.eye(7, dtype=np.float32)[0] * 40), "millimetres"),
+        (broken("pose", lambda x: x + np.eye(7, dtype=np.float32)[0] * 40), "give metres"),
         (broken("pose", lambda x: x[0]), "the leading axes differ"),
         (measurement(0), "there is no item"),
         ({**measurement(2), "condition": np.zeros((2, 3))}, "condition has shape"),
@@ -197,7 +197,7 @@ def test_a_condition_is_given_in_si_units(tmp_path):
     samples = predictor(visual=given["visual"], condition=condition, key=jax.random.key(0), num_samples=2).samples
     assert samples.visual.shape == (2, 2, SIDE, SIDE, 3)
     for wrong, message in (
-        (None, r"condition has shape None; .* needs \(2, 3\)"),
+        (None, r"condition has shape None: .* needs \(2, 3\)"),
         (condition[0], r"needs \(2, 3\)"),
         (condition * np.nan, "condition has NaN"),
         (condition * 1e3, "SI units"),
@@ -213,9 +213,9 @@ def test_a_condition_is_given_in_si_units(tmp_path):
 
 def test_a_checkpoint_of_another_view_is_refused(folder):
     sts.Predictor.load(folder, resolution=(SIDE, SIDE), crop=False)
-    with pytest.raises(ValueError, match="crop=False, asked for is crop=True"):
+    with pytest.raises(ValueError, match="crop=False, but crop=True was requested"):
         sts.Predictor.load(folder, crop=True)
-    with pytest.raises(ValueError, match=r"resolution=\(32, 32\), asked for is resolution=\(64, 64\)"):
+    with pytest.raises(ValueError, match=r"resolution=\(32, 32\), but resolution=\(64, 64\) was requested"):
         sts.Predictor.load(folder, resolution=(64, 64))
 
 
@@ -342,12 +342,12 @@ POSE = measurement()["pose"]
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"visual": "first.png"}, r"visual is 'first.png'; .*PIL"),
+        ({"visual": "first.png"}, r"visual is 'first.png', .*PIL"),
         ({"visual": pathlib.Path("first.png")}, r"visual is PosixPath.*not a path"),
         ({"visual": b"first.png"}, "not a path"),
         ({"visual": {"image": 1}}, "visual is a dict"),
         ({"visual": object()}, "visual is a object"),
-        ({"visual": [[1.0, 2.0], [3.0]]}, "visual is no array"),
+        ({"visual": [[1.0, 2.0], [3.0]]}, "visual is not an array"),
         ({"visual": True}, "visual is bool"),
         ({"visual": 0.5}, r"visual has shape \(\)"),
         ({"visual": np.zeros((SIDE, SIDE, 3), complex)}, "visual is complex128"),
@@ -356,14 +356,14 @@ POSE = measurement()["pose"]
         ({"pose": np.where(np.arange(7) == 4, 1e30, POSE).astype(np.float32)}, r"quaternion of length 1e\+30"),
         ({"pose": np.where(np.arange(7) == 4, 1e300, POSE.astype(np.float64))}, "pose has NaN or infinite"),
         ({"pose": np.where(np.arange(7) == 0, np.float32(np.nan), POSE)}, "pose has NaN or infinite"),
-        ({"pose": POSE, "key": 0, "num_samples": 1}, r"key is 0; give one key, such as jax.random.key\(0\)"),
+        ({"pose": POSE, "key": 0, "num_samples": 1}, r"key is 0, but it must be one key, such as jax.random.key\(0\)"),
         ({"pose": POSE, "key": np.zeros(2, np.uint32), "num_samples": 1}, "key is uint32"),
         ({"pose": POSE, "key": jax.random.split(jax.random.key(0)), "num_samples": 1}, r"of shape \(2,\)"),
         ({"pose": POSE, "key": jax.random.key(0), "num_samples": 1.5}, r"num_samples=1\.5"),
         ({"pose": POSE, "key": jax.random.key(0), "num_samples": "2"}, "num_samples='2'"),
         ({"pose": POSE, "key": jax.random.key(0), "num_samples": -1}, "num_samples=-1"),
         ({"pose": POSE, "present": [True]}, "present is a list"),
-        ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] is float64; give bool"),
+        ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] is float64, but it must be bool"),
         ({"pose": POSE, "present": {"pose": "yes"}}, r"present\['pose'\] is 'yes'"),
         ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*one of \['pose'\]"),
         ({"pose": POSE, "condition": "fast"}, "condition is 'fast'"),
@@ -454,7 +454,7 @@ def test_a_true_state_is_believed_and_a_wrong_one_refused(state_predictor, predi
     given, code = measurement(2), np.asarray(random_states(np.random.default_rng(0), 2))
     out = state_predictor(visual=given["visual"], condition=CONDITION, state=code)
     np.testing.assert_allclose(out.mean[:, : statespace.STATE_CODE], code, atol=2e-3)
-    for wrong, message in ((code[:1], r"state has shape \(1, 117\); it needs"), (code * np.nan, "state has NaN")):
+    for wrong, message in ((code[:1], r"state has shape \(1, 117\), but it needs"), (code * np.nan, "state has NaN")):
         with pytest.raises(ValueError, match=message):
             state_predictor(visual=given["visual"], condition=CONDITION, state=wrong)
     with pytest.raises(ValueError, match="takes no state: it is a model of the paper's kind"):
@@ -544,7 +544,7 @@ def test_a_model_of_the_library_is_loaded_by_its_name(compact, predictor, tmp_pa
     for unknown in ("freefal", ".."):
         with pytest.raises(FileNotFoundError, match=rf"'{unknown}' is neither .* come with sts_jax \(falls\)"):
             sts.Predictor.load(unknown)
-    with pytest.raises(FileNotFoundError, match=r"falls: has no config\.json"):
+    with pytest.raises(FileNotFoundError, match=r"falls has no config\.json"):
         sts.Predictor.load(tmp_path / "falls")
     predictor.save("falls")
     assert sts.Predictor.load("falls").model.config == predictor.model.config

@@ -167,9 +167,9 @@ def test_the_right_numbers_in_the_wrong_kind_are_named(field, value):
     sensor = Sensor()
     part, name = field.split(".")
     object.__setattr__(getattr(sensor, part), name, value)  # past the tests' own checks of types
-    with pytest.raises(ValueError, match=f"field {field} is .*it takes"):
+    with pytest.raises(ValueError, match=f"field {field} is .*must be"):
         sensor.check()
-    with pytest.raises(ValueError, match=f"field {field} is .*it takes"):
+    with pytest.raises(ValueError, match=f"field {field} is .*must be"):
         jax.jit(lambda: sensor.guard()[1])()
 
 
@@ -189,11 +189,11 @@ def with_field(sensor, field, value):
     [
         ("camera.distance", 0.004, "gel.thickness"),
         ("gel.thickness", 0.2, "camera.distance"),
-        ("gel.stiffness", 0.0, "above 0"),
+        ("gel.stiffness", 0.0, "> 0"),
         ("gel.stiffness", float("nan"), "finite"),
         ("lights.directions", jnp.zeros((4, 3)), "length"),
-        ("phong.shininess", -1.0, "above 0"),
-        ("skin.coupling", -1e-3, "below 0"),
+        ("phong.shininess", -1.0, "> 0"),
+        ("skin.coupling", -1e-3, ">= 0"),
     ],
 )
 def test_a_check_names_field_value_and_remedy(field, value, says):

@@ -91,7 +91,7 @@ def test_a_model_comes_back_from_its_folder(finished):
 
 def test_another_config_or_other_data_are_refused(finished):
     workdir, _ = finished
-    with pytest.raises(ValueError, match=r"config.json was made with training.steps = 12, and .* 13"):
+    with pytest.raises(ValueError, match=r"config.json was made with training.steps = 12, but .* 13"):
         training.train(training.TrainConfig(steps=13), SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
     with pytest.raises(ValueError, match=r"made with data.checksum"):
         training.train(CONFIG, SMALL, arrays(seed=1), workdir=workdir, preprocessing={"view": "pad"})
@@ -157,8 +157,8 @@ def test_beta_warms_up_over_its_share_of_the_steps():
     ("change", "message"),
     [
         ({"absent": ("b",)}, "b is declared absent"),
-        ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "inputs named"),
-        ({"present": {"sound": np.ones(20, bool)}}, "present named"),
+        ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "inputs has"),
+        ({"present": {"sound": np.ones(20, bool)}}, "present masks"),
         ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "arrays of"),
     ],
 )
@@ -351,14 +351,14 @@ def test_a_state_space_model_learns_four_samples_by_heart(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"targets": {"outcome": np.full(4, 2, np.int32)}}, "outcome is int32 from 2 to 2; give whole numbers from 0"),
+        ({"targets": {"outcome": np.full(4, 2, np.int32)}}, "outcome is int32 from 2 to 2, but the model takes whole"),
         ({"targets": {"outcome": np.ones(4, np.float32)}}, "outcome is float32"),
         ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "targets have samples of"),
         ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "inputs have samples of"),
         ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"empty needs .* of shape \(16, 16, 3\)"),
-        ({"present": {"tactile": np.ones(4, bool)}}, r"^present named \['tactile'\]"),
-        ({"target_present": {"tactile": np.ones(4, bool)}}, r"target_present named \['tactile'\]"),
-        ({"condition": np.ones((4, 3), np.float32)}, "condition of width 3"),
+        ({"present": {"tactile": np.ones(4, bool)}}, r"^present masks \['tactile'\]"),
+        ({"target_present": {"tactile": np.ones(4, bool)}}, r"target_present masks \['tactile'\]"),
+        ({"condition": np.ones((4, 3), np.float32)}, "condition has width 3"),
     ],
 )
 def test_arrays_that_do_not_fit_a_state_space_model_are_named(tmp_path, change, message):

@@ -1,4 +1,4 @@
-"""Collections on disk: made shard by shard, read as arrays."""
+"""Datasets on disk: `collect` writes them shard by shard, `load` reads them as arrays."""
 
 from sts_jax._files import LockedError as LockedError
 from sts_jax._files import TornFileError as TornFileError

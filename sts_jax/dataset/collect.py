@@ -1,4 +1,4 @@
-"""From a description to a folder of shards: objects, physics and frames, one pure function a shard."""
+"""Collect a dataset: objects, trajectories and frames. Each shard is a pure function of the collection and sensor."""
 
 import concurrent.futures
 import dataclasses
@@ -22,11 +22,11 @@ from sts_jax.dataset import records
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
 
-# Frames rendered by one compiled call, the last one of an object padded. A CPU renders them one after the other.
+# Frames rendered by one compiled call. The last call of an object is padded. A CPU renders frames one after another.
 RENDER_BATCH = 32
 CPU_RENDER_BATCH = 8
-SAME = 1e-5  # m, by which files of one mesh in several formats differ at most
-PARTS = ("train", "validation", "test")  # of the objects
+SAME = 1e-5  # m, largest difference between files of one mesh in several formats
+PARTS = ("train", "validation", "test")  # of the split of the objects
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,62 +34,62 @@ class Meshes:
     """Objects from files, see `survey_meshes`."""
 
     folder: str
-    names: tuple[str, ...]  # of the items of `objects.library`
-    labels: tuple[str, ...]  # the class of each
-    digest: str  # of the files
-    cache: str | None = None  # folder; this and the others: see `objects.library`
-    scale: float | None = None  # m
+    names: tuple[str, ...]  # names of items of `objects.library`
+    labels: tuple[str, ...]  # class of each
+    digest: str  # SHA-256 of the names and files
+    cache: str | None = None  # folder, see `objects.library`
+    scale: float | None = None  # m, length of one unit of the files
     up: Literal["x", "y", "z"] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """What a dataset is made of. Together with a `Sensor` it determines every byte."""
+    """Description of a dataset. Together with a `Sensor` it determines every byte of it."""
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
-    categories: tuple[str, ...] = objects.CATEGORIES  # of the procedural objects, in turn
-    meshes: Meshes | None = None  # objects from files instead; num_objects is then their number
-    parts: bool = False  # what a hull fits badly collides as convex parts (package coacd, ten seconds an object)
+    categories: tuple[str, ...] = objects.CATEGORIES  # classes of the procedural objects, used in turn
+    meshes: Meshes | None = None  # objects from files instead (num_objects is their number)
+    parts: bool = False  # convex parts for objects whose hull fits badly (package coacd, ten seconds per object)
     num_objects: int = 160
-    num_per_object: int = 4  # trajectories of each object, each with fresh hidden values
-    num_full: int = 20  # trajectories with every frame rendered; of the other rendered ones the first and the last
-    num_rendered: int | None = None  # of each object's trajectories, the first ones, that have images; None: all
-    num_views: int = 0  # pictures of each object at further starts, without a trajectory
-    symmetries: bool = True  # see each trajectory in all `scenario.symmetries`, or only as it is
+    num_per_object: int = 4  # trajectories per object, each with new hidden values
+    num_full: int = 20  # trajectories with every frame rendered (other rendered ones: first and last frame)
+    num_rendered: int | None = None  # trajectories per object that have images, the first ones (None: all)
+    num_views: int = 0  # pictures per object at further starts, which are not simulated
+    symmetries: bool = True  # render first and last frames in all `scenario.symmetries`, or only as simulated
     resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
     crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
-    shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # of the objects, which train, validate and test
+    shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # of the objects for training, validation and test
     objects_per_shard: int = 40
     seed: int = 0
-    engine: physics.Engine = "mujoco"  # of the physics, see `physics.simulate`; trajectories differ between engines
+    engine: physics.Engine = "mujoco"  # see `physics.simulate` (trajectories differ between engines)
 
     @property
     def num_trajectories(self) -> int:
-        """Trajectories in the whole dataset."""
+        """Number of trajectories in the whole dataset."""
         return self.num_objects * self.num_per_object
 
     @property
     def rendered_per_object(self) -> int:
-        """Trajectories of each object that have images."""
+        """Number of trajectories per object that have images."""
         return self.num_per_object if self.num_rendered is None else self.num_rendered
 
     @property
     def num_shards(self) -> int:
-        """Units of work, each a whole file or none."""
+        """Number of shards. A shard is written as a whole or not at all."""
         return math.ceil(self.num_objects / self.objects_per_shard)
 
 
 class Collected(NamedTuple):
-    """What is to be said of a whole dataset."""
+    """Summary of a whole dataset, as `collect` returns it."""
 
-    resampled: int  # trajectories drawn again
-    left_out: tuple[str, ...]  # a line for each object that was left out
+    resampled: int  # number of discarded draws of trajectories
+    left_out: tuple[str, ...]  # one line for each object that was left out
 
 
 class Progress(NamedTuple):
-    """What a collection reports while it runs."""
+    """Progress of `collect`."""
 
-    done: int  # trajectories (or frames) finished
+    done: int  # finished trajectories or frames
     total: int
     stage: str  # "trajectories" or "frames"
 
@@ -105,34 +105,35 @@ def survey_meshes(
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Meshes, str]:
-    """The objects of a folder of meshes, or of ShapeNetSem, that a scenario can use.
+    """List the objects of a folder of meshes, or of ShapeNetSem, that a scenario can use.
 
     Args:
         folder: See `objects.library`.
-        scenario: What happens to them.
-        classes: Of these classes only, see `mesh_classes`; of all where there is none.
-        scale: Metres, of one unit of the files; None takes ShapeNetSem's table, or one metre.
-        up: The files' axis that becomes +z; None takes ShapeNetSem's table, or z, for glTF y.
-        parts: Whether what a hull fits badly collides as convex parts.
-        cache: Keeps what is made of the files.
+        scenario: The scenario that the objects are for.
+        classes: The classes to use, see `mesh_classes`. Empty means all.
+        scale: Length of one unit of the files (m). None takes ShapeNetSem's table, or 1 m for other files.
+        up: The files' axis that becomes +z. None takes ShapeNetSem's table, or y for glTF and z for other files.
+        parts: Whether objects whose hull fits badly collide as convex parts.
+        cache: Folder that keeps the processed objects.
         progress: Called with a line for each object.
 
     Returns:
-        The objects, and a listing of them and of what was left out, with the reasons. Two files with the same mesh,
-        whatever their names and formats, are one object: a second one could stand on the other side of the split.
+        The usable objects, and a listing of them and of the objects that were left out, with the reasons. Files with
+        the same mesh, under any names and in any formats, count as one object. Otherwise a mesh could be in two parts
+        of the split.
 
     Raises:
-        FileNotFoundError: No such folder.
-        ValueError: It holds no mesh, none that can be used, or none of a class.
+        FileNotFoundError: The folder does not exist.
+        ValueError: The folder holds no mesh, no usable mesh, or no mesh of one of the classes.
     """
     library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts)
     unknown = sorted(set(classes) - set(library.classes))
     if unknown:
-        raise ValueError(f"{folder}: holds no {', '.join(unknown)}: its classes are {', '.join(library.classes)}")
+        raise ValueError(f"{folder} holds no {', '.join(unknown)}: choose among {', '.join(library.classes)}")
     items = tuple(item for item in library.items if not classes or item.label in classes)
     library, listing = objects.survey(dataclasses.replace(library, items=items), progress=progress)
     usable, digest = [], hashlib.sha256()
-    seen: dict[int, list[tuple[str, np.ndarray]]] = {}  # by the number of triangles: name and `_triangles`
+    seen: dict[int, list[tuple[str, np.ndarray]]] = {}  # name and `_triangles`, by the number of triangles
     for index, item in enumerate(library.items):
         body = objects.read(library, index).body
         reason = physics.refusal(body, scenario)
@@ -149,21 +150,21 @@ def survey_meshes(
         usable.append(item)
         digest.update(item.name.encode() + hashlib.sha256(item.path.read_bytes()).digest())
     if not usable:
-        raise ValueError(f"{folder}: holds no object that can be used; what was found:\n{listing}")
+        raise ValueError(f"{folder} holds no object that can be used:\n{listing}")
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)
     return Meshes(str(folder), names, labels, digest.hexdigest(), kept, scale, up), listing
 
 
 def _triangles(body: objects.Body) -> np.ndarray:
-    """The centres of a body's triangles (n, 3), without those that only pad it."""
+    """The centres of a body's triangles (n, 3), without the padding."""
     corners = np.asarray(body.vertices)[np.asarray(body.faces)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     return corners[area > 0].mean(1)
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two meshes of equally many triangles have them at the same places, in any order."""
+    """Whether two meshes with the same number of triangles have them at the same places, in any order."""
     box = [np.stack([x.min(0), x.max(0)]) for x in (one, other)]
     if np.abs(box[0] - box[1]).max() > SAME:
         return False
@@ -172,7 +173,7 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """The classes of the objects of a folder, see `objects.library`; no mesh is opened."""
+    """The classes of the objects of a folder (see `objects.library`). No mesh is opened."""
     return objects.library(folder).classes
 
 
@@ -190,20 +191,20 @@ def class_names(collection: Collection) -> tuple[str, ...]:
 
 
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
-    """Objects of a collection by their numbers (n,).
+    """Make objects of a collection, given their indices (n,).
 
-    A procedural one has its own key: object i is the same whatever else is made.
+    A procedural object has a key of its own, so that object i does not depend on the other objects that are made.
 
     Raises:
-        FileNotFoundError: A mesh file is gone.
-        ValueError: No body can be made of an object.
+        FileNotFoundError: A mesh file no longer exists.
+        ValueError: No body can be made from an object.
     """
     if collection.meshes is not None:
         library, where = _library(collection.meshes, collection.parts)
         chosen = [collection.meshes.names[i] for i in indices]
         gone = [name for name in chosen if name not in where]
         if gone:
-            raise FileNotFoundError(f"{library.folder}: {', '.join(gone)}: no such mesh file any more")
+            raise FileNotFoundError(f"{library.folder} no longer has the mesh files {', '.join(gone)}: put them back")
         return [objects.read(library, where[name]).body for name in chosen]
     key, names = jax.random.key(collection.seed), class_names(collection)
     bodies = [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
@@ -213,7 +214,7 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
 
 
 def head(collection: Collection, count: int) -> Collection:
-    """The collection of the first objects only."""
+    """The collection of the first `count` objects only."""
     meshes = collection.meshes
     if meshes is None:
         return dataclasses.replace(collection, num_objects=count)
@@ -222,9 +223,9 @@ def head(collection: Collection, count: int) -> Collection:
 
 
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
-    """Which objects train, validate and test: shuffled by the seed, each class spread alike."""
+    """Indices of the objects for training, validation and test, shuffled by the seed, with classes spread evenly."""
     rng = np.random.default_rng([collection.seed, 1])
-    # A block of one object of each class after the other, the objects of a class in random order.
+    # Each block has one object of every class that has one left, so that a cut spreads the classes evenly.
     names = np.array(class_names(collection))
     members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
     blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
@@ -234,9 +235,9 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
 
 
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
-    """A pose under a symmetry of the pad; that of a mirrored one belongs to `objects.mirror` of the body.
+    """A pose under a symmetry of the pad. A mirrored pose belongs to the mirrored body, see `objects.mirror`.
 
-    Symmetry s turns by s % 4 quarter turns about z, after having mirrored (y becomes -y) if s >= 4.
+    Symmetry s first mirrors (y becomes -y) if s >= 4, and then turns by s % 4 quarter turns about z.
     """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
@@ -256,7 +257,7 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
 
 
 def turn_condition(condition: Float[Array, "*n c"], symmetry: int) -> Float[Array, "*n c"]:
-    """A condition under a symmetry of the pad: the first two numbers are a vector along x and y, others stay."""
+    """A condition under a symmetry of the pad. The first two numbers are a vector (x, y), and the others stay."""
     if condition.shape[-1] == 0:
         return condition
     vector = jnp.concatenate([condition[..., :2], jnp.zeros((*condition.shape[:-1], 4))], -1)
@@ -270,36 +271,36 @@ def collect(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> Collected:
-    """Make every shard of a dataset that is not there yet.
+    """Make every shard of a dataset that does not exist yet.
 
     Args:
-        collection: What to make.
-        sensor: The sensor that sees it.
-        folder: Where the shards go, with `collection.json`, `sensor.json` (for `Sensor.load`) and
-            `split.json` beside them.
-        progress: Called as the work goes on.
+        collection: The description of the dataset.
+        sensor: The sensor that renders the frames.
+        folder: The folder for the shards, `collection.json`, `sensor.json` (for `Sensor.load`) and `split.json`.
+        progress: Called as trajectories and frames are finished.
 
     Returns:
-        How many trajectories were drawn again because they went non-finite or sank, and which objects were left out
-        because they did so in every draw, or could not be made; of the whole dataset.
+        For the whole dataset, the number of draws that were discarded because the trajectory became non-finite or the
+        object sank too deep, and the objects that were left out because all their draws failed or because they
+        could not be made.
 
     Raises:
-        ValueError: The sensor cannot be (`Sensor.check`); the folder holds another collection, the message names the
-            field, or one of an older format; or the pad does not have the scenario's symmetries; or `num_rendered` or
-            `num_views` is out of range; or no object of a shard can be simulated.
+        ValueError: A constant of the sensor or a field of the collection is out of range, the folder holds another
+            collection (the message names the field) or one of an older format, the pad does not have the scenario's
+            symmetries, or no object of a shard can be simulated.
         LockedError: Another process collects into the folder.
-        TornFileError: A file in the folder is damaged, or belongs to another dataset or shard; names it.
+        TornFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.
         OSError: The disk is full, or the folder cannot be written to.
     """
     sensor.check()
     sides = [float(side) for side in sensor.gel.size]
     quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(collection))
     if quarter_turns and sides[0] != sides[1]:
-        raise ValueError(f"symmetries=True with gel.size={sides}: only a square pad is itself after a quarter turn")
+        raise ValueError(f"symmetries=True needs a square pad, got gel.size={sides}: give one, or symmetries=False")
     if min(collection.shares) < 0 or not math.isclose(sum(collection.shares), 1):
-        raise ValueError(f"shares is {collection.shares}; the shares of the objects must be at least 0 and have sum 1")
+        raise ValueError(f"shares is {collection.shares}, but the shares of the objects must be >= 0 and have sum 1")
     if collection.meshes is not None and collection.num_objects != len(collection.meshes.names):
-        raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)}")
+        raise ValueError(f"num_objects={collection.num_objects}, but meshes has {len(collection.meshes.names)} objects")
     _check_counts(collection)
     with lock(folder):
         return _collect(collection, sensor, folder, progress)
@@ -340,12 +341,12 @@ def _collect(
 
 
 def symmetries_of(collection: Collection) -> tuple[int, ...]:
-    """In which symmetries of the pad the first and the last frame of each trajectory are rendered; 0 is as it was."""
+    """Symmetries of the pad in which the first and last frames of a trajectory are rendered. 0 is the identity."""
     return collection.scenario.symmetries if collection.symmetries else (0,)
 
 
 def shard_path(folder: Path, count: int, index: int) -> Path:
-    """The record file of one of `count` shards."""
+    """The record file of shard `index` of `count`."""
     return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
 
 
@@ -399,7 +400,7 @@ def _make_shard(
 
 
 def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, objects.Body], list[str]]:
-    """Objects by their numbers, and a line for each that cannot be made: gone or torn since the survey."""
+    """Objects by index, and a line for each that cannot be made, such as one whose file was deleted meanwhile."""
     bodies, left_out = {}, []
     for number in members.tolist():
         try:
@@ -415,11 +416,11 @@ def _named(collection: Collection, number: int) -> str:
 
 
 def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
-    """Which frames are rendered: rows of (trajectory, frame, symmetry), trajectory counted in the shard."""
+    """The frames to render, as rows of (trajectory, frame, symmetry). Trajectories are counted within the shard."""
     num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
     rows: list[tuple[int, int, int]] = []
     for i in range(num):
-        # The full ones are spread over the objects: the first trajectory of each, then the second of each, ...
+        # Full trajectories are spread over the objects: the first one of each, then the second one of each, ...
         place, repeat = divmod(i, collection.num_per_object)
         if repeat >= collection.rendered_per_object:
             continue
@@ -428,7 +429,7 @@ def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.
         rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
         rows += [(i, t, symmetry) for symmetry in symmetries_of(collection) if symmetry for t in (0, last)]
     frames = np.array(rows, np.int32)
-    # Object by object, its mirror image after it: what is drawn in one call.
+    # Sorted by object and then by mirror image, because a call renders one body.
     return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
 
 
@@ -442,7 +443,7 @@ def _solid(bodies: list[objects.Body], which: np.ndarray, hidden: physics.Hidden
 def _views_of(
     collection: Collection, key: PRNGKeyArray, bodies: list[objects.Body], sensor: Sensor
 ) -> dict[str, np.ndarray]:
-    """The further starts of which pictures are taken: pose, number of the body in the shard, and `_solid`."""
+    """The further starts to render: pose, index of the body in the shard, and `_solid`."""
     if not collection.num_views:
         shapes = {"pose": (0, 7), "support": (0, len(objects.DIRECTIONS)), "mass": (0,), "com": (0, 3)}
         return {"body": np.zeros(0, np.int32)} | {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
@@ -452,12 +453,12 @@ def _views_of(
 
 
 class _Job(NamedTuple):
-    """What one compiled call renders."""
+    """Frames of one body that one compiled call renders."""
 
     body: objects.Body
     pose: np.ndarray  # (n, 7)
     wrench: np.ndarray  # (n, 6)
-    is_view: bool  # of which the visual image alone is kept
+    is_view: bool  # whether only the visual image is kept
 
 
 def _render(
@@ -469,7 +470,10 @@ def _render(
     views: dict[str, np.ndarray],
     report: Callable[[int], None],
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Render `frames`, then `views`, in order, a fixed number a call; one thread a core: a call keeps one core busy."""
+    """Render `frames`, then `views`, in order, a fixed number per call.
+
+    There is one thread per core, because a call keeps only one core busy.
+    """
     size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
     turned = {
         q: [np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench))]
@@ -514,19 +518,19 @@ def render_uint8(
     resolution: tuple[int, int],
     crop: bool,
 ) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
-    """Frames of one object as they are stored: visual and tactile in `uint8`, segmentation in bool."""
+    """Render frames of one object as they are stored: visual and tactile in `uint8`, segmentation in bool."""
 
     def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         frame = sense(sensor, body, *item, resolution=resolution, crop=crop)
         visual, tactile = (jnp.round(image * 255).astype(jnp.uint8) for image in (frame.visual, frame.tactile))
         return visual, tactile, frame.segmentation
 
-    # On a CPU, one frame after the other is twice as quick as all at once.
+    # A CPU is twice as fast if it renders one frame after another instead of all at once.
     return jax.lax.map(one, (pose, wrench), batch_size=1 if jax.default_backend() == "cpu" else len(pose))
 
 
 def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
-    """Both streams and the segmentation with nothing on the sensor, `uint8`, as the collection renders them."""
+    """Both streams (`uint8`) and the segmentation (bool) of the untouched sensor, as the collection renders them."""
     body = make_bodies(collection, np.array([0]))[0]
     gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
     images = render_uint8(sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop)

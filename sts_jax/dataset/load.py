@@ -1,4 +1,4 @@
-"""A collected folder as arrays: trajectories, rendered frames, and the pairs that learning sees."""
+"""Load a dataset as arrays: trajectories, rendered frames, and pairs of first and last moments."""
 
 import dataclasses
 from pathlib import Path
@@ -13,20 +13,20 @@ from sts_jax.dataset.collect import PARTS, shard_path, turn, turn_condition
 
 
 class Pairs(NamedTuple):
-    """First and last moment of some trajectories, in memory; `n` is trajectories times symmetries."""
+    """First and last moments of some trajectories, in memory. `n` is trajectories times symmetries."""
 
     visual: np.ndarray  # uint8 (n, 2, height, width, 3): first, last
     tactile: np.ndarray  # uint8 (n, 2, height, width, 3)
     segmentation: np.ndarray  # bool (n, 2, height, width)
     pose: np.ndarray  # float32 (n, 2, 7)
-    contact: np.ndarray  # bool (n, 2): the pad carries the object
-    condition: np.ndarray  # float32 (n, c): the scenario's input, SI units; turned like the pose
+    contact: np.ndarray  # bool (n, 2): the pad pushes the object
+    condition: np.ndarray  # float32 (n, c): the scenario's input, SI units, turned like the pose
     outcome: np.ndarray  # int32 (n,), physics.Outcome
     object: np.ndarray  # int64 (n,), index of the object in the collection
     trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
-    support: np.ndarray  # float32 (n, 128), m: `objects.support` of the body, the mirrored one where it is mirrored
+    support: np.ndarray  # float32 (n, 128), m: `objects.support` of the body, or of the mirrored body
     mass: np.ndarray  # float32 (n,), kg, with the trajectory's hidden values
-    com: np.ndarray  # float32 (n, 3), m, centre of mass in the mesh frame; mirrored like the body
+    com: np.ndarray  # float32 (n, 3), m, centre of mass in the mesh frame, mirrored like the body
 
 
 class Ends(NamedTuple):
@@ -43,7 +43,7 @@ class Ends(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Pictures of some objects at starts without a trajectory, in memory."""
+    """Pictures of some objects at starts that are not simulated, in memory."""
 
     visual: np.ndarray  # uint8 (m, height, width, 3)
     pose: np.ndarray  # float32 (m, 7)
@@ -54,18 +54,18 @@ class Views(NamedTuple):
 
 
 def reduced(pairs: Pairs, size: int) -> Pairs:
-    """The same moments in images of another resolution: means over blocks of pixels.
+    """The same moments with images of a lower resolution, which are means over blocks of pixels.
 
     Args:
-        pairs: with square images.
-        size: pixels, the new side; that of the images must be a multiple of it.
+        pairs: moments with square images.
+        size: pixels, new side of the images, which divides their present side.
 
     Raises:
-        ValueError: the images are not square, or not of a multiple of the size.
+        ValueError: the images are not square, or their side is not a multiple of `size`.
     """
     height, width = pairs.visual.shape[2:4]
     if height != width or size < 1 or height % size:
-        raise ValueError(f"size is {size} and the images have {height} x {width} pixels; their side must be a multiple")
+        raise ValueError(f"size is {size}, but it must divide the side of square images, got {height} x {width} pixels")
     return pairs._replace(
         visual=_means(pairs.visual, size),
         tactile=_means(pairs.tactile, size),
@@ -74,7 +74,7 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
 
 
 def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
-    """Single square images `(side, side, channels)` as `reduced` makes them."""
+    """Reduce single square images `(side, side, channels)` as `reduced` does."""
     return {name: _means(image, size) for name, image in images.items()}
 
 
@@ -86,24 +86,24 @@ def _means(images: np.ndarray, size: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Everything small in memory, images read when asked for."""
+    """A dataset. Images are read on request, and everything else is in memory."""
 
-    collection: dict  # as collection.json has it
-    identity: str  # SHA-256 of everything that was collected, and of the split
+    collection: dict  # content of collection.json
+    identity: str  # SHA-256 of all collected data and of the split
     split: dict[str, np.ndarray]  # name -> object indices
-    trajectory: dict[str, np.ndarray]  # physics.Trajectory's leaves, all shards: (num, ...)
-    hidden: dict[str, np.ndarray]  # physics.Hidden's leaves, (num,)
-    solid: dict[str, np.ndarray]  # support, mirrored (the mirrored body's support), mass, com of each: (num, ...)
+    trajectory: dict[str, np.ndarray]  # leaves of physics.Trajectory, all shards: (num, ...)
+    hidden: dict[str, np.ndarray]  # leaves of physics.Hidden, (num,)
+    solid: dict[str, np.ndarray]  # support, mirrored (support of the mirrored body), mass, com: (num, ...)
     view: dict[str, np.ndarray]  # pose, body, support, mass, com of each view: (k, ...)
     frames: np.ndarray  # int (m, 3): trajectory, frame, symmetry of every stored image, in order of the shards
     shards: tuple[Path, ...]
-    shard_of: np.ndarray  # int (m,): which shard holds it
-    record_of: np.ndarray  # int (m,): where in it
-    view_shard_of: np.ndarray  # int (k,): which shard holds the picture of each view
-    view_record_of: np.ndarray  # int (k,): where in it
+    shard_of: np.ndarray  # int (m,): index of the shard of each stored image
+    record_of: np.ndarray  # int (m,): index of its record in the shard
+    view_shard_of: np.ndarray  # int (k,): index of the shard of each view
+    view_record_of: np.ndarray  # int (k,): index of its record in the shard
 
     def images(self, rows: np.ndarray) -> records.Images:
-        """Read the images of some rows of `frames`, in the order asked for."""
+        """Read the images of some rows of `frames`, in the given order."""
         height, width = self.collection["resolution"]
         out = records.Images(
             np.empty((len(rows), height, width, 3), np.uint8),
@@ -136,7 +136,7 @@ class Dataset:
         return np.flatnonzero(counts == self.trajectory["pose"].shape[1])
 
     def strip(self, trajectory: int) -> records.Images:
-        """Every frame of one fully rendered trajectory, in time order."""
+        """Read every frame of one fully rendered trajectory, in time order."""
         rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
         return self.images(rows[np.argsort(self.frames[rows, 1])])
 
@@ -144,18 +144,18 @@ class Dataset:
         """Indices of the trajectories of `train`, `validation` or `test`.
 
         Args:
-            part: Its name.
-            rendered: Those with images only, which `pairs` loads; False: all, which `ends` loads.
+            part: One of these names.
+            rendered: Whether to return only trajectories with images, which `pairs` loads. `ends` loads all.
 
         Raises:
-            ValueError: There is no such part.
+            ValueError: The name is unknown.
         """
         found = np.flatnonzero(np.isin(self.trajectory["body"], self._part(part)))
         return found[np.isin(found, self.rendered())] if rendered else found
 
     def _part(self, part: str) -> np.ndarray:
         if part not in self.split:
-            raise ValueError(f"unknown part {part!r} of the dataset: one of {', '.join(self.split)}.")
+            raise ValueError(f"unknown part {part!r} of the dataset: give one of {', '.join(self.split)}.")
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
@@ -165,7 +165,7 @@ class Dataset:
             trajectories: Their indices.
 
         Raises:
-            ValueError: An index is no whole number or out of range.
+            ValueError: An index is not a whole number or is out of range.
         """
         index = self._checked(trajectories)
         return Ends(
@@ -180,13 +180,13 @@ class Dataset:
         )
 
     def views(self, part: str) -> Views:
-        """Pictures of the objects of `train`, `validation` or `test` at further starts; there may be none.
+        """Pictures, possibly none, of the objects of `train`, `validation` or `test` at further starts.
 
         Args:
-            part: Its name.
+            part: One of these names.
 
         Raises:
-            ValueError: There is no such part.
+            ValueError: The name is unknown.
         """
         rows = np.flatnonzero(np.isin(self.view["body"], self._part(part)))
         height, width = self.collection["resolution"]
@@ -203,27 +203,27 @@ class Dataset:
         return Views(visual, pose, support, mass, com, self.view["body"][rows].astype(np.int64))
 
     def _checked(self, trajectories: Any) -> np.ndarray:
-        """Indices of trajectories as int64, or a ValueError where they are none."""
+        """Indices of trajectories as int64. Raise a ValueError if they are invalid."""
         trajectories, count = np.asarray(trajectories), len(self.trajectory["outcome"])
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
-                f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}; it takes a list "
-                "of indices (np.flatnonzero turns a mask into one)."
+                f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
+                "a list of indices (np.flatnonzero turns a mask into one)."
             )
         outside = trajectories[(trajectories < 0) | (trajectories >= count)]
         if outside.size:
-            raise ValueError(f"trajectories holds {outside[0]}; the dataset has trajectories 0 to {count - 1}.")
+            raise ValueError(f"trajectories holds {outside[0]}, but the dataset has trajectories 0 to {count - 1}.")
         return trajectories.astype(np.int64)
 
     def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
-        """First and last frame of some trajectories.
+        """First and last moments of some trajectories.
 
         Args:
             trajectories: Their indices.
-            symmetries: Each also turned and mirrored, as the collection rendered it.
+            symmetries: Whether to add the turned and mirrored copies that the collection rendered.
 
         Raises:
-            ValueError: An index is no whole number or out of range, or of a trajectory without images.
+            ValueError: An index is not a whole number or is out of range, or its trajectory has no images.
         """
         trajectories = self._checked(trajectories)
         without = trajectories[~np.isin(trajectories, self.rendered())]
@@ -262,11 +262,11 @@ class Dataset:
 
 
 def load(folder: str | Path) -> Dataset:
-    """Open a folder that `collect` has finished, and verify it: every image is read once, about 1 s a GB.
+    """Open a folder that `collect` has finished, and verify it. Every image is read once, in about 1 s per GB.
 
     Raises:
-        FileNotFoundError: The folder or one of its files is missing; names it.
-        TornFileError: A file is damaged, or belongs to another dataset or shard; names it.
+        FileNotFoundError: The folder or one of its files is missing. The message names it.
+        TornFileError: A file is damaged, or belongs to another dataset or shard. The message names it.
         ValueError: The dataset has an older format.
     """
     folder = Path(folder)
@@ -282,7 +282,7 @@ def load(folder: str | Path) -> Dataset:
         path = shard_path(folder, count, index)
         if not path.with_suffix(".npz").exists():
             raise FileNotFoundError(
-                f"{path.with_suffix('.npz')} is missing: the collection is not finished; run it again, it resumes."
+                f"{path.with_suffix('.npz')} is missing: the collection is not finished. Run it again to resume it."
             )
         parts.append(records.read_shard(path, records.Identity(made_of, seen_by, index)))
         shards.append(path)
@@ -323,32 +323,32 @@ def _whole_number(collection: dict, name: str, path: Path) -> int:
     value = collection.get(name)
     if type(value) is not int or value < 1:
         raise TornFileError(
-            f"{path}: {name} must be a whole number of at least 1, got {value!r}; "
+            f"{path}: {name} must be a whole number of at least 1, got {value!r}: "
             f"delete {path.parent} and collect again."
         )
     return value
 
 
 def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
-    """Read which objects train, validate and test: each object in one part."""
+    """Read the split of the objects. Each object must be in exactly one part."""
     remedy = f"delete {path} and start the collection again, which writes it anew"
     content = _read(path, remedy)
     if not isinstance(content, dict) or set(content) != set(PARTS):
         parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
-        raise TornFileError(f"{path} must have the parts {', '.join(PARTS)}, got {parts}; {remedy}.")
+        raise TornFileError(f"{path} must have the parts {', '.join(PARTS)}, got {parts}: {remedy}.")
     for name, part in content.items():
         if not isinstance(part, list) or not all(type(i) is int for i in part):
-            raise TornFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}; {remedy}.")
+            raise TornFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}: {remedy}.")
         outside = [i for i in part if not 0 <= i < num_objects]
         if outside:
             raise TornFileError(
-                f"{path}: {name} holds object {outside[0]}, and the objects are 0 to {num_objects - 1}; {remedy}."
+                f"{path}: {name} holds object {outside[0]}, but the objects are 0 to {num_objects - 1}: {remedy}."
             )
     named = np.array([i for part in content.values() for i in part], np.int64)
     times = np.bincount(named, minlength=num_objects)
     if (times != 1).any():
         number = int(np.flatnonzero(times != 1)[0])
         raise TornFileError(
-            f"{path}: object {number} must be in one part, and it is there {times[number]} times; {remedy}."
+            f"{path}: object {number} must be in one part, but it occurs {times[number]} times: {remedy}."
         )
     return {name: np.array(part, np.int64) for name, part in content.items()}

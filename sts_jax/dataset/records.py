@@ -1,10 +1,10 @@
-"""Shards on disk: whole files or none, the same bytes from the same inputs.
+"""Shards on disk. A file is written as a whole or not at all, and the same inputs give the same bytes.
 
 A shard is two files. `NAME.array_record` holds one record per rendered frame: the visual image, the tactile image
-(`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. Behind the frames it holds one record per
-view, the visual image alone. `NAME.npz` holds everything small as
-named arrays and is written last: a shard without it does not exist. It also holds the shard's `Identity` and the
-SHA-256 of its record file, so that neither file can be exchanged for one of another shard or dataset.
+(`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames are followed by one record per
+view, which holds the visual image only. `NAME.npz` holds everything small as named arrays. It is written last, and a
+shard without it counts as missing. It also holds the shard's `Identity` and the SHA-256 of its record file, so that
+neither file can be exchanged for one of another shard or dataset.
 """
 
 import io
@@ -18,8 +18,8 @@ from array_record.python.array_record_module import ArrayRecordReader, ArrayReco
 from sts_jax import physics
 from sts_jax._files import TornFileError, sha256, write_bytes, write_whole
 
-FORMAT = 4  # of a dataset's files; one more whenever older files can no longer be read
-ARRAYS = {  # the names that a shard's .npz holds beside its identity
+FORMAT = 4  # of a dataset's files, incremented when older files can no longer be read
+ARRAYS = {  # names of the arrays in a shard's .npz, apart from its identity
     *(f"trajectory/{name}" for name in physics.Trajectory._fields if name != "hidden"),
     *(f"hidden/{name}" for name in physics.Hidden._fields),
     *(f"solid/{name}" for name in ("support", "mirrored", "mass", "com")),
@@ -27,7 +27,7 @@ ARRAYS = {  # the names that a shard's .npz holds beside its identity
     "frames",
     "left_out",
 }
-# One frame per group, so that a random read inflates one frame only.
+# One frame per group, so that a random read decompresses one frame only.
 WRITER_OPTIONS = "group_size:1,zstd:3"
 
 
@@ -40,22 +40,22 @@ class Images(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """Which part of which dataset a shard is."""
+    """Identity of a shard: its dataset, sensor and index."""
 
     collection: str  # `digest` of collection.json
     sensor: str  # `digest` of sensor.json
-    shard: int  # its number
+    shard: int  # index of the shard
 
 
 def check_format(content: Any, folder: Path) -> None:
-    """Check that this version reads a dataset, given what its `collection.json` holds.
+    """Check that this version reads a dataset, given the content of its `collection.json`.
 
     Raises:
-        TornFileError: The content is no description of a collection.
-        ValueError: An older or newer version has written the dataset.
+        TornFileError: The content is not the description of a collection.
+        ValueError: The dataset was written by an older or newer version.
     """
     if not isinstance(content, dict):
-        raise TornFileError(f"{folder / 'collection.json'} holds no collection; delete {folder} and collect again.")
+        raise TornFileError(f"{folder / 'collection.json'} holds no collection: delete {folder} and collect again.")
     written = content.get("format", 1)  # the first format had no number
     if written != FORMAT:
         raise ValueError(
@@ -71,12 +71,12 @@ def write_shard(
 
     Args:
         path: The `.array_record` file.
-        frames: The records, batch by batch: `Images` of frames, then of views `(visual,)`.
+        frames: The records, batch by batch: `Images` of the frames, then `(visual,)` of the views.
         arrays: Everything else, with the names ARRAYS.
-        identity: Which shard this is.
+        identity: Identity of the shard.
 
     Raises:
-        OSError: A file cannot be written; names it.
+        OSError: A file cannot be written. The message names it.
     """
     write_images(path, frames)
     known = {f"identity/{name}": np.array(value) for name, value in identity._asdict().items()}
@@ -84,18 +84,18 @@ def write_shard(
 
 
 def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
-    """Read the arrays of a shard, once it is certain that both of its files are those that were written together.
+    """Read the arrays of a shard, after checking that its two files were written together.
 
     Args:
         path: The `.array_record` file.
-        identity: The shard that must be there.
+        identity: The identity that the shard must have.
 
     Returns:
         The arrays given to `write_shard`.
 
     Raises:
-        FileNotFoundError: A file is missing; names it.
-        TornFileError: A file is damaged, or belongs to another shard or dataset; names it.
+        FileNotFoundError: A file is missing. The message names it.
+        TornFileError: A file is damaged, or belongs to another shard or dataset. The message names it.
     """
     small = path.with_suffix(".npz")
     arrays = read_arrays(small)
@@ -103,10 +103,10 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
-        raise TornFileError(f"{small} lacks {', '.join(lacking)}; {again}.")
+        raise TornFileError(f"{small} lacks {', '.join(lacking)}: {again}.")
     there = {name.partition("/")[2]: arrays.pop(name).item() for name in names}
     if there["shard"] != identity.shard:
-        raise TornFileError(f"{small} holds shard {there['shard']} instead of shard {identity.shard}; {again}.")
+        raise TornFileError(f"{small} holds shard {there['shard']} instead of shard {identity.shard}: {again}.")
     for name in ("collection", "sensor"):
         if there[name] != getattr(identity, name):
             raise TornFileError(
@@ -117,20 +117,20 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
         raise _missing(path)
     if sha256(path) != there["images"]:
         raise TornFileError(
-            f"{path} is damaged or belongs to another shard: its SHA-256 is not that in {small.name}; {again}."
+            f"{path} is damaged or belongs to another shard (its SHA-256 is not that in {small.name}): {again}."
         )
     return arrays
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays to an `.npz` file, whole or not at all."""
+    """Write named arrays to an `.npz` file, as a whole or not at all."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
-    """Write the images of each batch in order to an array_record file, whole or not at all."""
+    """Write the images of each batch in order to an array_record file, as a whole or not at all."""
 
     def write(temporary: Path) -> None:
         writer = _or_os_error(ArrayRecordWriter, str(temporary), WRITER_OPTIONS)
@@ -144,7 +144,7 @@ def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
 
 
 def _or_os_error(call: Callable[..., Any], *args: Any) -> Any:
-    """Call array_record, which raises RuntimeError or ValueError where the disk is full."""
+    """Call array_record, and turn the RuntimeError or ValueError that it raises on a full disk into an OSError."""
     try:
         return call(*args)
     except (RuntimeError, ValueError) as error:
@@ -152,19 +152,19 @@ def _or_os_error(call: Callable[..., Any], *args: Any) -> Any:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read what `write_arrays` wrote.
+    """Read the arrays of a file that `write_arrays` wrote.
 
     Raises:
-        FileNotFoundError: No such file.
-        TornFileError: The file is not a whole `.npz`; delete it and collect again.
+        FileNotFoundError: The file does not exist.
+        TornFileError: The file is not a complete `.npz`. The remedy is to delete it and collect again.
     """
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             return dict(arrays)
     except FileNotFoundError:
         raise
-    except Exception as error:  # a torn zip shows as any of five exception types
-        raise TornFileError(f"{path} is torn ({error}); delete it and start the collection again.") from error
+    except Exception as error:  # a damaged zip file raises any of five types
+        raise TornFileError(f"{path} is damaged ({error}): delete it and start the collection again.") from error
 
 
 def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> Images:
@@ -172,12 +172,12 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
     Args:
         path: The `.array_record` file.
-        indices: Which records, `(n,)`.
+        indices: Indices of the records, `(n,)`.
         resolution: Height and width of every image.
-        total: How many records the file must hold (from the shard's arrays).
+        total: Number of records that the file must hold (from the shard's arrays).
 
     Raises:
-        FileNotFoundError: No such file.
+        FileNotFoundError: The file does not exist.
         TornFileError: The file is truncated or holds another number of records.
     """
     height, width = resolution
@@ -193,7 +193,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
 
 def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
-    """Read some views of a shard, `uint8 (n, height, width, 3)`; as `read_images`."""
+    """Read some views of a shard, `uint8 (n, height, width, 3)`. Arguments and errors are those of `read_images`."""
     return _read_records(path, indices, total).reshape(-1, *resolution, 3)
 
 
@@ -208,11 +208,11 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
         records = reader.read([int(i) for i in indices]) if count == total and len(indices) else []
         reader.close()
     except (RuntimeError, ValueError, IndexError) as error:
-        raise TornFileError(f"{torn}: {error}.") from error
+        raise TornFileError(f"{torn} ({error}).") from error
     if count != total:
-        raise TornFileError(f"{torn}: it holds {count} records instead of {total}.")
+        raise TornFileError(f"{torn} (it holds {count} records instead of {total}).")
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
 
 
 def _missing(path: Path) -> FileNotFoundError:
-    return FileNotFoundError(f"{path} is missing; delete {path.with_suffix('.npz').name} and collect again.")
+    return FileNotFoundError(f"{path} is missing: delete {path.with_suffix('.npz').name} and collect again.")

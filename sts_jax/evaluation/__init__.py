@@ -1,4 +1,4 @@
-"""How good a prediction is: metrics per item, tables with intervals, ceilings, figures."""
+"""Evaluation of predictions: metrics per item, tables with intervals, ceilings and figures."""
 
 from sts_jax.evaluation import figures, metrics
 from sts_jax.evaluation.report import (

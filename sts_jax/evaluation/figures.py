@@ -1,4 +1,4 @@
-"""Pictures of what was predicted, learnt and simulated, each written to one PNG file."""
+"""Figures of predictions, training and simulation, each written to one file."""
 
 import collections
 from collections.abc import Mapping, Sequence
@@ -18,26 +18,26 @@ from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.report import Predicted, Scores, in_unit
 
-SLOWER = 2  # an animation is so many times slower than what it shows
+SLOWER = 2  # factor by which an animation is slower than the motion
 _PANEL = 104  # pixels, height of one panel of curves below an animation
 
 
-SAMPLES = 4  # of each prediction are shown
-_POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of true ends and of predicted ones
+SAMPLES = 4  # samples shown of each prediction
+_POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of possible and of predicted ends
 
 
 def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, title: str) -> None:
-    """Input, truth, prediction and samples of the first `num` held-out trajectories: a row for each stream.
+    """Draw input, truth, prediction and samples of the first `num` held-out trajectories, with a row for each stream.
 
-    Where there is a condition, an arrow on the input is the velocity against the pad that the jerk gives what slides
-    freely: a quarter of the picture for 1 m/s.
+    If there is a condition, an arrow on the input shows the velocity relative to the pad that the jerk gives to a
+    freely sliding object. A quarter of the picture is 1 m/s.
 
     Args:
         path: The PNG to write.
         test: Held-out trajectories, in the dataset's order.
-        predicted: Of these, or of the first ones; a stream that is not predicted has no rows.
-        num: How many trajectories.
-        title: Of the figure.
+        predicted: Predictions of these, or of the first ones. A stream that is not predicted has no rows.
+        num: Number of trajectories.
+        title: Title of the figure.
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
     samples = predicted.samples or Predicted()
@@ -72,12 +72,12 @@ def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, titl
 
 
 def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
-    """How often the likeliest outcome came true against its predicted probability, with the number of items below.
+    """Draw how often the likeliest outcome came true against its probability, with the number of items below.
 
     Args:
         path: The PNG to write.
-        scores: By name, of predictors with outcome probabilities; each gives one column.
-        title: Of the figure.
+        scores: Scores by name. Each predictor with outcome probabilities gives one column.
+        title: Title of the figure.
     """
     judged = {
         name: (own.confidence, own.right)
@@ -125,16 +125,16 @@ def ends(
     *,
     title: str,
 ) -> None:
-    """Where one object can come to rest, beside where a model expects it: the pad from above, oriented as the images.
+    """Draw the possible ends of one start beside the predicted ones, on the pad from above, oriented as the images.
 
     Args:
         path: The PNG to write.
-        size: Of the pad along x and y (m), `(2,)`.
+        size: Size of the pad along x and y (m), `(2,)`.
         start: First pose, `(7,)`.
         truth: Last pose, `(7,)`.
         rerolled: Last poses with other hidden values, `(m, 7)`.
         sampled: Last poses that a model drew, `(k, 7)`.
-        title: Of the figure.
+        title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)
     half = 500 * np.asarray(size)  # mm
@@ -165,16 +165,16 @@ def ends(
 class Trained(NamedTuple):
     """One trained model of a scaling curve."""
 
-    name: str  # of the line: the inputs, or the model
-    trajectories: int  # that it was trained on
-    minutes: float  # of training
+    name: str  # of the line, such as the inputs or the model
+    trajectories: int  # number of training trajectories
+    minutes: float  # training time
     skill: float
     low: float  # of the 95 % interval
     high: float
 
 
 def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
-    """Visual skill on held-out objects against the number of training trajectories and against training time.
+    """Draw visual skill on held-out objects against the number of training trajectories and against training time.
 
     The left panel joins the models of one name and training time, the right panel those of one name and number of
     trajectories.
@@ -183,7 +183,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
         path: The PNG to write.
         points: The trained models.
         ceiling: Skill of the best possible prediction, drawn as a line.
-        title: Of the figure.
+        title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
     for axis, along, fixed, unit in (
@@ -228,18 +228,18 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
 
 
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
-    """Loss, KL and the reconstruction of each modality against the gradient step, one line a model.
+    """Draw loss, KL and the reconstruction of each modality against the gradient step, one line per model.
 
     Args:
         path: The PNG to write.
-        logs: For each model its log: dictionaries with `step`, `loss`, `kl` and one number a modality.
+        logs: The log of each model: dictionaries with `step`, `loss`, `kl` and one number per modality.
     """
     keys = [
         key
         for key in ("loss", "kl", "look", "visual", "tactile", "state", "outcome", "pose")
         if any(key in e for log in logs.values() for e in log)
     ]
-    # A state-space model has a density of the final pose; its squared error is that of the first pose, the state.
+    # A state-space model predicts a density of the final pose. Its squared error is that of the first pose, the state.
     squared = "state" if any("state" in entry for log in logs.values() for entry in log) else "pose"
     units = {squared: "squared error (scaled pose)"}
     figure, axes = plt.subplots(1, len(keys), figsize=(3.6 * len(keys), 3.2), squeeze=False)
@@ -252,7 +252,7 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
         axis.set_ylabel(units.get(key, "nats an item"))
         axis.set_title(key, fontsize=9)
         if key == "loss":
-            axis.set_yscale("log")  # the models differ by the number of their subsets
+            axis.set_yscale("log")  # models with different numbers of subsets differ in scale
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=7)
     _save(figure, path)
@@ -269,19 +269,19 @@ def strip(
     num: int = 10,
     title: str = "",
 ) -> None:
-    """One trajectory: a view from outside, both streams, and what the pad exerts, over time.
+    """Draw one trajectory over time: a view from outside, both streams, and the wrench of the pad on the object.
 
-    Below the pictures is the force, below that its moment about the sensor's origin.
+    The force is below the pictures, and its moment about the sensor's origin is below the force.
 
     Args:
         path: The PNG to write.
-        time: Of every frame (s), `(frames,)`.
+        time: Time of every frame (s), `(frames,)`.
         view: The scene from outside, `(frames, h, w, 3)`.
         visual: `(frames, height, width, 3)` in [0, 1].
         tactile: `(frames, height, width, 3)` in [0, 1].
         wrench: `(frames, 6)`, N and N m.
-        num: How many frames are shown: from just before the first touch to the end, denser at the beginning.
-        title: Of the figure.
+        num: Number of frames that are shown, from the first to the last, denser at the beginning.
+        title: Title of the figure.
     """
     last = len(time) - 1
     chosen = np.unique(np.round(last * np.linspace(0, 1, num) ** 1.8).astype(int))
@@ -329,27 +329,27 @@ def animation(
     outcome: str = "",
     side: int = 240,
 ) -> None:
-    """One trajectory as a moving picture: a view from outside, both streams, force and moment so far.
+    """Write an animation of one trajectory: a view from outside, both streams, force and moment so far.
 
-    An arrow on the visual stream is gravity's part along the pad: what the slope, or the jerk of the pad, pulls with.
-    All is shown SLOWER times slower than it happens.
+    An arrow on the visual stream is the component of gravity along the pad, which is due to the slope or to the jerk of
+    the pad. The animation is SLOWER times slower than the motion.
 
     Args:
         path: The GIF to write.
-        time: Of every frame (s), `(frames,)`.
+        time: Time of every frame (s), `(frames,)`.
         view: The scene from outside, `(frames, h, w, 3)` in [0, 1].
         visual: `(frames, height, width, 3)` in [0, 1].
         tactile: `(frames, height, width, 3)` in [0, 1].
         wrench: `(frames, 6)`, N and N m.
         gravity: `(frames, 3)`, m/s^2, sensor frame.
-        title: Above.
-        outcome: Shown at the end.
-        side: Of each of the three pictures (pixels).
+        title: Title above the pictures.
+        outcome: Text that is shown at the end.
+        side: Side of each of the three pictures (pixels).
     """
     top, width = 44, 3 * side
     base = top + side
     across = np.interp(time, [time[0], max(time[-1], time[0] + 1e-6)], [50, width - 12])
-    letters = font_manager.findfont("DejaVu Sans")  # comes with matplotlib; Pillow's own has no "²"
+    letters = font_manager.findfont("DejaVu Sans")  # comes with matplotlib (Pillow's own font has no "²")
     font, small = (ImageFont.truetype(letters, size=size) for size in (12, 11))
     curves = [
         ("force (N)", "F", wrench[:, :3]),

@@ -1,8 +1,8 @@
-"""Numbers that say how good a prediction is, each per item so that any grouping can follow.
+"""Metrics of predictions, per item, so that items can be grouped in any way.
 
-Images are probabilities in [0, 1]; targets are grey values, so their binary cross-entropy has a floor, the entropy
-of the target itself: `BCE(x, p) = H(x) + KL(x || p)`. The excess is the KL term, what a prediction could do better;
-the skill is one minus its ratio to the excess of the mean training image.
+Predicted images are probabilities in [0, 1]. Targets are grey values, so that the binary cross-entropy is at least the
+entropy of the target: `BCE(x, p) = H(x) + KL(x || p)`. The excess is the KL term, which a better prediction can reduce.
+The skill is one minus the ratio of the excess to that of the mean training image.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Predicted probabilities are kept this far from 0 and 1: half a grey level, so that stored images can be predictions.
+# Predicted probabilities are kept at least half a grey level from 0 and 1, so that stored images can be predictions.
 HALF_LEVEL = 1 / 510
 FLOOR = 1e-3  # outcome probabilities below this count as this in the log loss
 BINS = 10  # of equal width in [0, 1], for the calibration of outcome probabilities
 LEVEL = 0.9  # probability of the region whose coverage is measured
-_CHUNK = 128  # items whose images are compared at once: bounds the memory
+_CHUNK = 128  # items whose images are compared at once, which bounds the memory
 _CLOSE = 1e-6  # m, the distance below which the geometric median's weights no longer grow
 
 
@@ -23,8 +23,8 @@ class ImageError(NamedTuple):
     """Cross-entropy and excess of predicted images, summed over the pixels that count."""
 
     bce: np.ndarray  # (n,) nats, summed over pixels and channels
-    excess: np.ndarray  # (n,)
-    pixels: np.ndarray  # (n,) how many pixels times channels
+    excess: np.ndarray  # (n,) nats, bce less the entropy of the target
+    pixels: np.ndarray  # (n,) number of pixels times channels
 
 
 def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> ImageError:
@@ -33,7 +33,7 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
     Args:
         predicted: Probabilities `(n, height, width, 3)`.
         target: Grey values in [0, 1], same shape.
-        mask: Which pixels count, bool `(n, height, width)`; all where not given.
+        mask: Which pixels count, bool `(n, height, width)` (default: all).
     """
     if len(target) > _CHUNK:
         cuts = [slice(start, start + _CHUNK) for start in range(0, len(target), _CHUNK)]
@@ -56,7 +56,7 @@ def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = N
 
 
 def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Mean of a summed error over the pixels that count."""
+    """Mean per pixel of an error that is summed over the pixels that count."""
     w = np.ones(len(values)) if weight is None else weight
     total = float((w * count).sum())
     return float((w * values).sum()) / total if total > 0 else float("nan")
@@ -74,8 +74,9 @@ def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Angle between the objects' up axes, radians `(n,)` in [0, pi]: a turn about the own axis, unseen of round things,
-    does not count.
+    """Angle between the up axes of two orientations, radians `(n,)` in [0, pi].
+
+    A turn about the axis itself does not count. It is invisible for round objects.
     """
     w, x, y, z = (np.stack([predicted, target])[..., i].astype(np.float64) for i in range(3, 7))
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], -1)
@@ -86,7 +87,7 @@ def best_of(errors: Sequence[ImageError]) -> ImageError:
     """The error of each item's best sample: the one with the smallest excess.
 
     Args:
-        errors: One a sample.
+        errors: One per sample.
     """
     excess = np.stack([error.excess for error in errors])
     best, item = excess.argmin(0), np.arange(excess.shape[1])
@@ -107,7 +108,7 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Energy score of samples of a position, `E|X - y| - E|X - X'| / 2`, in the unit of the positions, `(n,)`.
 
     The second mean is taken over the k (k - 1) pairs of different samples, so that the expectation does not depend on
-    k. One sample scores its distance: the score of a deterministic prediction is its absolute error.
+    k. The score of one sample is its distance, so that a deterministic prediction scores its absolute error.
 
     Args:
         samples: `(k, n, d)`.
@@ -124,12 +125,12 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> np.ndarray:
-    """Whether the target lies in the central region of some samples, `(n,)`; the mean over items is the coverage.
+    """Whether the target lies in the central region of some samples, `(n,)`. The mean over items is the coverage.
 
     The target and the k samples are ranked by their mean distance from each other. The region leaves out the
-    outermost points. A calibrated predictor's target is a draw like its samples, whatever their distribution, so that
-    its rank is one of 1 to k + 1 with equal probability. A rank r counts `level (k + 1) - (r - 1)`, limited to
-    [0, 1]: the mean is then `level` for every k. Points of equal distance share the mean of their counts.
+    outermost points. For a calibrated predictor the target is a draw like the samples, whatever their distribution, so
+    that its rank is one of 1 to k + 1 with equal probability. A rank r counts `level (k + 1) - (r - 1)`, limited to
+    [0, 1], so that the mean is `level` for every k. Points of equal distance share the mean of their counts.
 
     Args:
         samples: `(k, n, d)`, k >= 1.
@@ -143,19 +144,21 @@ def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> n
     inner = (outlying < outlying[0] - tolerance).sum(0)
     ties = (np.abs(outlying - outlying[0]) <= tolerance).sum(0)  # the target included
 
-    def counted(ranks: np.ndarray) -> np.ndarray:  # the counts of ranks 1 to `ranks`, added up
+    def counted(ranks: np.ndarray) -> np.ndarray:  # sum of the counts of ranks 1 to `ranks`
         return np.minimum(ranks, level * len(points))
 
     return (counted(inner + ties) - counted(inner)) / ties
 
 
 def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
-    """One pose for some samples: the position with the smallest mean distance from theirs (geometric median), and the
-    orientation of the sample with the smallest mean angle to the others.
+    """The central pose of some samples.
+
+    Its position has the smallest mean distance from the samples (geometric median). Its orientation is that of the
+    sample with the smallest mean angle to the others.
 
     Args:
         samples: `(k, n, 7)`, unit quaternions.
-        iterations: Of Weiszfeld's method.
+        iterations: Iterations of Weiszfeld's method.
 
     Returns:
         `(n, 7)`.
@@ -177,17 +180,17 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
     Args:
         probability: `(n, c)`.
         label: The column of the true outcome, int `(n,)`.
-        floor: Smaller probabilities count as this: no single item decides the mean.
+        floor: Smaller probabilities count as this, so that no single item decides the mean.
     """
     return -np.log(np.maximum(probability[np.arange(len(label)), label], floor))
 
 
 class Reliability(NamedTuple):
-    """Outcomes that were predicted with similar confidence, bin by bin."""
+    """Frequency of outcomes that were predicted with similar confidence, in bins."""
 
-    confidence: np.ndarray  # (bins,) mean probability of the likeliest outcome; nan where the bin is empty
+    confidence: np.ndarray  # (bins,) mean probability of the likeliest outcome, nan in empty bins
     accuracy: np.ndarray  # (bins,) share of the items in which that outcome came true
-    items: np.ndarray  # (bins,) how many, weighted
+    items: np.ndarray  # (bins,) number of items, weighted
 
 
 def reliability(
@@ -198,8 +201,8 @@ def reliability(
     Args:
         confidence: Probability of the likeliest outcome, `(n,)`.
         right: Whether it came true, bool `(n,)`.
-        weight: Of the items, `(n,)`; 1 where not given.
-        bins: How many, of equal width in [0, 1].
+        weight: Weights of the items, `(n,)` (default: 1).
+        bins: Number of bins of equal width in [0, 1].
     """
     w = np.ones(len(right)) if weight is None else weight
     place = np.minimum((confidence * bins).astype(int), bins - 1)
@@ -211,7 +214,7 @@ def reliability(
 def calibration_error(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> float:
-    """Expected calibration error: the mean over items of |accuracy - confidence| of the bin that they are in.
+    """Expected calibration error: the mean over items of |accuracy - confidence| of their bins.
 
     The arguments are those of `reliability`.
 
@@ -224,12 +227,12 @@ def calibration_error(
 
 
 def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Area under the ROC curve: the probability that a positive item scores above a negative one; ties count half.
+    """Area under the ROC curve: the probability that a positive item scores above a negative one. Ties count half.
 
     Args:
         positive: bool `(n,)`.
         score: `(n,)`.
-        weight: Of the items, `(n,)`; 1 where not given.
+        weight: Weights of the items, `(n,)` (default: 1).
     """
     w = np.ones(len(score)) if weight is None else weight
     _, place = np.unique(score, return_inverse=True)
@@ -239,7 +242,7 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
 
 
 def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """The weighted median: the mean of the lower and the upper one; nan without any weight."""
+    """The weighted median, which is the mean of the lower and the upper median, or nan if there is no weight."""
     w = np.ones(len(values)) if weight is None else weight
     order = np.argsort(values, kind="stable")
     upto = np.cumsum(w[order])
@@ -250,7 +253,7 @@ def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
 
 
 def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Mean over the classes that occur of the share of each that is predicted rightly."""
+    """Mean over the classes that occur of the share of their items that are predicted correctly."""
     w = np.ones(len(target)) if weight is None else weight
     shares = []
     for label in np.unique(target):
@@ -261,10 +264,10 @@ def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndar
 
 
 def best_threshold(score: np.ndarray, positive: np.ndarray) -> float:
-    """The threshold on a score above which `positive` is said with the best balanced accuracy.
+    """The threshold above which a score predicts `positive` with the best balanced accuracy.
 
-    Without both classes in sight nothing can be chosen: then halfway between 0 and the smallest positive score, or
-    above all scores if there is none.
+    If only one class occurs, the threshold is half the smallest score (all are positive) or twice the largest score
+    (none is positive).
     """
     if positive.all():
         return float(score.min()) / 2
@@ -284,8 +287,8 @@ def bootstrap(
     Args:
         groups: The group of each item, `(n,)`.
         statistic: Maps item weights `(n,)` to a value or array of values.
-        num: How many draws.
-        seed: Of the draws.
+        num: Number of draws.
+        seed: Seed of the draws.
 
     Returns:
         `(num, ...)` values.

@@ -1,4 +1,4 @@
-"""Predictions on held-out objects, the baselines, and their errors per item."""
+"""Predictions on held-out objects, baselines, and their errors per item."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from sts_jax.evaluation import metrics
 
 
 class Predicted(NamedTuple):
-    """The predicted last moment of `n` trajectories; None for a quantity that is not predicted.
+    """The predicted last moment of `n` trajectories. Quantities that are not predicted are None.
 
     With samples, `visual` and `tactile` are their means and `pose` is a point prediction.
     """
@@ -22,7 +22,7 @@ class Predicted(NamedTuple):
     tactile: np.ndarray | None = None  # (n, height, width, 3), float in [0, 1] or uint8
     pose: np.ndarray | None = None  # float (n, 7)
     outcome: np.ndarray | None = None  # int (n,), physics.Outcome
-    samples: "Predicted | None" = None  # k draws of the whole prediction: (k, n, ...); None if it is deterministic
+    samples: "Predicted | None" = None  # k draws of the whole prediction, (k, n, ...), or None if it is deterministic
     outcome_probability: np.ndarray | None = None  # float (n, c), in the order of `scenario.outcomes`
 
 
@@ -32,14 +32,14 @@ def first(predicted: Predicted, count: int) -> Predicted:
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:
-    """One prediction for the items of several, in order; all predict the same quantities."""
+    """One prediction for the items of several predictions of the same quantities, in order."""
     return _mapped(np.concatenate, parts)
 
 
 def _mapped(
     function: Callable[[Sequence[np.ndarray], int], np.ndarray], parts: Sequence[Predicted], axis: int = 0
 ) -> Predicted:
-    """Apply a function of some arrays and their axis of items to every quantity of some predictions."""
+    """Apply a function of several arrays and their axis of items to every quantity of several predictions."""
 
     def apply(leaves: Sequence[np.ndarray | None]) -> np.ndarray | None:
         there = [leaf for leaf in leaves if leaf is not None]
@@ -57,9 +57,9 @@ def _mapped(
 
 
 class Scores(NamedTuple):
-    """Errors of one predictor, per item; None where it does not predict the quantity.
+    """Errors of one predictor, per item. The errors of quantities that it does not predict are None.
 
-    The last fields belong to predicted distributions. A deterministic position has an energy score too: its error.
+    The last fields are for predicted distributions. The energy score of a deterministic position is its error.
     """
 
     visual: metrics.ImageError | None
@@ -72,9 +72,9 @@ class Scores(NamedTuple):
     outcome: np.ndarray | None  # int (n,)
     energy: np.ndarray | None = None  # m (n,), energy score of the position
     coverage: np.ndarray | None = None  # (n,), see `metrics.coverage`
-    best: metrics.ImageError | None = None  # visual, of each item's sample with the smallest excess
-    gradient: np.ndarray | None = None  # (n,) gradient energy of visual samples, their mean; else of the image
-    gradient_target: np.ndarray | None = None  # (n,) that of the true images
+    best: metrics.ImageError | None = None  # visual error of each item's sample with the smallest excess
+    gradient: np.ndarray | None = None  # (n,) gradient energy of the image, or mean over the visual samples
+    gradient_target: np.ndarray | None = None  # (n,) gradient energy of the true images
     log_loss: np.ndarray | None = None  # nats (n,), of the outcome
     confidence: np.ndarray | None = None  # (n,) probability of the likeliest outcome
     right: np.ndarray | None = None  # bool (n,), whether that outcome came true
@@ -89,7 +89,7 @@ CEILINGS = (CEILING, ONE_REROLL)
 
 
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """`scenario.outcome` of poses `(n, 7)`, true or predicted."""
+    """`scenario.outcome` of first and last poses `(n, 7)`, true or predicted."""
     return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
 
 
@@ -99,27 +99,27 @@ def shares(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarr
     One more sample is spread evenly over the outcomes, so that no probability is 0.
 
     Args:
-        outcome: int `(k, n)`, of each sample.
-        outcomes: `scenario.outcomes`, the columns.
+        outcome: Outcome of each sample, int `(k, n)`.
+        outcomes: `scenario.outcomes`, in the order of the columns.
     """
     counts = (outcome[..., None] == np.array([int(one) for one in outcomes])).sum(0)
     return (counts + 1 / len(outcomes)) / (len(outcome) + 1)
 
 
 def frequency(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarray:
-    """How often each outcome occurs `(c,)`, with one more item that is spread evenly, so that none is 0.
+    """Frequency of each outcome `(c,)`, with one more item that is spread evenly, so that no frequency is 0.
 
     Args:
-        outcome: int `(n,)`, of training trajectories.
+        outcome: Outcomes of training trajectories, int `(n,)`.
         outcomes: `scenario.outcomes`.
     """
     return shares(outcome[:, None], outcomes)[0]
 
 
 def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
-    """The outcome of freefall as an image shows it: off the pad where it is closer to the empty one than a threshold.
+    """The outcome of freefall from an image: `FELL_OFF` if its distance from the empty image is at most a threshold.
 
-    How a thing lies that is still on the pad is not read from images: there is no outcome of other scenarios.
+    The outcomes of other scenarios depend on how an object lies on the pad, which is not read from images.
     """
     empty = emptiness(visual, blank) <= threshold
     return np.where(empty, int(physics.Outcome.FELL_OFF), int(physics.Outcome.RESTS))
@@ -131,10 +131,11 @@ def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
-    """Predictions without learning: the mean target, the input itself, the nearest input's target, and a rule.
+    """Predictions without learning: the mean target, the input itself, the target of the nearest input, and a rule.
 
-    The neighbour is the training item whose first visual image is nearest in squared distance. With a condition, its
-    squared distance counts as much: both are divided by the training set's variance, the condition's number by number.
+    The neighbour is the training item whose first visual image is nearest in squared distance. The squared distance of
+    the condition, if there is one, has the same weight: both are divided by their variance in the training set, the
+    condition number by number.
 
     The rule keeps x, y and the orientation of the start, at the median height of the training objects that stay on
     the pad. It predicts no images.
@@ -193,14 +194,15 @@ def score(
 ) -> Scores:
     """Errors per item of a prediction of the last moment.
 
-    With `outcome_probability` and `frequency`, the outcome that is judged has the largest ratio of probability to
-    frequency. This decision has the best expected balanced accuracy: a rare outcome counts as much as a common one.
+    With `outcome_probability` and `frequency`, the outcome that is judged is the one with the largest ratio of
+    probability to frequency. This decision has the best expected balanced accuracy, in which a rare outcome counts as
+    much as a common one.
 
     Args:
-        predicted: Of all items, or of the first ones only.
+        predicted: Prediction of all items, or of the first ones only.
         test: The held-out items.
         outcomes: `scenario.outcomes`, for predictions with `outcome_probability`.
-        frequency: Of each outcome among training trajectories, from `frequency`.
+        frequency: Frequency of each outcome among training trajectories, from `frequency`.
 
     Raises:
         ValueError: `outcome_probability` has another number of columns than `outcomes`.
@@ -248,7 +250,7 @@ def score(
 
 
 def in_unit(image: np.ndarray) -> np.ndarray:
-    """Grey values in [0, 1], of floats in [0, 1] or of `uint8`."""
+    """Grey values in [0, 1] of an image of `uint8` or of floats in [0, 1]."""
     return image.astype(np.float32) / 255 if image.dtype == np.uint8 else image
 
 
@@ -259,11 +261,11 @@ def _with_probability(
     outcomes: Sequence[physics.Outcome],
     frequency: np.ndarray | None,
 ) -> Scores:
-    """The scores with those of the outcome's probabilities."""
+    """Add the scores of the outcome probabilities."""
     if probability.shape != (len(test.outcome), len(outcomes)):
         raise ValueError(
-            f"outcome_probability has shape {probability.shape}, expected {(len(test.outcome), len(outcomes))}: one "
-            "column for each of `outcomes`; pass outcomes=scenario.outcomes"
+            f"outcome_probability has shape {probability.shape}, expected {(len(test.outcome), len(outcomes))} (one "
+            "column for each of `outcomes`): pass outcomes=scenario.outcomes"
         )
     number = np.array([int(outcome) for outcome in outcomes])
     likeliest = number[probability.argmax(1)]

@@ -1,4 +1,4 @@
-"""The best possible prediction: the same start again and again, with other hidden values."""
+"""The best possible prediction, from repeated simulations of a start with other hidden values."""
 
 import concurrent.futures
 import os
@@ -17,8 +17,8 @@ from sts_jax.physics.scenarios import Shape, Start
 from sts_jax.physics.simulate import ATTEMPTS
 from sts_jax.sensor import Sensor
 
-RENDER_BATCH = 32  # frames drawn by one compiled call
-_SAME = 1e-4  # by which a first pose may differ from the start that was asked for (m; parts of a quaternion)
+RENDER_BATCH = 32  # frames rendered by one compiled call
+_SAME = 1e-4  # largest difference of a first pose from the given start (m, or entries of a quaternion)
 
 
 def ceiling(
@@ -30,24 +30,24 @@ def ceiling(
     *,
     progress: Callable[[int], object] | None = None,
 ) -> Predicted:
-    """What can be predicted from a first pose and condition alone: the ends with freshly drawn hidden values.
+    """The best prediction from a first pose and condition alone: ends with newly drawn hidden values.
 
     Each item's object is released at rest from its first pose, `times` times. The true end is another such draw, so
-    that this distribution is calibrated, and no predictor that sees shape, pose and condition has a better expected
-    log loss or excess than infinitely many re-rolls. Touch in the first moment reveals a part of the hidden values: a
+    that this distribution is calibrated, and no predictor from shape, pose and condition has a better expected log loss
+    or excess than infinitely many re-rolls. Touch in the first moment reveals a part of the hidden values, so that a
     model that uses it can exceed this ceiling.
 
     Args:
-        collection: Whose objects and scenario the items have.
-        sensor: What sees them.
-        test: The items. Ends are drawn as the collection draws them, and `dataset.reduced` where the items are.
-        times: Re-rolls of each.
-        key: Of the re-rolls.
+        collection: The collection of the items.
+        sensor: The sensor that renders the ends.
+        test: The items. Ends are rendered as in the collection, at the resolution of the items.
+        times: Number of re-rolls per item.
+        key: The random key of the re-rolls.
         progress: Called with the number of simulated re-rolls.
 
     Returns:
         Means over the re-rolls, `metrics.centre` of their poses, and the re-rolls as samples (images in `uint8`). The
-        outcome's probabilities are their `shares`.
+        outcome probabilities are their `shares`.
 
     Raises:
         ValueError: `times` is below 1.
@@ -65,7 +65,7 @@ def ceiling(
     first = np.asarray(traj.pose[:, 0]).reshape(len(test.object), times, 7)
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
-        raise RuntimeError(f"a re-roll began {off:.3g} from its item's first pose: simulate draws its starts otherwise")
+        raise RuntimeError(f"a re-roll began {off:.3g} from its item's first pose: simulate changed its keys")
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])
 
@@ -87,10 +87,10 @@ def ceiling(
 def _replayed(
     scenario: physics.Scenario, pose: np.ndarray, condition: np.ndarray, times: int, key: PRNGKeyArray
 ) -> Any:
-    """The scenario with given starts: trajectory j of body i begins at rest at `pose[i]`, whatever j.
+    """The scenario with given starts: every trajectory of body i begins at rest at `pose[i]`.
 
-    `simulate` takes no starts, it draws them from keys. The scenario finds the number of the body by comparing its key
-    with the keys of all bodies.
+    `simulate` does not accept starts but draws them from keys. The scenario therefore finds the index of the body by
+    comparing its key with the keys of all bodies.
     """
 
     @jax.jit
@@ -103,10 +103,10 @@ def _replayed(
     known, body = np.asarray(key_of(*index)), index[0]
 
     class Replayed(type(scenario)):  # type: ignore[misc]  # any of the scenarios
-        """Starts that are given instead of drawn."""
+        """A scenario whose starts are given instead of drawn."""
 
         def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-            """The start of the body whose key this is; not finite if there is none."""
+            """The start of the body with this key, not finite if there is none."""
             del shape, pad
             same = (jnp.asarray(known) == jax.random.key_data(key)).all(-1)
             mine = jnp.asarray(body)[jnp.argmax(same)]
@@ -125,9 +125,9 @@ def _drawn(
     wrench: np.ndarray,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both streams of all ends, `uint8`, object by object in calls of equal size; one thread a core.
+    """Render both streams of all ends (`uint8`), object by object, in calls of equal size and one thread per core.
 
-    Their height is that of the collection, or `size` if it is another one.
+    The images have the resolution of the collection, or are reduced to `size` if that is not its height.
     """
     same = size == collection.resolution[0]
     jobs = [

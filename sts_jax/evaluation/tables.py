@@ -1,4 +1,4 @@
-"""The figures of several predictors with their intervals, as numbers and as two tables: a short one and all of it."""
+"""Metrics of several predictors with their intervals, as numbers and as two tables, a short and a complete one."""
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -10,10 +10,10 @@ from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.report import BASELINES, CEILINGS, CONSTANT, Scores
 
-Statistic = Callable[[np.ndarray], float]  # of the items' weights
+Statistic = Callable[[np.ndarray], float]  # a function of the items' weights
 
 _DEGREES = 180 / np.pi
-# Of the complete table: heading, figure, factor, decimals, and whether the interval is shown.
+# Columns of the complete table: heading, metric, factor, decimals, and whether the interval is shown.
 _ALL = (
     ("visual BCE", "visual_bce", 1, 4, False),
     ("visual excess x1e-4", "visual_excess", 1e4, 1, False),
@@ -45,9 +45,9 @@ _COMPARED = {
     *(f"{stream}_skill{part}" for stream in ("visual", "tactile") for part in ("", "_object")),
     *("position_on_pad", "energy", "axis_on_pad", "outcome_log_loss"),
 }
-# The names of the figures of a predictor. Per stream BCE and excess (nats a pixel and channel) and skill, over all
-# pixels and over the target's object pixels; position and energy score (m), angle and angle of the up axes (rad) over
-# all items and over those that stayed on the pad; the outcome.
+# The names of the metrics of a predictor. BCE and excess (nats per pixel and channel) and skill of each stream are over
+# all pixels or over the target's object pixels. Position and energy score (m), angle and angle of the up axes (rad) are
+# over all items or over those that stayed on the pad. The rest are sharpness, coverage and outcome.
 FIGURES = (
     *(row[1] for row in _ALL),
     *(f"{stream}_{figure}_object" for stream in ("visual", "tactile") for figure in ("bce", "excess")),
@@ -55,20 +55,20 @@ FIGURES = (
 
 
 def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, seed: int = 0) -> dict:
-    """All figures of all predictors with 95 % intervals over objects, and the differences from the baselines.
+    """All metrics of all predictors with 95 % intervals over objects, and their differences from the baselines.
 
     Args:
-        scores: By name; the baselines must be among them. A predictor may have scores of the first items only; its
-            figures are then over these.
+        scores: Scores by name, including the baselines. A predictor may have scores of the first items only. Its
+            metrics are then over these.
         test: The items that were scored.
-        num: Bootstrap draws.
-        seed: Of the draws.
+        num: Number of bootstrap draws.
+        seed: Seed of the draws.
 
     Returns:
-        A JSON-able dictionary: `items`, `objects`, `outcomes`, `scored` (name -> number of items), `predictors`
-        (name -> figure -> value, low, high), and `differences` of the others from the baselines (name -> baseline ->
-        figure -> value, low, high), where a positive difference of skill and a negative difference of an error speak
-        for the predictor.
+        A dictionary for JSON: `items`, `objects`, `outcomes`, `scored` (name -> number of items), `predictors`
+        (name -> metric -> value, low, high), and `differences` of the others from the baselines (name -> baseline ->
+        metric -> value, low, high), where a positive difference of skill and a negative difference of an error favour
+        the predictor.
     """
     statistics = {name: _statistics(s, scores[CONSTANT], test) for name, s in scores.items()}
     scored = {name: _count(s, len(test.object)) for name, s in scores.items()}
@@ -103,17 +103,17 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
 
 
 def gain(before: Scores, after: Scores, test: Pairs, *, num: int = 2000, seed: int = 0) -> dict | None:
-    """The share of one predictor's log loss of the outcome that another one removes, with its 95 % interval.
+    """The share of the outcome's log loss of one predictor that another one removes, with its 95 % interval.
 
     Args:
         before: Scores of a predictor, for instance from vision.
         after: Scores of the other one, for instance from vision and touch.
         test: The items that were scored.
-        num: Bootstrap draws over objects.
-        seed: Of the draws.
+        num: Number of bootstrap draws over objects.
+        seed: Seed of the draws.
 
     Returns:
-        `value`, `low` and `high`; None if a predictor has no outcome probabilities.
+        `value`, `low` and `high`, or None if a predictor has no outcome probabilities.
     """
     if before.log_loss is None or after.log_loss is None:
         return None
@@ -133,13 +133,13 @@ def _cell(number: float, sample: np.ndarray) -> dict | None:
 
 
 def _count(s: Scores, items: int) -> int:
-    """How many items a predictor was scored on."""
+    """Number of items that a predictor was scored on."""
     errors = (error.excess for error in (s.visual, s.tactile) if error is not None)
     return next((len(x) for x in (*errors, s.position, s.outcome) if x is not None), items)
 
 
 def _statistics(s: Scores, constant: Scores, test: Pairs) -> dict[str, Statistic]:
-    """The figures of a predictor, each a function of the weights of its items."""
+    """The metrics of a predictor, each as a function of the weights of its items."""
     count = _count(s, len(test.object))
     truth = test.outcome[:count]
     stayed = truth != int(physics.Outcome.FELL_OFF)
@@ -186,12 +186,12 @@ def _median(values: np.ndarray, weight: np.ndarray, *, keep: np.ndarray) -> floa
 
 
 def table(summary: dict, *, title: str, rows: Sequence[str] | None = None, notes: Sequence[str] = ()) -> str:
-    """The main figures as Markdown, eight columns wide.
+    """The main metrics as a Markdown table of eight columns.
 
     Args:
-        summary: Of `summarise`.
+        summary: From `summarise`.
         title: The heading.
-        rows: Which predictors, in which order; all where not given.
+        rows: Names of the predictors, in order (default: all).
         notes: Lines below the table.
     """
     heads = (
@@ -225,7 +225,7 @@ def table(summary: dict, *, title: str, rows: Sequence[str] | None = None, notes
 
 
 def full_table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
-    """Every figure of every predictor as Markdown, then the differences from the baselines."""
+    """All metrics of all predictors as a Markdown table, followed by the differences from the baselines."""
     explained = (
         "BCE and excess are nats a pixel and channel; skill is 1 - excess / excess of the constant. The best sample is "
         "each item's sample with the smallest visual excess: it is chosen with the truth in sight. Sharpness is the "

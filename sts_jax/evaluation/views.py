@@ -1,4 +1,4 @@
-"""Pictures of an object at a pose, seen by a bystander."""
+"""Pictures of an object and the pad from outside."""
 
 import functools
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, ScalarLike
 from sts_jax import geometry, optics
 from sts_jax.objects import Body
 
-_THICKNESS = 0.012  # m, how much of the sensor's housing is drawn
+_THICKNESS = 0.012  # m, thickness of the part of the sensor's housing that is drawn
 _PAD = optics.to_linear(jnp.array([178.0, 178.0, 204.0]) / 255)
 _HOUSING = jnp.array([0.05, 0.05, 0.055])
 
@@ -25,13 +25,13 @@ def outside(
     *,
     resolution: tuple[int, int] = (160, 160),
 ) -> Float[Array, "h w 3"]:
-    """A picture of the object and the pad from outside, three-quarter view.
+    """Render the object and the pad from outside, in a three-quarter view.
 
     Args:
         body: The object.
         pose: Mesh frame in the sensor frame.
-        size: Of the pad along x and y (m), `(2,)`.
-        up: The vertical in the sensor frame, of any length: the pad is shown as tilted as it is; level if not given.
+        size: Size of the pad along x and y (m), `(2,)`.
+        up: The vertical in the sensor frame, of any length, which gives the tilt of the pad (default: level).
         wall: Height of a stop wall at the pad's edge of largest y (m).
         resolution: (height, width), pixels.
 

@@ -1,4 +1,4 @@
-"""A multimodal variational autoencoder with a product of experts; it knows nothing of sensors."""
+"""A multimodal variational autoencoder with a product of experts, independent of the sensor."""
 
 from sts_jax.mvae.conv import conv, conv_transpose
 from sts_jax.mvae.elbo import Terms, decode, infer, loss, predict

@@ -1,9 +1,9 @@
-"""Convolutions and their transposes, with gradients that are quick on a CPU.
+"""Convolutions and transposed convolutions with gradients that are fast on a CPU.
 
-XLA's CPU back end is slow wherever a convolution has `lhs_dilation`: in transposed convolutions, and in the
-gradients of strided ones. Here none has one. Stride 1 needs none, and on small grids a Fourier transform replaces most
-of the products. Arrays are channels last, `(batch, height, width, channel)`; kernels are `(size, size, in, out)` and
-`size` is a multiple of `stride`.
+XLA's CPU backend is slow for convolutions with `lhs_dilation`, which transposed convolutions and the gradients of
+strided convolutions have. The convolutions here avoid it. Stride 1 does not need it, and on small grids a Fourier
+transform replaces most of the products. Arrays are `(batch, height, width, channel)`. Kernels are
+`(size, size, in, out)`, where `size` is a multiple of `stride`.
 """
 
 import functools
@@ -14,20 +14,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
-_FEW = 16  # channels
-_SMALL = 144  # pixels of the larger image up to which a dense Fourier transform costs less than it saves
+_FEW = 16  # channels, below which other forms are faster
+_SMALL = 144  # pixels of the larger image, up to which a dense Fourier transform is faster
 
 
 def conv(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
-    """Convolution as networks have it (correlation), `y[i] = sum_a x[stride i + a - padding] kernel[a]`.
+    """Convolution as in neural networks (correlation), `y[i] = sum_a x[stride i + a - padding] kernel[a]`.
 
     Args:
-        x: the input; outside of it is zero.
-        kernel: `size` a multiple of `stride`.
+        x: the input, zero outside.
+        kernel: `size` is a multiple of `stride`.
         stride: pixels between two outputs.
-        padding: zeros added on each side; at most `size - 1`.
+        padding: zeros added on each side, at most `size - 1`.
 
     Returns:
         `ho = (h + 2 padding - size) // stride + 1` rows, columns likewise.
@@ -46,7 +46,7 @@ def conv_transpose(
 
     Args:
         x: the input.
-        kernel: `size` a multiple of `stride`; `in` is the number of channels of `x`.
+        kernel: `size` is a multiple of `stride`, and `in` is the number of channels of `x`.
         stride: pixels of the output per pixel of the input.
         padding: rows and columns cut from each side of the output.
 
@@ -64,10 +64,10 @@ def conv_transpose(
 def _fourier(height: int, width: int, size: int, padding: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Real matrices A, B, C that turn a convolution at stride 1 into one product per row.
 
-    `y = C^T ((A x) (B k))` is the transposed convolution and `x = A^T ((C y) (B k))` the convolution, since the
-    transform of the wide image, `height + size - 1` by `width + size - 1`, has room for all of it. A complex product
-    takes three real ones (Gauss), and half of the frequencies suffice for real images: for 5x5 pixels and 4x4 taps 94
-    products replace 400.
+    `y = C^T ((A x) (B k))` is the transposed convolution and `x = A^T ((C y) (B k))` the convolution, because the
+    transform has the size of the wide image, `height + size - 1` by `width + size - 1`, and nothing wraps around. A
+    complex product takes three real ones (Gauss), and half of the frequencies suffice for real images. For 5x5 pixels
+    and 4x4 taps, 94 products replace 400.
 
     Args:
         height: of the narrow image.
@@ -76,7 +76,7 @@ def _fourier(height: int, width: int, size: int, padding: int) -> tuple[np.ndarr
         padding: rows and columns that the wide image lacks on each side.
 
     Returns:
-        A for the narrow image, B for the kernel, C for the wide image; a row per product, a column per pixel.
+        A for the narrow image, B for the kernel, C for the wide image, with a row per product and a column per pixel.
     """
     n, m = height + size - 1, width + size - 1
     u, v = np.divmod(np.arange(n * m), m)
@@ -100,9 +100,9 @@ def _fourier(height: int, width: int, size: int, padding: int) -> tuple[np.ndarr
 
 
 def _bilinear(x: Array, kernel: Array, image: np.ndarray, taps: np.ndarray, back: np.ndarray) -> Array:
-    """`back^T ((image x) (taps kernel))`, flat in the pixels: `(batch, pixel, out)`."""
+    """`back^T ((image x) (taps kernel))` with the pixels on one axis, `(batch, pixel, out)`."""
     batch, h, w, channels = x.shape
-    # Rows first: both sides of every product, and of its derivatives, are then matrices as they lie in memory.
+    # With rows first, the factors of every product and of its derivatives are matrices as they lie in memory.
     spectrum = jnp.asarray(image, x.dtype) @ x.reshape(batch, h * w, channels).swapaxes(0, 1).reshape(h * w, -1)
     weights = jnp.asarray(taps, x.dtype) @ kernel.reshape(taps.shape[1], -1)
     y = jnp.matmul(spectrum.reshape(-1, batch, channels), weights.reshape(-1, channels, kernel.shape[3]))
@@ -121,7 +121,7 @@ def _conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> Array
 
 
 def _convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """`conv`; where channels are few, a block of `stride` x `stride` pixels is made one pixel first: quicker."""
+    """`conv`. With few channels, folding each block of `stride` x `stride` pixels into one pixel first is faster."""
     if stride > 1 and x.shape[3] < _FEW:
         size = kernel.shape[0]
         counts = [(n + 2 * padding - size) // stride + size // stride for n in x.shape[1:3]]
@@ -131,7 +131,7 @@ def _convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
 
 
 def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, width: int) -> Array:
-    """`conv_transpose`, cut or filled with zeros to the size asked for."""
+    """`conv_transpose`, cropped or padded with zeros to the given size."""
     size, _, _, out = kernel.shape
     if stride == 1:
         pads = [(size - 1 - padding, n - m + padding) for n, m in ((height, x.shape[1]), (width, x.shape[2]))]
@@ -139,7 +139,7 @@ def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, wid
         return jax.lax.conv_general_dilated(x, turned, (1, 1), pads, dimension_numbers=_LAYOUT)
     batch, h, w, _ = x.shape
     taps = size // stride
-    # One small convolution to all phases, interleaved.
+    # One small convolution computes all phases, which are then interleaved.
     phases = _fold_kernel(kernel.swapaxes(2, 3), stride).swapaxes(2, 3)[::-1, ::-1]
     y = jax.lax.conv_general_dilated(x, phases, (1, 1), [(taps - 1, taps - 1)] * 2, dimension_numbers=_LAYOUT)
     y = y.reshape(*y.shape[:3], stride, stride, out).transpose(0, 1, 3, 2, 4, 5)
@@ -148,7 +148,7 @@ def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, wid
 
 
 def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int) -> Array:
-    """`k[a, A, B] = sum_i wide[stride i + a - padding, A] narrow[i, B]`: either gradient in the kernel."""
+    """`k[a, A, B] = sum_i wide[stride i + a - padding, A] narrow[i, B]`, the kernel's gradient in both functions."""
     _, h, w, channels = narrow.shape
     if stride > 1:
         counts = [h + size // stride - 1, w + size // stride - 1]
@@ -156,7 +156,7 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
         return _unfold_kernel(folded, stride)
     wide = _cut(wide, -padding, h + size - 1, w + size - 1)
     if size > 2 or wide.shape[3] < _FEW:
-        sums = ("CHWN", "IHWO", "HWNC")  # the convolution sums over the batch, as if it were the channels
+        sums = ("CHWN", "IHWO", "HWNC")  # sum over the batch, in the place of the channels
         return jax.lax.conv_general_dilated(wide, narrow, (1, 1), "VALID", dimension_numbers=sums)
     flat = narrow.reshape(-1, channels)
     taps = [wide[:, a : a + h, b : b + w].reshape(len(flat), -1) for a in range(size) for b in range(size)]
@@ -165,7 +165,7 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
 
 
 def _cut(x: Array, start: int, height: int, width: int) -> Array:
-    """Rows and columns from `start` on, zero outside of the array."""
+    """Rows and columns from `start` on, zero outside the array."""
     before = max(-start, 0)
     after = [max(start + n - m, 0) for n, m in ((height, x.shape[1]), (width, x.shape[2]))]
     x = jnp.pad(x, ((0, 0), (before, after[0]), (before, after[1]), (0, 0)))
@@ -174,14 +174,14 @@ def _cut(x: Array, start: int, height: int, width: int) -> Array:
 
 
 def _fold(x: Array, stride: int, padding: int, counts: list[int]) -> Array:
-    """`counts` blocks of `stride` x `stride` pixels become pixels, their phases channels."""
+    """Turn `counts` blocks of `stride` x `stride` pixels into pixels, and the phases into channels."""
     h, w = counts
     x = _cut(x, -padding, stride * h, stride * w).reshape(len(x), h, stride, w, stride, -1)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(len(x), h, w, -1)
 
 
 def _fold_kernel(kernel: Array, stride: int) -> Array:
-    """The kernel that does on folded pixels what `kernel` does with `stride`."""
+    """The kernel that has the same result on folded pixels as `kernel` with `stride`."""
     size, _, channels, out = kernel.shape
     taps = size // stride
     kernel = kernel.reshape(taps, stride, taps, stride, channels, out).transpose(0, 2, 1, 3, 4, 5)

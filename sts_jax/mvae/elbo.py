@@ -1,14 +1,15 @@
 """The time-lagged evidence lower bound over all subsets of the modalities, and prediction.
 
-`L(x_t, x_T) = sum_{X} [ sum_{m asked of X} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
-over the non-empty subsets `X` (paper, "Learning Intuitive Physics with MVAEs"), to be minimised. `E_m` is the
-binary cross-entropy with logits of an image, summed over pixels and channels, or the mean squared error of a
-vector's components. The batch is averaged, subsets are summed, the expectation is one draw of `z`.
+`L(x_t, x_T) = sum_{X} [ sum_{m in asked(X)} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
+is minimised, where `X` runs over the non-empty subsets (paper, "Learning Intuitive Physics with MVAEs") and predicts
+the modalities `asked(X)`. `E_m` is the binary cross-entropy with logits of an image, summed over pixels and
+channels, or the mean squared error of a vector's components. The loss is averaged over the batch and summed over the
+subsets. One draw of `z` estimates the expectation.
 
-Non-empty is meant of what a sample has: a subset of which nothing is present has no posterior of its own and is left
-out for this sample. (Its posterior would be the prior, and decoders asked for the target from a random `z` learn to
-answer every `z` with a share of the mean target.) A sample of which nothing at all is present keeps them: there the
-mean target is what is to be learnt.
+A subset is empty for a sample if none of its modalities is present in the sample. It is then left out for this sample.
+(Its posterior would be the prior, and decoders that predict the target from a random `z` learn to answer every `z` with
+a share of the mean target.) A sample without any input keeps all subsets, because the mean target is then the right
+prediction.
 """
 
 from typing import Literal, NamedTuple
@@ -23,7 +24,7 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 
 
 class Terms(NamedTuple):
-    """Parts of a loss: means over the batch and over the subsets asked, before any weight."""
+    """The loss, and its unweighted parts as means over the batch and over the subsets that count."""
 
     loss: Float[Array, ""]
     kl: Float[Array, ""]  # nats
@@ -31,11 +32,11 @@ class Terms(NamedTuple):
 
 
 class _Group(NamedTuple):
-    """Subsets that are one once the absent modalities are taken out."""
+    """Subsets that are equal without the absent modalities."""
 
-    members: int  # bit m: modality m is in
+    members: int  # bit m is set if modality m is a member
     subsets: int
-    asked: tuple[int, ...]  # per modality, how many of the subsets are asked for it
+    asked: tuple[int, ...]  # for each modality, the number of subsets that predict it
 
 
 def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...], *, empty: bool) -> list[_Group]:
@@ -69,29 +70,29 @@ def loss(
     """The negative bound of one batch (module docstring), in training mode.
 
     Each modality is encoded once. Subsets that are equal without the `absent` modalities are computed once and
-    weighted by their number, so `absent` changes the time and not the loss. A subset falls back, sample by sample,
-    to those of its modalities that are present. All subsets are decoded in one stacked call: its batch statistics
-    are shared, weighted like the subsets. The noise of a sample belongs to the modalities that are left of a
-    subset, so that equal subsets draw the same `z`.
+    weighted by their number, so `absent` changes the time and not the loss. In each sample, a subset is reduced to its
+    modalities that are present. All subsets are decoded in one stacked call and share batch statistics, weighted like
+    the subsets. The noise of a sample depends on the modalities that remain of a subset, so that equal subsets draw the
+    same `z`.
 
     Args:
         graphdef: definition of the model.
-        params: its parameters.
-        stats: its running batch statistics.
-        key: consumed: the noise of `z`.
-        inputs: `x_t` by name, `(batch, *shape)`, images in [0, 1]; one not given is as if in `absent`.
+        params: parameters.
+        stats: running batch statistics.
+        key: consumed for the noise of `z`.
+        inputs: `x_t` by name, `(batch, *shape)`, images in [0, 1]. A missing input counts as `absent`.
         targets: `x_T` by name, all of them.
-        present: which inputs count, by name; one not given counts always. The values of those that do not
-            count, NaN among them, have no influence.
-        target_present: the same of the targets; a missing one adds nothing to the sum, the mean stays over
-            the whole batch.
-        condition: `(batch, condition)`; needed where the model has one.
+        present: which samples have an input, by name. Without a mask all have it. Masked values have no influence, even
+            NaN.
+        target_present: the same for the targets. A missing target adds nothing to the sum, and the mean is still taken
+            over the whole batch.
+        condition: `(batch, condition)`, required if the model has one.
         beta: weight of the divergence.
-        asked: `all`: every subset for every target; `own`: each subset for its own modalities (paper's code).
+        asked: `all`: every subset predicts every target. `own`: each subset predicts its own modalities (paper's code).
         absent: names of modalities that are present in no sample.
 
     Returns:
-        The loss, the new statistics (same structure) and its parts.
+        The loss, and the pair of the new batch statistics (same structure) and the parts of the loss.
     """
     model = nnx.merge(graphdef, params, stats, copy=True)
     config = model.config
@@ -100,7 +101,7 @@ def loss(
     batch = len(next(iter(targets.values())))
     experts, mask = _experts(model, inputs, present or {}, absent, batch, training=True)
 
-    groups = _groups(config, asked, absent, empty=bool(present))  # a sample may have nothing only where masks say so
+    groups = _groups(config, asked, absent, empty=bool(present))  # only a mask can leave a sample without input
     members = jnp.array([[bool(g.members >> i & 1) for i in range(len(config.names))] for g in groups])
     left = members[:, :, None] & mask[None]
     counts = jnp.any(left, axis=1) | ~jnp.any(mask, axis=0)[None]  # (group, batch)
@@ -135,26 +136,27 @@ def infer(
     *,
     present: dict[str, Bool[Array, "batch"]] | None = None,
 ) -> Gaussian:
-    """The fused posterior `q(z | X)` under the running batch statistics.
+    """The fused posterior `q(z | X)` with the running batch statistics.
 
     Args:
         graphdef: definition of the model.
         state: parameters and statistics, `nnx.merge_state(params, stats)`.
-        inputs: what is given, by name, `(batch, *shape)`, images in [0, 1]; at least one.
-        present: which samples of an input count; one not given counts always. Where none does, it is the prior.
+        inputs: at least one modality by name, `(batch, *shape)`, images in [0, 1].
+        present: which samples have an input, by name. Without a mask all have it. A sample without inputs has the
+            prior.
 
     Returns:
         Mean and log variance, `(batch, latent)`.
 
     Raises:
-        ValueError: nothing is given, or a name is unknown.
+        ValueError: there is no input, or a name is unknown.
     """
     model = nnx.merge(graphdef, state)
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
         raise ValueError(
-            f"inputs named {list(inputs)}, masks {list(present or {})}; give at least one of "
-            f"{list(model.config.names)} and no other"
+            f"inputs are named {list(inputs)} and masks {list(present or {})}. Give at least one input, with "
+            f"names from {list(model.config.names)}"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
@@ -168,13 +170,13 @@ def decode(
     *,
     condition: Float[Array, "*batch condition"] | None = None,
 ) -> dict[str, Array]:
-    """Every modality from a latent, under the running batch statistics.
+    """Decode every modality from a latent, with the running batch statistics.
 
     Args:
         graphdef: definition of the model.
         state: parameters and statistics, `nnx.merge_state(params, stats)`.
-        z: any leading axes.
-        condition: the same leading axes; needed where the model has one.
+        z: latent, with any leading axes.
+        condition: with the same leading axes, required if the model has one.
 
     Returns:
         By name: logits of images (`jax.nn.sigmoid` gives the image) and values of vectors, `(*batch, *shape)`.
@@ -193,7 +195,7 @@ def predict(
     present: dict[str, Bool[Array, "batch"]] | None = None,
     condition: Float[Array, "batch condition"] | None = None,
 ) -> tuple[dict[str, Array], Gaussian]:
-    """What is expected from any subset of the inputs: `decode` of the mean of `infer`; arguments as there."""
+    """Predict from any subset of the inputs, by `decode` of the mean of `infer`. The arguments are those of both."""
     posterior = infer(graphdef, state, inputs, present=present)
     return decode(graphdef, state, posterior.mean, condition=condition), posterior
 
@@ -202,14 +204,14 @@ def _check(
     config: Config, asked: str, absent: tuple[str, ...], targets: dict[str, Array], given: dict[str, Array]
 ) -> None:
     if asked not in ("all", "own"):
-        raise ValueError(f"asked={asked!r}; known are 'all' and 'own'")
+        raise ValueError(f"asked is {asked!r}, but it must be 'all' or 'own'")
     if set(absent) - set(config.names):
-        raise ValueError(f"absent={absent}; the model has {config.names}")
+        raise ValueError(f"absent is {absent}, but the model has only {config.names}")
     unknown = sorted(set(given) - set(config.names))
     if unknown:
-        raise ValueError(f"inputs or masks named {unknown}; the model has {config.names}")
+        raise ValueError(f"inputs or masks are named {unknown}, but the model has only {config.names}")
     if set(targets) != set(config.names):
-        raise ValueError(f"targets named {sorted(targets)}; the model needs {sorted(config.names)}")
+        raise ValueError(f"targets are named {sorted(targets)}, but the model needs {sorted(config.names)}")
 
 
 def _over(mask: Array, like: Array) -> Array:
@@ -226,7 +228,7 @@ def _experts(
     *,
     training: bool,
 ) -> tuple[Gaussian, Array]:
-    """All experts, `(modality, batch, latent)`, and where they count, `(modality, batch)`."""
+    """All experts, `(modality, batch, latent)`, and the mask of those that are present, `(modality, batch)`."""
     nothing = jnp.zeros((batch, model.config.latent), jnp.float32)
     experts, masks = [], []
     for name in model.config.names:
@@ -242,7 +244,7 @@ def _experts(
 
 
 def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[int, ...]) -> Array:
-    """Standard normal noise `(group, batch, latent)`, a function of the modalities left to each sample."""
+    """Standard normal noise `(group, batch, latent)`, a function of the modalities that remain in each sample."""
     possible = sorted({part for g in groups for part in range(g.members + 1) if part & g.members == part})
     drawn = jnp.stack([jax.random.normal(jax.random.fold_in(key, p), shape[1:]) for p in possible])
     place = jnp.zeros(possible[-1] + 1, jnp.int32).at[jnp.array(possible)].set(jnp.arange(len(possible)))
@@ -254,14 +256,14 @@ def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[in
 def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
     width = 0 if condition is None else condition.shape[-1]
     if width != config.condition:
-        raise ValueError(f"condition of width {width}; the model has {config.condition}")
+        raise ValueError(f"condition has width {width}, but the model needs {config.condition}")
     if condition is None:
         return z
     return jnp.concatenate([z, jnp.broadcast_to(condition, (*z.shape[:-1], width))], axis=-1)
 
 
 def _error(modality: Modality, output: Array, target: Array) -> Array:
-    """Reconstruction error per leading axes."""
+    """Reconstruction error of each item of the leading axes."""
     if modality.kind == "image":
         error = jax.nn.softplus(output) - output * target
         return jnp.sum(error, axis=(-3, -2, -1))

@@ -1,4 +1,4 @@
-"""Diagonal Gaussians: the product of experts with its prior, the divergence from the prior, samples."""
+"""Diagonal Gaussians: the product of experts with the prior, and the divergence from the prior."""
 
 from typing import NamedTuple
 
@@ -16,17 +16,17 @@ class Gaussian(NamedTuple):
 def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"]) -> Gaussian:
     """The normalised product of the standard normal prior and of every expert that is present.
 
-    `q(z | X) = N(0, I) prod_{m in X} N(mean_m, var_m) / Z`, so with the precisions `T_m = 1 / var_m`
+    `q(z | X) = N(0, I) prod_{m in X} N(mean_m, var_m) / Z`. With the precisions `T_m = 1 / var_m`,
     `var = 1 / (1 + sum_m T_m)` and `mean = var sum_m T_m mean_m`. Without any expert it is the prior.
 
     Args:
-        experts: mean and log variance, `(modality, *batch, latent)`; an absent one may hold any finite number.
+        experts: mean and log variance, `(modality, *batch, latent)`. Absent ones may hold any finite numbers.
         present: which experts count, `(modality, *batch)`.
 
     Returns:
         The product, `(*batch, latent)`.
 
-    Source: the paper's equation for PoE; Wu and Goodman 2018, section 2.2.
+    Source: the paper's equation for PoE, and Wu and Goodman 2018, section 2.2.
     """
     precision = jnp.where(present[..., None], jnp.exp(-experts.log_var), 0)
     total = 1 + jnp.sum(precision, axis=0)

@@ -1,9 +1,9 @@
 """The paper's encoders and decoders as Flax NNX modules.
 
-Used functionally: `init` splits a model once into its definition, parameters and batch statistics;
-`flax.nnx.merge(graphdef, params, stats, copy=True)` puts it together again inside `jax.jit`.
+They are used functionally. `init` splits a model once into its definition, parameters and batch statistics, and
+`flax.nnx.merge(graphdef, params, stats, copy=True)` assembles it again inside `jax.jit`.
 
-Images are `(batch, height, width, channel)` in [0, 1] at the input and logits at the output; vectors are
+Images are `(batch, height, width, channel)`, in [0, 1] at the input and logits at the output. Vectors are
 `(batch, size)` at both.
 
 Source: the paper's supplement, "Network Architecture". Hidden widths are Wu and Goodman's (2018).
@@ -24,56 +24,58 @@ from sts_jax.mvae.conv import conv, conv_transpose
 from sts_jax.mvae.gaussian import Gaussian
 
 _SIZE = 4  # side of every kernel
-_LAYERS = ((2, 1), (2, 1), (2, 1), (1, 0))  # stride and padding of the encoder; the decoder's backwards
+_LAYERS = ((2, 1), (2, 1), (2, 1), (1, 0))  # stride and padding of the encoder, reversed in the decoder
 _EPSILON = 1e-5  # added to a variance
 _LOG_VAR_LIMIT = 8.0  # an encoder's variances lie within exp(-8) .. exp(8)
-# An untrained model uses a few of its latents only, with little noise; the others start near the prior and can grow.
-# With all of them in use the divergence (hundreds of nats) outweighs what an image can tell, and with noise as wide as
-# the prior's a decoder learns to ignore the latent: either way the posterior collapses before anything is learnt.
-_ACTIVE = 16  # latents in use at first
-_QUIET = 0.03  # kernels of the others, of an active one's
-_FIRST_LOG_VAR = -4.0  # of an active one
+# Only a few latents are active at initialisation, with little noise. The others start near the prior and can grow. If
+# all were active, the divergence (hundreds of nats) would outweigh the information of an image. If the noise were as
+# wide as the prior, a decoder would learn to ignore the latent. Both collapse the posterior before anything is learnt.
+_ACTIVE = 16  # active latents at initialisation
+_QUIET = 0.03  # kernels of the other latents, relative to those of an active one
+_FIRST_LOG_VAR = -4.0  # of an active latent at initialisation
 
 
 @dataclass(frozen=True)
 class Modality:
-    """One thing that is measured and predicted."""
+    """One quantity that is measured and predicted."""
 
     name: str
     kind: Literal["image", "vector"]
-    shape: tuple[int, ...]  # (height, width, channel), sides multiples of 8 and at least 32; or (size,)
-    weight: float = 1.0  # lambda of its reconstruction; the paper: 1 for images, 1000 for the pose
-    start: float = 0.5  # grey value that an image's decoder says at first: the background's saves many steps
+    shape: tuple[int, ...]  # (height, width, channel), sides >= 32 and multiples of 8, or (size,)
+    weight: float = 1.0  # lambda of its reconstruction (paper: 1 for images, 1000 for the pose)
+    start: float = 0.5  # grey value of an untrained image decoder. The background's saves many steps.
 
     def __post_init__(self) -> None:
         if not 0 < self.start < 1:
-            raise ValueError(f"{self.name}: start={self.start}; a grey value between 0 and 1, both excluded")
+            raise ValueError(f"{self.name}: start is {self.start}, but it must be a grey value > 0 and < 1")
         if self.kind == "vector" and len(self.shape) == 1 and self.shape[0] > 0:
             return
         if self.kind == "image" and len(self.shape) == 3:
             if all(side >= 32 and side % 8 == 0 for side in self.shape[:2]):
                 return
-            raise ValueError(f"{self.name}: image of {self.shape[:2]}; sides must be multiples of 8, at least 32")
-        raise ValueError(f"{self.name}: a {self.kind!r} of shape {self.shape}; known are image (h, w, c), vector (n,)")
+            raise ValueError(f"{self.name}: image of {self.shape[:2]}, but sides must be multiples of 8 and >= 32")
+        raise ValueError(
+            f"{self.name}: a {self.kind!r} of shape {self.shape}, but it must be an image (h, w, c) or a vector (n,)"
+        )
 
 
 @dataclass(frozen=True)
 class Config:
-    """What a model is made of; plain values, so `asdict` of it is JSON."""
+    """Configuration of a model, in plain values that JSON can hold."""
 
     modalities: tuple[Modality, ...]
     latent: int = 256  # paper
-    hidden: int = 512  # width between two fully connected layers; not in the paper
+    hidden: int = 512  # width between two fully connected layers (not in the paper)
     widths: tuple[int, ...] = (32, 64, 128, 256)  # paper
-    condition: int = 0  # width of the condition, concatenated to the latent; 0: none
+    condition: int = 0  # width of the condition, concatenated to the latent, 0 for none
     momentum: float = 0.9  # of the running batch statistics, per step
 
     def __post_init__(self) -> None:
         names = [m.name for m in self.modalities]
         if not names or len(set(names)) != len(names):
-            raise ValueError(f"modalities named {names}: give at least one, each name once")
+            raise ValueError(f"modalities are named {names}. Give at least one, and each name once")
         if len(self.widths) != len(_LAYERS):
-            raise ValueError(f"widths={self.widths}: give {len(_LAYERS)}, one per convolution")
+            raise ValueError(f"widths is {self.widths}, but it must have {len(_LAYERS)} numbers, one per convolution")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,12 +83,12 @@ class Config:
         return tuple(m.name for m in self.modalities)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain dictionaries and lists."""
+        """The configuration in plain dictionaries and sequences."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
-        """The inverse of `to_json`, also after a trip through a JSON file."""
+        """The inverse of `to_json`, also for values read from a JSON file."""
         modalities = tuple(Modality(**{**m, "shape": tuple(m["shape"])}) for m in values["modalities"])
         return cls(**{**values, "modalities": modalities, "widths": tuple(values["widths"])})
 
@@ -111,7 +113,7 @@ class _ToLatent(_Linear):
 
 
 class _FromLatent(_Linear):
-    """A decoder's first layer, from the latent with the condition behind it."""
+    """A decoder's first layer, from the latent followed by the condition."""
 
     def __init__(self, config: Config, size: int) -> None:
         super().__init__(config.latent + config.condition, size)
@@ -125,9 +127,9 @@ class _FromLatent(_Linear):
 class BatchNorm(nnx.Module):
     """Batch normalisation with a weight per sample.
 
-    Training: `mean = sum_n w_n mean_hw(x_n) / sum_n w_n`, the variance likewise, and the running statistics
-    become `momentum old + (1 - momentum) new`. Where no sample has weight, they stay and are used.
-    Evaluation (`weights=None`): the running statistics.
+    Training uses `mean = sum_n w_n mean_hw(x_n) / sum_n w_n` and the variance likewise, and updates the running
+    statistics to `momentum old + (1 - momentum) new`. If no sample has weight, these are used and stay unchanged.
+    Evaluation (`weights=None`) uses the running statistics.
     """
 
     def __init__(self, channels: int, *, momentum: float) -> None:
@@ -140,7 +142,7 @@ class BatchNorm(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch h w channel"], weights: Float[Array, "batch"] | None
     ) -> Float[Array, "batch h w channel"]:
-        """Normalise; with `weights`, by the statistics of this batch, which also enter the running ones."""
+        """Normalise. With `weights`, use the statistics of this batch and update the running ones."""
         mean, var = self.mean[...], self.var[...]
         if weights is not None:
             total = jnp.sum(weights)
@@ -178,7 +180,7 @@ class _ImageEncoder(nnx.Module):
 
 
 class _ImageDecoder(nnx.Module):
-    """A fully connected layer, then four transposed convolutions; the last one is linear and gives logits."""
+    """A fully connected layer, then four transposed convolutions, of which the last is linear and gives logits."""
 
     def __init__(self, modality: Modality, config: Config) -> None:
         channels = (*config.widths[::-1], modality.shape[2])
@@ -191,7 +193,7 @@ class _ImageDecoder(nnx.Module):
             ]
         )
         self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in channels[1:-1]])
-        # An untrained decoder says `start` nearly everywhere.
+        # so that the output of an untrained decoder is `start` nearly everywhere
         self.kernels[-1][...] *= 0.1
         self.bias = nnx.Param(jnp.full(channels[-1], math.log(modality.start / (1 - modality.start)), jnp.float32))
 
@@ -231,7 +233,7 @@ class _VectorDecoder(nnx.Module):
 class MVAE(nnx.Module):
     """One encoder and one decoder per modality.
 
-    `encode` and `decode` take a weight per sample for the batch statistics; `None` means evaluation.
+    `encode` and `decode` take a weight per sample for the batch statistics, or `None` for evaluation.
     """
 
     def __init__(self, config: Config) -> None:
@@ -246,15 +248,15 @@ class MVAE(nnx.Module):
         return self.encoders[name](x, weights)
 
     def decode(self, name: str, z: Array, weights: Array | None) -> Array:
-        """Logits of an image, or a vector, from the latent with the condition behind it."""
+        """Logits of an image, or a vector, from the latent followed by the condition."""
         return self.decoders[name](z, weights)
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
-    """A new model as `(graphdef, params, stats)`; consumes `key`.
+    """Create a model, `(graphdef, params, stats)`, and consume `key`.
 
-    Kernels are normal with variance `1 / fan_in`, biases 0, scales 1. All kernels are drawn in one call, since
-    each shape of a draw is a compilation.
+    Kernels are normal with variance `1 / fan_in`, biases 0, scales 1. All kernels are drawn in one call, because each
+    shape of a draw needs a compilation.
     """
     graphdef, params, stats = nnx.split(MVAE(config), nnx.Param, nnx.BatchStat)
     leaves, tree = jax.tree.flatten(params)
@@ -274,7 +276,7 @@ def _core(modality: Modality) -> tuple[int, int]:
 
 
 def _spread(shape: tuple[int, ...], fan_in: int) -> Array:
-    """A kernel before `init` has drawn it: its standard deviation."""
+    """The standard deviation of a kernel, in its place until `init` draws it."""
     return jnp.full(shape, 1 / math.sqrt(fan_in), jnp.float32)
 
 

@@ -1,4 +1,4 @@
-"""Objects: what falls on the sensor, made from a key or loaded from a mesh file."""
+"""Rigid objects that fall on the sensor, generated from a key or loaded from a mesh file."""
 
 from sts_jax.objects.body import (
     CATEGORIES,

@@ -1,4 +1,4 @@
-"""One rigid object as arrays: what is seen, what collides, what it weighs."""
+"""A rigid object as arrays: its visible surface, its collision geometry and its mass properties."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-# Padding classes. Two bodies of one class have leaves of equal shape, so whatever is compiled for one serves the
-# other. A padding face is (0, 0, 0): it has no area and covers no pixel. A padding vertex (of `vertices`, which are
-# as many as the faces, or of a hull) repeats the last one, so that extents need no mask; so does a padding hull. A
-# padding triangle of the interior has all corners in the origin: it bounds nothing.
+# Padding classes. Two bodies of one class have leaves of equal shape, so they share compiled programs. A padding face
+# is (0, 0, 0). It has no area and covers no pixel. Padding vertices and padding hulls repeat the last one, so that
+# extents need no mask. There are as many vertices as faces. A padding triangle of the interior has all corners at the
+# origin, so it encloses no volume.
 FACE_CLASSES = (1024, 4096, 16384, 131072)
 PART_CLASSES = (1, 8)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
-LEVEL_STEPS = 30  # halvings in the search for the contents' level: beyond float32's digits
+LEVEL_STEPS = 30  # bisection steps for the level of the contents, beyond the resolution of float32
 
 Direction = Float[Array | np.ndarray, "3"] | tuple[float, float, float]
 
@@ -26,51 +26,51 @@ CATEGORIES = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon"
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid object in its own mesh frame (m, kg), array leaves only.
+    """A rigid object in its own mesh frame (m, kg). All leaves are arrays.
 
-    The origin lies inside the convex hull; +z is the object's up axis where it has one. The albedo at a point is
-    its texture's value times its interpolated corner colour (as in glTF), in linear light.
+    The origin lies inside the convex hull. If the object has an up axis, it is +z. The albedo at a point is the
+    texture's value times the interpolated corner colour (as in glTF), in linear light.
 
-    Mass, centre of mass and inertia follow from the shell and from what fills the interior (`rigid`).
+    `rigid` computes mass, centre of mass and inertia from the shell and the contents.
     """
 
     vertices: Float[Array, "*n v 3"]  # m
     faces: Int[Array, "*n f 3"]  # counter-clockwise seen from outside
     normals: Float[Array, "*n f 3 3"]  # unit normal at each corner of each face
     colors: Float[Array, "*n f 3 3"]  # [0, 1], at each corner of each face
-    uv: Float[Array, "*n f 3 2"]  # [0, 1], texture coordinates of each corner; v = 0 is the texture's top row
+    uv: Float[Array, "*n f 3 2"]  # [0, 1], texture coordinates of each corner, v = 0 at the texture's top row
     texture: Float[Array, "*n t t 3"]  # [0, 1]
-    two_sided: Bool[Array, "*n"]  # open surfaces are seen from behind too
-    hulls: Float[Array, "*n p h 3"]  # m, vertices of the convex parts that collide; one, unless decomposed
+    two_sided: Bool[Array, "*n"]  # whether faces are visible from behind too, as on open surfaces
+    hulls: Float[Array, "*n p h 3"]  # m, vertices of the convex collision parts (one part unless decomposed)
     shell_mass: Float[Array, "*n"]  # kg, of the empty object
     shell_com: Float[Array, "*n 3"]  # m
     shell_inertia: Float[Array, "*n 3 3"]  # kg m^2, about the shell's centre of mass, mesh axes
-    interior: Float[Array, "*n i 3 3"]  # m, triangles of the closed surface that bounds the contents; zeros if solid
-    contents_density: Float[Array, "*n"]  # kg/m^3; 0 for solid things
-    category: Int[Array, "*n"]  # index into CATEGORIES, -1 for a loaded mesh
+    interior: Float[Array, "*n i 3 3"]  # m, triangles of the closed surface that bounds the contents, zeros if solid
+    contents_density: Float[Array, "*n"]  # kg/m^3, 0 for solid objects
+    category: Int[Array, "*n"]  # index into CATEGORIES, or -1 for an object of no category
 
     def check(self) -> None:
         """Raise an error unless this is one body that can be drawn and simulated. Runs on the host, not under `jit`.
 
         Raises:
-            ValueError: the body has leading axes, a value that is not finite, a face of a vertex that does not exist,
-                or an unknown category. The message names the field.
+            ValueError: the body has leading axes, a value that is not finite, a vertex index out of range, or an
+                unknown category. The message names the field.
         """
         if jnp.ndim(self.vertices) != 2:
             raise ValueError(
-                f"vertices has the shape {jnp.shape(self.vertices)}; one body has (v, 3). For several use jax.vmap"
+                f"vertices has the shape {jnp.shape(self.vertices)}, but one body has (v, 3): use jax.vmap for several"
             )
         for field in dataclasses.fields(self):
             values = np.asarray(getattr(self, field.name))
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 number = int((~np.isfinite(values)).sum())
                 which = f"is {values}" if values.ndim == 0 else f"has {number:,} values that are not finite"
-                raise ValueError(f"{field.name} {which}; all must be finite: repair the mesh, or leave the body out")
+                raise ValueError(f"{field.name} {which}, but all must be finite: repair the mesh, or omit the body")
         faces = np.asarray(self.faces)
         if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
             raise ValueError(
-                f"faces has indices from {faces.min()} to {faces.max()}; there are {len(self.vertices)} vertices, "
-                f"so they must be from 0 to {len(self.vertices) - 1}"
+                f"faces has indices from {faces.min()} to {faces.max()}, but with {len(self.vertices)} vertices they "
+                f"must be from 0 to {len(self.vertices) - 1}"
             )
         check_category(np.asarray(self.category).tolist())
 
@@ -99,17 +99,17 @@ class Body:
 
 
 def check_category(category: object) -> None:
-    """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1 for an object of none of them."""
+    """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1 for an object of no category."""
     number = np.asarray(category)
     if number.shape or number.dtype.kind not in "iu" or not -1 <= number < len(CATEGORIES):
         raise ValueError(
-            f"category is {category!r}; it must be from 0 to {len(CATEGORIES) - 1}, an index into objects.CATEGORIES, "
-            "such as CATEGORIES.index('mouse'), or -1 for an object of none of them"
+            f"category is {category!r}, but it must be from 0 to {len(CATEGORIES) - 1}, an index into "
+            "objects.CATEGORIES such as CATEGORIES.index('mouse'), or -1 for an object of no category"
         )
 
 
 def is_traced(tree: object) -> bool:
-    """Whether any leaf of a tree is traced, so that its values are not known."""
+    """Whether any leaf of a tree is a tracer, which has no concrete values."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -118,16 +118,16 @@ def _form(leaf: object) -> str:
 
 
 def stack(bodies: Sequence[Body]) -> Body:
-    """Bodies of one class as one `Body` with a leading axis, for `jax.vmap`.
+    """Stack bodies of one padding class into one `Body` with a leading axis, for `jax.vmap`.
 
     Args:
-        bodies: at least one body; all of the same classes.
+        bodies: at least one body, all of the same padding class.
 
     Returns:
         The leaves stacked along a new first axis.
 
     Raises:
-        ValueError: there is no body, or two bodies are of different classes.
+        ValueError: there is no body, or the bodies are of different classes.
     """
     if not bodies:
         raise ValueError("stack needs at least one body, got none")
@@ -136,14 +136,15 @@ def stack(bodies: Sequence[Body]) -> Body:
         if shape != shapes[0]:
             raise ValueError(
                 f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, hulls "
-                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}; body 0 has {len(bodies[0].faces)} "
-                f"faces, {bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class by itself"
+                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}, but body 0 has "
+                f"{len(bodies[0].faces)} faces, {bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class "
+                "separately"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 
 
 def mirror(body: Body) -> Body:
-    """The body's mirror image: y becomes -y in the mesh frame, for one body or with leading axes."""
+    """Mirror a body, with or without leading axes: y becomes -y in the mesh frame."""
     flip = jnp.array([1.0, -1, 1])
     corners = jnp.array([0, 2, 1])  # so that faces stay counter-clockwise from outside
     return dataclasses.replace(
@@ -163,17 +164,18 @@ def mirror(body: Body) -> Body:
 def rigid(
     body: Body, fill: ScalarLike, shell_scale: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mass, centre of mass and inertia of a body whose contents fill it to a share of the interior's volume.
+    """Mass, centre of mass and inertia of a body whose contents fill a share of its interior.
 
-    With the shell's mass m_s, centre c_s and inertia I_s, and the contents' volume V, centre c_c and second moments
-    C = int (r - c_c) (r - c_c)^T over them: m = s m_s + rho V, m c = s m_s c_s + rho V c_c, and by Steiner's theorem
-    I = s I_s + rho (tr(C) 1 - C) + both masses' parts about c.
+    Let the shell have mass m_s, centre c_s and inertia I_s, and the contents density rho, volume V, centre c_c and
+    second moments C = int (r - c_c) (r - c_c)^T. With the shell scale s, m = s m_s + rho V and
+    m c = s m_s c_s + rho V c_c. By Steiner's theorem, I = s I_s + rho (tr(C) 1 - C) plus the terms of both masses
+    about c.
 
     Args:
         body: one body.
-        fill: share of the interior's volume, 0 to 1; clipped.
+        fill: share of the interior's volume, clipped to [0, 1].
         shell_scale: factor on the shell's mass.
-        up: unit vector in the mesh frame, away from where the contents have settled.
+        up: upward unit vector in the mesh frame. The contents have settled at the lowest end along it.
 
     Returns:
         mass (kg), centre of mass (m, mesh frame), inertia about the centre of mass (kg m^2, mesh axes).
@@ -193,18 +195,19 @@ def rigid(
 def fill_moments(
     interior: Float[Array, "i 3 3"], fill: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
-    """Volume, centre and central second moments of the lowest share of a closed mesh.
+    """Volume, centre and central second moments of a closed mesh filled from below to a share of its volume.
 
-    With a point of the liquid's surface as reference, the signed tetrahedra of the triangles clipped to the half-space
-    below it sum to the filled part: the surface itself adds nothing. Its level is found by bisection.
+    The triangles are clipped to the half-space below the liquid's surface. With a reference point on that surface,
+    their signed tetrahedra sum to the filled part, because the surface itself contributes nothing. Bisection finds
+    the level of the surface.
 
     Args:
-        interior: (i, 3, 3) m, closed, triangles counter-clockwise from outside; triangles without area are ignored.
-        fill: share of the volume, 0 to 1; clipped.
-        up: unit vector; what is lowest along it is filled.
+        interior: m, triangles of a closed surface, counter-clockwise from outside. Those without area have no effect.
+        fill: share of the volume, clipped to [0, 1].
+        up: upward unit vector. The mesh is filled from the lowest end along it.
 
     Returns:
-        m^3, m (the interior's middle where nothing is filled), m^5.
+        Volume (m^3), centre (m, the middle of the bounding box if nothing is filled), second moments (m^5).
     """
     up = jnp.asarray(up, interior.dtype)
     height = interior @ up
@@ -212,8 +215,9 @@ def fill_moments(
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
     def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        """Volumes and corners of the tetrahedra under a level, from a reference on it."""
-        # Of a triangle that crosses the level, the corner alone below is added, or the one alone above subtracted.
+        """Volumes and corners of the tetrahedra below a level, their reference point on it, and the total volume."""
+        # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
+        # adds the whole triangle and subtracts the piece at the corner above.
         reference = middle + (level - middle @ up) * up
         under = height < level
         count = jnp.sum(under, axis=1)
@@ -240,11 +244,11 @@ def fill_moments(
         return jnp.where(less, level, low), jnp.where(less, high, level)
 
     low, high = jax.lax.fori_loop(0, LEVEL_STEPS, halve, jax.lax.stop_gradient((bottom, top)))
-    # A step of Newton's with a constant slope: the derivative of the level that was found is that of the root.
+    # A Newton step with a constant slope gives the level the derivative of the exact root.
     found, slope = jax.value_and_grad(lambda level: below(level)[-1])((low + high) / 2)
     wide = slope > 0
     level = (low + high) / 2 + jnp.where(wide, (target - found) / jnp.where(wide, slope, 1), 0)
-    # Above the top everything is under the level, whatever rounding says of the highest corners.
+    # A full body takes a level above the top, so that rounding cannot leave its highest corners out.
     level = jnp.where(share < 1, level, top + (top - bottom))
     volumes, corners, reference, volume = below(level)
     total = jnp.sum(corners, axis=1)

@@ -1,7 +1,8 @@
-"""Collections of mesh files: ShapeNetSem as its users download it, or any folder of meshes with a class a sub-folder.
+"""Collections of mesh files: ShapeNetSem as downloaded, or any folder of meshes with one sub-folder per class.
 
-`library` lists and opens no mesh; `read` makes a `Body` of one item; `survey` reads all once, into a cache if there is
-one, and says in a line each what became of them. One bad object never stops a collection.
+`library` lists the items without opening a mesh. `read` loads one item as a `Body`. `survey` reads all items once,
+fills the cache if there is one, and lists each object with its size or its error. One bad object never stops a
+collection.
 """
 
 import csv
@@ -29,13 +30,13 @@ from sts_jax.objects.meshes import AXES, PAD, load, references, rotation
 from sts_jax.objects.procedural import STEEL
 from sts_jax.objects.solids import WALL, decompose, gaps
 
-LARGEST = 0.12  # m, longest side: what is larger is scaled down to it, so that it can lie on the 0.15 m pad
-THINNEST = 0.0005  # m, a hull thinner than this is a sheet, on which no contact is stable
-HOLLOW = 0.002  # m, a hull that stands off the surface by more is worth decomposing
-NUM_FACES = 4096  # of the padding classes, the one up to which rendering stays cheap
+LARGEST = 0.12  # m, longest side: larger objects are scaled down to it, so that they can lie on the 0.15 m pad
+THINNEST = 0.0005  # m, a hull thinner than this is a sheet, which has no stable contacts
+HOLLOW = 0.002  # m, a hull that stands off the surface by more than this is worth decomposing
+NUM_FACES = 4096  # largest padding class for which rendering stays cheap
 
-# ShapeNetSem's categories (the `category` column of its metadata.csv, named in its taxonomy.txt) by class. Its "Mouse"
-# is left out: it may be the animal, where "ComputerMouse" cannot.
+# Class of each of ShapeNetSem's categories (the `category` column of its metadata.csv, named in its taxonomy.txt).
+# "Mouse" is left out because, unlike "ComputerMouse", it may be the animal.
 SHAPENET_CLASSES = {
     "Bottle": "bottle",
     "BeerBottle": "bottle",
@@ -52,58 +53,58 @@ SHAPENET_CLASSES = {
     "Spoon": "spoon",
     "Watch": "watch",
 }
-# Of the columns that its README names, those that are needed: id, categories, directions, metres per unit.
+# The required columns among those in ShapeNetSem's README: id, categories, directions, metres per unit.
 _COLUMNS = ("fullId", "category", "up", "front", "unit")
-# What ShapeNet's own viewer takes where the table has no direction (ShapeNet/shapenet-viewer, Constants.scala).
+# Defaults of ShapeNet's own viewer for missing directions (ShapeNet/shapenet-viewer, Constants.scala).
 _UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 
-_SOLID = ("scissors", "fork", "spoon")  # classes that hold nothing and are of steel
-# What trimesh reads beside meshes: archives, points, drawings.
+_SOLID = ("scissors", "fork", "spoon")  # classes of solid steel objects
+# Formats other than meshes that trimesh reads: archives, points, drawings.
 _NO_MESH = {"zip", "gz", "tar.gz", "bz2", "tar.bz2", "xyz", "dxf", "svg", "json", "dict", "dict64", "msgpack", "xml"}
-# Meshes that trimesh reads with further packages, or not.
+# Mesh formats that trimesh reads only with further packages, or not at all.
 _OTHERS = {".3ds", ".3mf", ".blend", ".dae", ".fbx", ".step", ".stp", ".usd", ".usdz", ".wrl", ".x3d"}
-_FORMAT = 1  # of a cached object; one more whenever another body is made of the same file and settings
+_FORMAT = 1  # version of cached objects, increased whenever the same file and settings give a different body
 
 Vector = tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """One mesh file, and how it becomes a body."""
+    """One mesh file and the settings for loading it."""
 
     path: Path
-    name: str  # what it is listed by: the path within the folder, or ShapeNetSem's model id
+    name: str  # path within the folder, or ShapeNetSem's model id
     label: str  # class
     up: Vector  # direction in the file that becomes +z
     front: Vector  # direction in the file that becomes -y
-    scale: float | None = None  # m, of one unit of the file
+    scale: float | None = None  # m, length of one unit of the file
     longest_side: float | None = None  # m, instead of a scale
-    textures: Path | None = None  # where images lie that are not beside the file
-    stated: float | None = None  # m, the longest side by ShapeNetSem's table
+    textures: Path | None = None  # folder of images that are not beside the file
+    stated: float | None = None  # m, longest side according to ShapeNetSem's table
     notes: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Library:
-    """The objects of a folder: what there is, in a fixed order, and what was left out and why."""
+    """The objects of a folder in a fixed order, and the skipped files with the reasons."""
 
     folder: Path
     items: tuple[Item, ...]
     skipped: tuple[tuple[str, str], ...]  # (name, reason)
     classes: tuple[str, ...]  # of the items, sorted
-    cache: Path | None = None  # folder of what is made of the files
-    faces: int = NUM_FACES  # what has more is decimated
-    largest: float = LARGEST  # m
-    parts: bool = False  # whether what a hull fits badly collides as convex parts
+    cache: Path | None = None  # folder of the cached bodies
+    faces: int = NUM_FACES  # meshes with more are decimated
+    largest: float = LARGEST  # m, longer objects are scaled down
+    parts: bool = False  # whether objects that their hull fits badly collide as convex parts
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """What became of an item."""
+    """An item, loaded as a body."""
 
     item: Item
     body: Body
-    gaps: tuple[float, float]  # m, by which the surface sticks out of what collides, and what collides off the surface
+    gaps: tuple[float, float]  # m, how far the surface sticks out of the collision parts, and the reverse
     notes: tuple[str, ...]
 
 
@@ -118,30 +119,31 @@ def library(
     largest: float = LARGEST,
     parts: bool = False,
 ) -> Library:
-    """The objects of a folder, listed without opening a mesh.
+    """List the objects of a folder without opening a mesh.
 
-    A folder with a metadata.csv of ShapeNetSem's is read by that table: `unit` gives the size, `up` and `front` the
-    attitude, `category` one of CATEGORIES (see SHAPENET_CLASSES); the meshes are models-OBJ/models/ID.obj, the images
-    in models-textures/textures. In any other folder every mesh file is an object, whose class is the first sub-folder
-    on its way; files straight in the folder are of a class named after it.
+    A folder with ShapeNetSem's metadata.csv is read by that table. `unit` gives the size, `up` and `front` the
+    attitude, and `category` one of CATEGORIES (see SHAPENET_CLASSES). Meshes are expected at models-OBJ/models/ID.obj,
+    images in models-textures/textures. In any other folder, every mesh file is an object. Its class is the first
+    sub-folder of its path, or the name of the folder for a file directly in it.
 
     Args:
-        folder: where the objects are.
-        cache: a folder, made where it is missing, that keeps what is made of each file; None makes it each time.
-        scale: m, of one unit of the files; None takes ShapeNetSem's table, or one metre.
-        longest_side: m, to which every object is scaled; None keeps their sizes.
-        up: the files' axis that becomes +z; None takes ShapeNetSem's table, or "z", for glTF "y".
-        faces: what has more faces or vertices is decimated to so many.
-        largest: m; what is longer is scaled down to it.
-        parts: decompose into convex parts what its hull stands off by more than 2 mm; else all keep their hulls. It
-            takes some ten seconds an object and the package coacd.
+        folder: the folder of objects.
+        cache: folder that keeps the loaded bodies, created if it is missing. None loads the files each time.
+        scale: m, length of one unit of the files. None takes ShapeNetSem's table, or one metre.
+        longest_side: m, longest side to which every object is scaled. None keeps their sizes.
+        up: axis of the files that becomes +z. None takes ShapeNetSem's table, or else "y" for glTF and "z" for others.
+        faces: maximum number of faces and of vertices. Larger meshes are decimated.
+        largest: m. Longer objects are scaled down to it.
+        parts: whether objects whose hull stands off the surface by more than 2 mm are decomposed into convex parts.
+            This takes some ten seconds per object and needs the package coacd.
 
     Returns:
-        The list, sorted by class and name.
+        The library, sorted by class and name.
 
     Raises:
-        FileNotFoundError: no such folder.
-        ValueError: it holds no mesh, the table lacks columns or cannot be read.
+        FileNotFoundError: the folder does not exist.
+        ValueError: the folder has no usable mesh, the table lacks columns or cannot be read, or an argument is out of
+            range.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -209,7 +211,7 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
 
 
 def _shapenet_root(folder: Path) -> Path | None:
-    """The folder with the table: the one given or one in it, as the archive unpacks."""
+    """The folder with the table: the given folder, or a sub-folder as the archive unpacks it."""
     for table in (folder / "metadata.csv", *sorted(folder.glob("*/metadata.csv"))):
         if table.is_file():
             with table.open(encoding="utf-8", errors="replace", newline="") as lines:
@@ -238,15 +240,15 @@ def _tabled(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             continue
         try:
             if name in seen:
-                raise ValueError("its id stands twice in the table: the first row is taken")
+                raise ValueError("its id is in the table twice, and the first row is used")
             seen.add(name)
             if "_BAD" in categories:
                 raise ValueError("marked _BAD in the table")
             if len(labels) > 1:
-                raise ValueError(f"of several classes ({', '.join(sorted(labels))})")
+                raise ValueError(f"it has several classes ({', '.join(sorted(labels))})")
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
             if path is None:
-                raise ValueError(f"models-OBJ/models/{name}.obj is not there")
+                raise ValueError(f"models-OBJ/models/{name}.obj does not exist")
             items.append(_shapenet_item(row, path, name, labels.pop(), images))
         except ValueError as error:
             skipped.append((name, str(error)))
@@ -276,7 +278,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
 def _shapenet_item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:
     unit = row["unit"].strip()
     if not unit:
-        raise ValueError("its unit is missing, so that its size is unknown")
+        raise ValueError("its unit is missing, so its size is unknown")
     try:
         scale = float(unit)
     except ValueError:
@@ -285,8 +287,8 @@ def _shapenet_item(row: dict[str, str], path: Path, name: str, label: str, image
         raise ValueError(f"its unit is {unit!r}, not a positive number of metres")
     notes = [f"no {key} in the table: ShapeNet's default" for key in ("up", "front") if not row[key].strip()]
     up, front = _vector(row["up"], "up") or _UP, _vector(row["front"], "front") or _FRONT
-    rotation(up, front)  # says where they do not give one
-    # Its README calls these metres, the released table holds centimetres.
+    rotation(up, front)  # raises an error if they do not define a rotation
+    # ShapeNetSem's README gives these in metres, but the released table holds centimetres.
     sides = _vector(row.get("aligned.dims", ""), "aligned.dims")
     stated = None if sides is None else max(sides) / 100
     return Item(path, name, label, up, front, scale=scale, textures=images, stated=stated, notes=tuple(notes))
@@ -307,23 +309,22 @@ def _vector(text: str, key: str) -> Vector | None:
 
 
 def read(collection: Library, index: int) -> Entry:
-    """One item as a body, from the cache where it is kept, which is filled where it is not.
+    """Load one item as a body, through the cache if the library has one.
 
-    What had to be mended on the way (see `load`) is in the notes. Scissors, forks and spoons are solid and of steel;
-    everything else is a shell that may hold something. The body's category is the class where that is one of
-    CATEGORIES, else -1.
+    The notes list all repairs (see `load`). Scissors, forks and spoons are solid and of steel. All other objects are
+    shells with contents. The body's category is its class if that is one of CATEGORIES, and -1 otherwise.
 
     Args:
-        collection: of `library`.
-        index: into its items.
+        collection: a library from `library`.
+        index: index of the item.
 
     Returns:
-        The body and what there is to say of it.
+        The body with its gaps and notes.
 
     Raises:
-        ImportError: it has more faces than the library asks for, or is to be decomposed, without the package for it.
-        FileNotFoundError: the file is gone.
-        ValueError: no body can be made of it; the message says why.
+        ImportError: the package for decimation or decomposition is needed and not installed.
+        FileNotFoundError: the file does not exist any more.
+        ValueError: the file cannot be loaded as a body. The message gives the reason.
     """
     item = collection.items[index]
     if collection.cache is None:
@@ -337,14 +338,14 @@ def read(collection: Library, index: int) -> Entry:
 
 
 def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[list[Body], list[tuple[str, str]]]:
-    """Several items as bodies, leaving out what none can be made of.
+    """Load several items as bodies, and skip those that cannot be loaded.
 
     Args:
-        collection: of `library`.
-        indices: into its items; None is all.
+        collection: a library from `library`.
+        indices: indices of the items. None means all.
 
     Returns:
-        The bodies, and (name, reason) of each item that was left out.
+        The bodies, and (name, reason) of each skipped item.
     """
     made, skipped = [], []
     for index in range(len(collection.items)) if indices is None else indices:
@@ -357,15 +358,15 @@ def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[l
 
 
 def survey(collection: Library, *, progress: Callable[[str], None] | None = None) -> tuple[Library, str]:
-    """Reads every item once.
+    """Read every item once.
 
     Args:
-        collection: of `library`.
-        progress: called with each object's line as it is done.
+        collection: a library from `library`.
+        progress: called with the line of each object after it is read.
 
     Returns:
-        The library without what cannot be used, which has joined `skipped`; and a listing: how many there are of each
-        class, a line for each object, a line for each that was left out.
+        The library with the unusable items moved to `skipped`, and a listing: the number of objects of each class, a
+        line for each object and a line for each skipped item.
     """
     items, skipped, lines = [], list(collection.skipped), []
     for index, item in enumerate(collection.items):
@@ -392,7 +393,7 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
         head.append(
             "gaps: how far the surface sticks out of the hull at most / how far the hull stands off the surface"
         )
-    tail = [f"{len(usable.skipped)} lines on what was left out:", *(f"{name}: {why}" for name, why in usable.skipped)]
+    tail = [f"{len(usable.skipped)} lines on skipped files:", *(f"{name}: {why}" for name, why in usable.skipped)]
     return usable, "\n".join([*head, *lines, *(tail if usable.skipped else [])]) + "\n"
 
 
@@ -402,7 +403,7 @@ def describe(entry: Entry) -> str:
 
 
 def facts(body: Body, apart: tuple[float, float]) -> list[str]:
-    """Size (mm), faces, collision hull and gaps (mm) of a body, in words; `apart` (m) is what `gaps` gives."""
+    """Size (mm), faces, collision hull and gaps (mm) of a body, in words. `apart` (m) is the result of `gaps`."""
     size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
     drawn = int(np.asarray(body.faces).any(axis=1).sum())
     hulls = np.asarray(body.hulls)
@@ -416,13 +417,13 @@ def _tried(collection: Library, index: int) -> Entry | str:
     try:
         return read(collection, index)
     except ImportError:
-        raise  # this machine's fault, not the object's
-    except Exception as error:  # whatever else the many libraries underneath raise for a file nobody has checked
+        raise  # a missing package is no fault of the object
+    except Exception as error:  # the mesh libraries raise errors of many types for a damaged file
         return _short(error, item) or type(error).__name__
 
 
 def _short(message: object, item: Item) -> str:
-    """A message without the path that it begins with and that a listing names anyway."""
+    """A message without its path, because a listing names the object anyway."""
     return str(message).removeprefix(f"{item.path}: ").replace(f"{item.path.parent}{os.sep}", "").replace("\n", " ")
 
 
@@ -451,7 +452,7 @@ def _made(collection: Library, item: Item) -> Entry:
     shape = ConvexHull(np.asarray(body.hulls[0], float))
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:
-        raise ValueError(f"it is a sheet {thickness * 1e3:.2g} mm thick, too flat to lie or slide on anything")
+        raise ValueError(f"it is a sheet {thickness * 1e3:.2g} mm thick, which is too thin for stable contacts")
     apart = gaps(body)
     if collection.parts and apart[1] > HOLLOW:
         try:
@@ -462,7 +463,7 @@ def _made(collection: Library, item: Item) -> Entry:
     return Entry(item, body, apart, (*item.notes, *notes))
 
 
-# The cache: one file an object, under a name that changes with all it depends on.
+# The cache has one file per object. Its name is a hash of everything that the body depends on.
 
 
 def _key(collection: Library, item: Item) -> str:
@@ -474,7 +475,7 @@ def _key(collection: Library, item: Item) -> str:
     try:
         named = references(item.path, item.textures)
     except (OSError, ValueError):
-        named = {}  # `load` says what is wrong with it
+        named = {}  # `load` raises an error for it
     if not item.path.is_file():
         raise FileNotFoundError(f"{item.path}: no such mesh file")
     for name, path in [(item.path.name, item.path), *sorted(named.items())]:
@@ -483,7 +484,7 @@ def _key(collection: Library, item: Item) -> str:
 
 
 def _keep(place: Path, entry: Entry) -> None:
-    """Written under another name and renamed, so that a reader sees a whole file or none."""
+    """Write under a temporary name and rename, so that a reader sees a complete file or none."""
     place.parent.mkdir(parents=True, exist_ok=True)
     about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
@@ -499,4 +500,4 @@ def _kept(place: Path, item: Item) -> Entry | None:
             about = json.loads(data["about"].tobytes())
         return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None  # not there, or torn: it is made anew
+        return None  # missing or damaged: the body is loaded again

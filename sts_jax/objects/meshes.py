@@ -1,4 +1,4 @@
-"""Mesh files as bodies: any format trimesh reads, with its texture or colours."""
+"""Mesh files as bodies, in any format that trimesh reads, with textures or colours."""
 
 import json
 import os
@@ -17,11 +17,12 @@ from scipy.spatial import ConvexHull, KDTree
 from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body, check_category
 from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
 
-PAD = 0.15  # m, side of the sensor's pad: nothing larger fits
-SMALLEST = 0.005  # m, longest side: anything shorter has a wrong unit
-PLAIN = 0.7  # sRGB grey of a mesh that names no colour
+PAD = 0.15  # m, side of the sensor's pad, which larger objects do not fit
+SMALLEST = 0.005  # m, longest side of the smallest object: a shorter file probably has another unit
+PLAIN = 0.7  # sRGB grey of a mesh without colours
 
-# Up and front of a file whose up axis alone is given; front becomes -y. A glTF's front is its +z (its specification).
+# Up and front of a file for which only the up axis is given. Front becomes -y. The front of a glTF is +z (glTF
+# specification).
 AXES = {
     "x": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     "y": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -30,25 +31,25 @@ AXES = {
 
 
 def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "3 3"]:
-    """The rotation R that takes a file's up axis to +z and what of its front lies across it to -y.
+    """Rotation R that takes a file's up axis to +z and the component of its front orthogonal to up to -y.
 
     Args:
-        up: any length.
-        front: any length, not along `up`.
+        up: direction of any length.
+        front: direction of any length, not parallel to `up`.
 
     Returns:
-        R, proper: a point becomes R p.
+        R, a proper rotation: a point p becomes R p.
 
     Raises:
-        ValueError: an axis is not finite or zero, or both lie in one line.
+        ValueError: a direction is not finite or zero, or the two are parallel.
     """
     z, y = np.array(up, float), -np.array(front, float)
     if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
-        raise ValueError(f"up must be three finite numbers, not all zero, and front too, got {up} and {front}")
+        raise ValueError(f"up and front must be three finite numbers, not all zero, got {up} and {front}")
     z /= np.linalg.norm(z)
     across = y - (y @ z) * z
     if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(y):
-        raise ValueError(f"up {tuple(up)} and front {tuple(front)} lie in one line: which way the object looks is open")
+        raise ValueError(f"front is {tuple(front)} and up is {tuple(up)}, but they must not be parallel or zero")
     y = across / np.linalg.norm(across)
     return np.stack([np.cross(y, z), y, z])
 
@@ -71,47 +72,47 @@ def load(
     parts: bool = False,
     category: int = -1,
 ) -> Body:
-    """A mesh file as a body; a scene's meshes become one.
+    """Load a mesh file as a body. The meshes of a scene are merged into one.
 
-    The albedo is texture times corner colour, in linear light. Textures, 8-bit colours and an OBJ's `Kd` are taken as
-    sRGB, a glTF's factors and vertex colours as linear (its specification); a textured OBJ's `Kd` is ignored, alpha
-    too. Textures are stretched to the next square of TEXTURE_CLASSES; several are packed into one, where coordinates
-    outside [0, 1] are clipped instead of repeated. The mesh's frame keeps its axes (see `up`), with its origin moved
-    to the centroid of the collision hull: all of the convex hull, or the 64 vertices of it that matter most
-    (`hull_gap` gives what then sticks out). Surfaces that are not closed are seen from both sides.
+    The albedo is texture times corner colour, in linear light. Textures, 8-bit colours and the `Kd` of an OBJ are read
+    as sRGB, factors and vertex colours of a glTF as linear (glTF specification). The `Kd` of a textured OBJ and alpha
+    are ignored. A texture is stretched to the next square of TEXTURE_CLASSES. Several textures are packed into one,
+    where coordinates outside [0, 1] are clipped instead of repeated. The frame keeps the file's axes (see `up`), with
+    the origin at the centroid of the collision hull, which is the convex hull reduced to at most 64 vertices
+    (`hull_gap` gives the error). Surfaces that are not closed are visible from both sides.
 
     Args:
-        path: the file; what it refers to (materials, images) is found beside it.
-        longest_side: m, of the bounding box, to which the mesh is scaled; None keeps the file's size.
-        scale: m, of one unit of the file; None is a metre.
-        largest: m; a mesh whose longest side is longer is scaled down to it, with a warning.
-        mass: kg, spread over the surface, with no contents. None makes it a shell of `density` that holds
-            1,000 kg/m^3 (what of it is filled is given to `rigid`).
+        path: the file. Its materials and images are looked up beside it.
+        longest_side: m, longest side of the scaled bounding box. None keeps the file's size.
+        scale: m, length of one unit of the file. None means one metre.
+        largest: m, maximum of the longest side. A larger mesh is scaled down to it, with a warning.
+        mass: kg, spread over the surface of a body without contents. None gives a shell of `density` whose contents
+            have 1,000 kg/m^3 (`rigid` takes the fill level).
         density: kg/m^2 of the surface.
-        hollow: whether it holds something; False is a solid thing, all of whose mass is on its surface.
-        strict: refuse what is otherwise mended with a warning: a mesh that encloses no volume (its convex hull's is
-            taken), an OBJ that names a material or image that is not there (it is left out).
-        up: the file's axis, or a direction in it, that becomes +z; glTF files are made with "y".
-        front: the direction in the file that becomes -y, once `up` is a direction too.
-        texture: an image to use instead of what the file names, on the file's texture coordinates.
-        textures: another folder where the images that the file names may lie.
-        faces: decimate what has more faces or vertices to so many, with a warning; its colours are then sampled from
-            the texture, one to a corner, and the texture is left out. Needs the package fast-simplification.
-        parts: let it collide as convex parts instead of its hull (`decompose`). Needs the package coacd.
+        hollow: whether the object has contents. False gives a solid object with all its mass on the surface.
+        strict: whether to raise an error for defects that are otherwise repaired with a warning: a mesh that encloses
+            no volume (its convex hull's is used), and missing materials and images of an OBJ (they are left out).
+        up: axis of the file, or direction in it, that becomes +z. The convention of glTF files is "y".
+        front: direction in the file that becomes -y, by default (0, -1, 0). Only with an `up` that is a direction.
+        texture: image that replaces the file's own textures, with the file's texture coordinates.
+        textures: additional folder in which to look up the file's images.
+        faces: maximum number of faces and of vertices. A larger mesh is decimated with a warning, and its texture is
+            replaced by one colour per corner. Needs the package fast-simplification.
+        parts: whether the body collides as convex parts (`decompose`) instead of its hull. Needs the package coacd.
         category: index into CATEGORIES, or -1.
 
     Returns:
         The body.
 
     Raises:
-        FileNotFoundError: the file or the texture is not there; with `strict` also one that the file names.
-        ImportError: decimation or decomposition without its package.
+        FileNotFoundError: the file or the texture does not exist, or with `strict` a file that the mesh refers to.
+        ImportError: the package for decimation or decomposition is not installed.
         IsADirectoryError: the path is a folder.
         PermissionError: the file is not readable.
-        ValueError: the file is empty, truncated or no mesh, has no faces, NaN, too many faces, no extent in some
-            direction, is larger than the pad or smaller than 5 mm, is not closed and `strict` is set, or cannot be
-            decimated to `faces` or decomposed. `mass`, `density`, `category`, `faces`, a size or a
-            direction is out of range.
+        ValueError: the file is empty, truncated or not a mesh. The mesh has no faces, NaN, too many faces, no extent
+            in some direction, is larger than the pad or smaller than 5 mm, is not closed although `strict` is set, or
+            cannot be decimated to `faces` or decomposed. `mass`, `density`, `category`, `faces`, a size or a direction
+            is out of range.
     """
     path = Path(path)
     for name, value, unit in (
@@ -127,10 +128,10 @@ def load(
             raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
-            raise ValueError(f"{path}: {name} is {value} m, the pad is {PAD} m wide: give at most that")
+            raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most that")
         if value is not None and value < SMALLEST:
             raise ValueError(
-                f"{path}: {name} is {value} m, the smallest object is {SMALLEST} m long: give at least that"
+                f"{path}: {name} is {value} m, but the smallest object is {SMALLEST} m long: give at least that"
             )
     try:
         check_category(category)
@@ -142,7 +143,7 @@ def load(
         raise ValueError(f"{path}: faces must be a whole number, at least 4, got {faces!r}")
     if isinstance(up, str):
         if up not in AXES or front is not None:
-            raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers where front is given, got {up!r}")
+            raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers if front is given, got {up!r}")
         turn = rotation(*AXES[up])
     else:
         try:
@@ -155,31 +156,31 @@ def load(
     if sheet is None:
         _check_materials(path, images, strict)
     try:
-        # trimesh opens images inside; those of a folder of their own are found by a resolver that looks there last.
+        # trimesh opens the images itself, so only a resolver can make it look in a separate folder of images.
         resolver = None if images is None else _Resolver(path, images)
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
         # For text that is not UTF-8, trimesh imports a package that is not among its requirements.
         damaged = "it is truncated or damaged: replace it" if error.name == "charset_normalizer" else "install it"
-        raise ValueError(f"{path}: cannot be read as a mesh ({error}); {damaged}") from error
-    except Exception as error:  # trimesh raises whatever its many readers raise
+        raise ValueError(f"{path}: cannot be read as a mesh ({error}): {damaged}") from error
+    except Exception as error:  # trimesh's many readers raise errors of many types
         raise ValueError(
-            f"{path}: cannot be read as a mesh ({error}); is it complete, and its suffix right?"
+            f"{path}: cannot be read as a mesh ({error}): check that it is complete and has the right suffix"
         ) from error
     if not pieces:
-        raise ValueError(f"{path}: holds no faces; a mesh with triangles is needed")
+        raise ValueError(f"{path}: has no faces: give a mesh with triangles")
     for piece in pieces if sheet is not None else []:
         if getattr(piece.visual, "uv", None) is None:
             raise ValueError(
-                f"{path}: has no texture coordinates, so {texture} cannot be laid on it: leave texture out"
+                f"{path}: has no texture coordinates, so {texture} cannot be applied to it: leave texture out"
             )
         material = trimesh.visual.material.PBRMaterial(baseColorTexture=sheet)
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
     number = sum(len(piece.faces) for piece in pieces)
     if faces is None and number > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: {number:,} faces, at most {FACE_CLASSES[-1]:,} can be drawn: give faces= to decimate it"
+            f"{path}: has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: give faces= to decimate it"
         )
     corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
     if not np.isfinite(corners).all():
@@ -198,7 +199,7 @@ def load(
 def _check_file(path: Path) -> None:
     """Raise an error unless a file exists, is readable and not empty. An STL file must also be complete."""
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder; give a mesh file in it, or the folder to objects.library")
+        raise IsADirectoryError(f"{path}: is a folder: give a mesh file in it, or pass it to objects.library")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
     try:
@@ -215,18 +216,18 @@ def _check_file(path: Path) -> None:
         return
     if head.lstrip().startswith(b"solid") and b"facet" in head:
         if b"endsolid" not in tail:
-            raise ValueError(f"{path}: is truncated, its text ends without endsolid: replace it")
+            raise ValueError(f"{path}: is truncated, because its text ends without endsolid: replace it")
         return
-    number = int.from_bytes(head[80:84], "little")  # of triangles, of 50 bytes each
+    number = int.from_bytes(head[80:84], "little")  # triangles of 50 bytes each
     if size < 84 + 50 * number or size < 84:
         raise ValueError(
-            f"{path}: is truncated or no STL: it has {size:,} bytes, and a binary STL of {number:,} triangles has "
+            f"{path}: is truncated or not an STL. It has {size:,} bytes, but a binary STL of {number:,} triangles has "
             f"{84 + 50 * number:,}: replace it"
         )
 
 
 class _Surface(NamedTuple):
-    vertices: np.ndarray  # (v, 3), m; those at one place are one, whatever seams the colours have
+    vertices: np.ndarray  # (v, 3), m, without duplicates, even at seams of the colours
     faces: np.ndarray  # (f, 3)
     colors: np.ndarray  # (f, 3, 3)
     uv: np.ndarray  # (f, 3, 2)
@@ -238,22 +239,22 @@ def _factor(
 ) -> float:
     extent = float(np.ptp(corners, axis=(0, 1)).max())
     if not extent > 0:
-        raise ValueError(f"{path}: all vertices lie in one point")
+        raise ValueError(f"{path}: all vertices lie at one point")
     if longest_side is not None:
         return longest_side / extent
     factor = 1.0 if scale is None else scale
     extent *= factor
     if extent < SMALLEST:
         raise ValueError(
-            f"{path}: its longest side is {extent * 1e3:.2g} mm, and the smallest object is {SMALLEST * 1e3:g} mm "
-            "long: is its unit right? Give longest_side, or scale, the metres of one unit of the file"
+            f"{path}: its longest side is {extent * 1e3:.2g} mm, but the smallest object is {SMALLEST * 1e3:g} mm "
+            "long: check its unit and give longest_side, or scale, the metres of one unit of the file"
         )
     if largest is not None and extent > largest:
         warnings.warn(f"{path}: its longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(
-            f"{path}: longest side is {extent:.3g} m, the pad is {PAD} m wide: give longest_side in metres "
+            f"{path}: its longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side in metres "
             "(the file may be in millimetres)"
         )
     return factor
@@ -270,7 +271,7 @@ def _surface(
 
 
 def _proper(path: Path, surface: _Surface) -> _Surface:
-    """Without faces of no area and vertices of no face."""
+    """Remove faces without area and unused vertices."""
     faces = surface.faces
     proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not proper.any():
@@ -289,10 +290,10 @@ def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
         import fast_simplification
     except ImportError as error:
         raise ImportError(
-            f"{path}: {len(surface.faces):,} faces, and decimation needs the package fast-simplification, which is not "
-            "installed: pip install 'sts_jax[meshes]'"
+            f"{path}: has {len(surface.faces):,} faces, and decimation needs the package fast-simplification, which is "
+            "not installed: pip install 'sts_jax[meshes]'"
         ) from error
-    # Slivers, which nothing can be collapsed into, are welded first: by 1/1000 of the size and more.
+    # Slivers can block the decimation. If so, vertices are welded first, on a grid of 1/1000 of the size or coarser.
     for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
         vertices, faces = _welded(surface, weld)
         if len(faces) > target:
@@ -301,10 +302,11 @@ def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
             break
     else:
         raise ValueError(
-            f"{path}: {len(surface.faces):,} faces cannot be decimated to {target:,}: too many loose parts"
+            f"{path}: {len(surface.faces):,} faces cannot be decimated to {target:,}, because they form too many loose "
+            "parts: give a larger faces="
         )
     triangles, corners = surface.vertices[surface.faces], np.asarray(vertices, float)[faces]
-    # Each corner, drawn a little to its face's centre, takes the albedo of the nearest sample that looks the same way.
+    # Each corner, moved a little towards its face's centre, takes the albedo of the nearest sample of similar normal.
     face, weight = surface_samples(triangles, 20 * target)
     albedo = np.einsum("nk,nkc->nc", weight, surface.colors[face])
     if surface.texture is not None:
@@ -315,7 +317,7 @@ def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
     tree = KDTree(np.hstack([np.einsum("nk,nkc->nc", weight, triangles[face]), facing * _normals(triangles)[face]]))
     place = (0.8 * corners + 0.2 * corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
     nearest = tree.query(np.hstack([place, facing * np.repeat(_normals(corners), 3, axis=0)]))[1]
-    what = "" if surface.texture is None else "; its texture became colours, one to a corner"
+    what = "" if surface.texture is None else ", and its texture to one colour per corner"
     warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{what}", stacklevel=3)
     colors = albedo[nearest].reshape(-1, 3, 3)
     return _proper(
@@ -345,7 +347,7 @@ def _body(
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: {len(faces):,} faces, {len(vertices):,} vertices, at most {FACE_CLASSES[-1]:,} fit: "
+            f"{path}: has {len(faces):,} faces and {len(vertices):,} vertices, but at most {FACE_CLASSES[-1]:,} fit: "
             "give faces= to decimate it"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -356,20 +358,20 @@ def _body(
         hull = ConvexHull(vertices)
     except Exception as error:
         raise ValueError(
-            f"{path}: the mesh is flat, even its convex hull has no volume: give it a thickness"
+            f"{path}: the mesh is flat, so even its convex hull has no volume: give it a thickness"
         ) from error
     interior = (vertices, faces)
     holds = hollow and mass is None
     if not (closed and abs(mesh.volume) > 1e-6 * hull.volume):
         what = "encloses no volume" if closed else "is not closed"
         if strict:
-            raise ValueError(f"{path}: the mesh {what}: close it, or take strict=False for its convex hull's volume")
+            raise ValueError(f"{path}: the mesh {what}: close it, or give strict=False to use its convex hull's volume")
         if holds:
             warnings.warn(
-                f"{path}: the mesh {what}; its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
+                f"{path}: the mesh {what}, so its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
-        if len(hull.simplices) > max(len(faces), len(vertices)):  # so that the body stays in its class
+        if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its padding class
             points = convex_hull(vertices, limit=256, tolerance=0.0)
             interior = (points, _outward(points, ConvexHull(points)))
         else:
@@ -393,10 +395,10 @@ def _body(
 
 
 def _is_closed(faces: np.ndarray) -> bool:
-    """Whether faces have no boundary: each edge is run through as often one way as the other.
+    """Whether faces have no boundary: each edge is traversed equally often in both directions.
 
-    Of a single part this is what watertight and consistently wound means. Where parts touch, and welding has made one
-    edge of theirs, more than two faces meet there, and there is no hole.
+    A single part is then watertight and consistently wound. Where touching parts have been welded, more than two faces
+    may meet at an edge without leaving a hole.
     """
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
@@ -407,7 +409,10 @@ def _is_closed(faces: np.ndarray) -> bool:
 def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
     faces = np.asarray(piece.faces)
     if faces.min() < 0 or faces.max() >= len(piece.vertices):
-        raise ValueError(f"{path}: a face names vertex {faces.max()} of {len(piece.vertices)}: is the file complete?")
+        raise ValueError(
+            f"{path}: a face refers to vertex {faces.max()}, but there are only {len(piece.vertices)}: check that the "
+            "file is complete"
+        )
     return np.asarray(piece.vertices, float)[faces]
 
 
@@ -439,7 +444,7 @@ class _Resolver(trimesh.resolvers.FilePathResolver):
 
 
 def _found(folder: Path, name: str, images: Path | None) -> Path | None:
-    """A file by the name that another gives it: beside it, or under its last name in the folder of images."""
+    """Find a file that a mesh file in `folder` refers to: by its relative path, or by its base name in `images`."""
     name = name.strip().replace("\\", "/")
     places = [folder / name] + ([] if images is None else [images / Path(name).name])
     return next((place for place in places if place.is_file()), None)
@@ -452,7 +457,7 @@ def _named(file: Path, word: str) -> list[str]:
 
 
 def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """What an OBJ or glTF file names, by name: the files, or None where they are not there; nothing else is read."""
+    """Files that an OBJ or glTF file refers to, by name, or None for a missing file. Other formats are not read."""
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
         names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
@@ -466,16 +471,16 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
 
 
 def _check_materials(path: Path, images: Path | None, strict: bool) -> None:
-    """trimesh passes in silence over an OBJ's materials and images that are missing or torn."""
+    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones."""
     if path.suffix.lower() != ".obj":
         return
     files = references(path, images)
     missing = [str(path.parent / name) for name, file in files.items() if file is None]
     if missing and strict:
-        raise FileNotFoundError(f"{path} names {', '.join(missing)}, not there: put it in place, or give texture=")
+        raise FileNotFoundError(f"{path} refers to {', '.join(missing)}, not found: add it, or give texture=")
     if missing:
         warnings.warn(
-            f"{path} names {', '.join(missing)}, not there: drawn without it; texture= gives one", stacklevel=3
+            f"{path} refers to {', '.join(missing)}, not found: drawn without it unless texture= is given", stacklevel=3
         )
     for file in files.values():
         if file is not None and file.suffix.lower() != ".mtl":
@@ -483,7 +488,7 @@ def _check_materials(path: Path, images: Path | None, strict: bool) -> None:
 
 
 def _albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Corner colours, texture coordinates and the texture, of all pieces together."""
+    """Corner colours, texture coordinates and the texture of all pieces together."""
     is_linear = path.suffix.lower() in (".glb", ".gltf")
     colors, uvs, images = [], [], []
     for piece in pieces:
@@ -515,7 +520,7 @@ def _albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.n
             linear(_square(distinct[0], _texture_class(max(distinct[0].shape[:2]))) / 255.0),
         )
 
-    # Cells side by side on a sheet of the class's own size, so that it is not resampled again.
+    # The cells tile a sheet of a texture class's size, so that it is not resampled again.
     grid = int(np.ceil(np.sqrt(len(distinct))))
     size = _texture_class(grid * max(max(sheet.shape[:2]) for sheet in distinct))
     side = size // grid

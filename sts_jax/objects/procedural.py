@@ -1,11 +1,11 @@
-"""Eight families of everyday things, drawn from a key: sections are lofted into parts, parts are painted.
+"""Eight families of everyday objects, generated from a key by lofting sections into painted parts.
 
-Everything is made on the host in millimetres and handed over in metres. What collides is the convex hull of the
-very vertices that are drawn. Colours are chosen in sRGB and stored in linear light. A part that joins another is
-left open where it joins; marks (`_decal`) are paint, 0.04 mm proud and without weight.
+The geometry is built on the host in millimetres and returned in metres. An object collides as the convex hull of its
+drawn vertices. Colours are chosen in sRGB and stored in linear light. A part may be open where it joins another. Marks
+(`_decal`) are paint, raised by 0.04 mm and without mass.
 
-Each family returns its parts and, in its comments, the ranges it draws from; U(a, b) is uniform. What has a front
-(lens, keys) turns it to -y.
+The function of a family returns its parts. Its comments give the ranges that it draws from, where U(a, b) is uniform.
+An object with a front (lens, keys) faces -y.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from sts_jax.objects.solids import CONTENTS, WALL, assemble, linear
 
 STEEL = 5.9  # kg/m^2 of each face: stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301) x 1.5 mm, on two faces
 SHEET = 1.5  # mm, thickness of cutlery
-PAINT = 0.04  # mm, how far a painted mark stands out, so that nearest surface wins
+PAINT = 0.04  # mm, height of a painted mark, so that it is drawn in front of the surface below it
 
 Number = float | int
 Color = np.ndarray
@@ -40,22 +40,22 @@ class Part(NamedTuple):
 
 
 def make(key: PRNGKeyArray, category: str) -> Body:
-    """An object of a family, the same for the same key.
+    """Generate an object of a category. Equal keys give equal objects.
 
     Args:
-        key: made by `jax.random.key`; consumed.
+        key: from `jax.random.key`, consumed by the call.
         category: one of CATEGORIES.
 
     Returns:
-        The body, of the smallest face class, longest side 50 to 130 mm, +z up as it usually stands or lies.
+        A body of the smallest face class, with a longest side of 50 to 130 mm and +z up as it usually stands or lies.
 
     Raises:
-        TypeError: `key` is no JAX key.
-        ValueError: unknown category.
+        TypeError: `key` is not a JAX key.
+        ValueError: `category` is unknown.
     """
     check_key(key)
     if category not in CATEGORIES:
-        raise ValueError(f"unknown category {category!r}: take one of {', '.join(CATEGORIES)}")
+        raise ValueError(f"category is {category!r}, but it must be one of {', '.join(CATEGORIES)}")
     seed = np.asarray(jax.random.key_data(key)).ravel()
     rng = np.random.default_rng([*(int(word) for word in seed), CATEGORIES.index(category)])
     parts = _FAMILIES[category](rng)
@@ -102,7 +102,7 @@ def _rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarra
 
 
 def _rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.ndarray:
-    """An outline in x, y at each (scale, z)."""
+    """Rings with an outline in x, y at each (scale, z)."""
     return np.stack([np.column_stack([outline * scale, np.full(len(outline), z)]) for scale, z in levels])
 
 
@@ -120,7 +120,7 @@ def _loft(
     density: Number = WALL,
     interior: bool = False,
 ) -> Part:
-    """A surface through rings (k, n, 3); one colour, or one per band, or (n,) per band; ends None are left open."""
+    """A surface through rings (k, n, 3), with one colour, one per band or n per band. An end of None stays open."""
     k, n = rings.shape[:2]
     bands = k if closed else k - 1
     i, j = np.meshgrid(np.arange(bands), np.arange(n), indexing="ij")
@@ -163,7 +163,7 @@ def _box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part
 
 
 def _decal(outline: np.ndarray, color: Color) -> Part:
-    """A painted mark in the plane z = PAINT, seen from above; `outline` counter-clockwise about its middle."""
+    """A painted mark in the plane z = PAINT, facing +z. `outline` is counter-clockwise about its middle."""
     n = len(outline)
     points = np.column_stack([np.vstack([outline, outline.mean(axis=0)]), np.full(n + 1, PAINT)])
     faces = np.stack([np.full(n, n), np.arange(n), (np.arange(n) + 1) % n], axis=1)
@@ -186,7 +186,7 @@ def _spin(angle: Number) -> np.ndarray:
 
 
 def _move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", spin: Number = 0.0) -> Part:
-    """A part turned about z, then with its z axis along `axis`, then shifted."""
+    """Turn a part by `spin` about z, then turn its z axis to `axis`, then shift it."""
     return part._replace(vertices=part.vertices @ (_TURNS[axis] @ _spin(spin)).T + np.asarray(shift, float))
 
 
@@ -251,7 +251,7 @@ _GLINT = linear(np.array([0.75, 0.85, 1.0]))
 
 
 def _lens(radius: Number, length: Number, num: int, barrel: Color, ring: Color) -> Part:
-    """A lens barrel along +z from z = 0, with rings and its glass set back."""
+    """A lens barrel along +z from z = 0, with rings and recessed glass."""
     profile = [
         (radius * 0.96, 0),
         (radius * 0.96, length * 0.35),
@@ -278,7 +278,7 @@ def _bottle(rng: np.random.Generator) -> list[Part]:
     cap_height = height * rng.uniform(0.1, 0.2)  # U(.1, .2)
     neck = rng.uniform(0.32, 0.48) if style == 1 else rng.uniform(0.5, 0.8)  # U(.32, .48), others U(.5, .8)
     slope = rng.uniform(0.22, 0.38) if style == 1 else rng.uniform(0.04, 0.14)  # shoulder: U(.22, .38), U(.04, .14)
-    label = np.sort([rng.uniform(0.08, 0.3), rng.uniform(0.6, 0.92)])  # of the straight height: U(.08, .3)-U(.6, .92)
+    label = np.sort([rng.uniform(0.08, 0.3), rng.uniform(0.6, 0.92)])  # over straight height: U(.08, .3), U(.6, .92)
 
     body, cap, paper, mark = _vivid(rng), _vivid(rng), _pale(rng), _vivid(rng)
     if rng.uniform() < 0.5:  # half have a dark or white cap
@@ -327,7 +327,7 @@ def _camera(rng: np.random.Generator) -> list[Part]:
     radius = height * rng.uniform(0.3, 0.4)  # lens over height: U(.3, .4)
     length = width * rng.uniform(0.16, 0.5)  # U(.16, .5)
     hump = height * rng.uniform(0.14, 0.26)  # viewfinder: U(.14, .26)
-    side = width * rng.uniform(-0.02, 0.1)  # lens off the middle: U(-.02, .1)
+    side = width * rng.uniform(-0.02, 0.1)  # offset of the lens over width: U(-.02, .1)
     corner = depth * rng.uniform(0.14, 0.3)  # U(.14, .3)
 
     retro = rng.uniform() < 0.5
@@ -362,7 +362,7 @@ def _camera(rng: np.random.Generator) -> list[Part]:
     parts.append(_move(_decal(flash, _GLINT), (side, lean - 0.4, height + hump * 0.5), axis="-y"))
     window = _rectangle(width * 0.1, height * 0.1)
     parts.append(_move(_decal(window, _GLINT), (width * 0.33, front, height * 0.88), axis="-y"))
-    # Grip: a ridge on the hand's side (the viewer's left).
+    # Grip: a ridge for the hand, on the left in the front view.
     grip = _rectangle(width * 0.13, depth * 0.34, depth * 0.1)
     parts.append(
         _move(
@@ -399,7 +399,7 @@ def _camera(rng: np.random.Generator) -> list[Part]:
 
 def _webcam(rng: np.random.Generator) -> list[Part]:
     longest = rng.uniform(55, 90)  # mm: U(55, 90)
-    ball = rng.uniform() < 0.5  # half have a ball for a head, half a bar
+    ball = rng.uniform() < 0.5  # half have a ball as the head, half a bar
     head = rng.uniform(13, 18)  # mm, half the head's height: U(13, 18)
     stretch = rng.uniform(2.1, 3.2)  # a bar's half width over its half height: U(2.1, 3.2)
     neck = head * rng.uniform(0.4, 1.2)  # U(.4, 1.2)
@@ -453,7 +453,7 @@ def _mouse(rng: np.random.Generator) -> list[Part]:
     length = 100.0
     width = length * rng.uniform(0.54, 0.7)  # U(.54, .7)
     height = length * rng.uniform(0.3, 0.42)  # U(.3, .42)
-    peak = rng.uniform(-0.35, 0.05)  # where it is highest, -1 (back) to 1 (front): U(-.35, .05)
+    peak = rng.uniform(-0.35, 0.05)  # position of the highest point, -1 (back) to 1 (front): U(-.35, .05)
     waist = rng.uniform(0.0, 0.12)  # U(0, .12)
     split = rng.uniform(0.0, 0.2)  # where the keys begin: U(0, .2)
     corded = rng.uniform() < 0.5
@@ -464,7 +464,7 @@ def _mouse(rng: np.random.Generator) -> list[Part]:
     seam = _grey(0.45) if keys.mean() < 0.08 else _grey(0.04)
     wheel = _vivid(rng) if rng.uniform() < 0.5 else _grey(0.7 if keys.mean() < 0.15 else 0.15)
 
-    # Sections across, from the back to the front: six points each, of which the last two lie on the table.
+    # Cross-sections from the back to the front, of six points each. The first and the last point lie on the table.
     stations = np.array([-1.0, -0.86, -0.5, 0.0, 0.45, 0.78, 0.93, 1.0])
     across = np.radians([180, 146, 108, 72, 34, 0])
 
@@ -484,7 +484,7 @@ def _mouse(rng: np.random.Generator) -> list[Part]:
         share = (u - stations[i]) / (stations[i + 1] - stations[i])
         return coarse[i] * (1 - share) + coarse[i + 1] * share
 
-    # Seams are cut into the coarse faces, so that no vertex leaves the hull these span.
+    # Seams are cut into the coarse faces, so that no vertex leaves their hull.
     along = np.sort([*stations, split, split + 0.02])
     rows = np.stack([between(u) for u in along])
     left, right = rows[:, 2:3], rows[:, 3:4]
@@ -554,7 +554,7 @@ def _scissors(rng: np.random.Generator) -> list[Part]:
 
 
 def _cutlery(rng: np.random.Generator, length: Number, end: Number, lift: Number) -> tuple[Part, Color, float]:
-    """The handle from x = 0 on the table to x = `end`, `lift` above it; its steel; the width of its neck."""
+    """The handle from x = 0 on the table to x = `end` at height `lift`, its steel colour and the width of its neck."""
     arch = length * rng.uniform(0.015, 0.05)  # handle's rise over length: U(.015, .05)
     wide = length * rng.uniform(0.075, 0.12)  # its end's width: U(.075, .12)
     neck = length * rng.uniform(0.032, 0.045)  # its neck's width: U(.032, .045)
@@ -638,8 +638,8 @@ def _watch(rng: np.random.Generator) -> list[Part]:
     thick = rng.uniform(7, 11)  # U(7, 11)
     band = radius * rng.uniform(0.9, 1.25)  # strap's width: U(.9, 1.25)
     narrow = rng.uniform(0.7, 0.95)  # its end's width over that: U(.7, .95)
-    power = 2.0 if rng.uniform() < 0.7 else rng.uniform(3.0, 4.5)  # round, or a third of them squarish: U(3, 4.5)
-    uneven = rng.uniform(0.45, 0.6)  # share of the longer strap: U(.45, .6)
+    power = 2.0 if rng.uniform() < 0.7 else rng.uniform(3.0, 4.5)  # round, or squarish for a third: U(3, 4.5)
+    uneven = rng.uniform(0.45, 0.6)  # share of the strap half with holes: U(.45, .6)
     metal = _steel(rng) if rng.uniform() < 0.6 else _hsv(0.115, 0.55, 0.83)
     links = rng.uniform() < 0.35  # a third have a bracelet of links
     strap = (
@@ -678,7 +678,7 @@ def _watch(rng: np.random.Generator) -> list[Part]:
     parts.append(_move(crown, (radius - 0.4, 0, 0.52 * thick), axis="x"))
     parts.append(_move(_decal(_ellipse(radius * 0.72, radius * 0.72, 16, power), metal * 0.5), (0, 0, 0), axis="-z"))
     parts.append(_move(_decal(_circle(radius * 0.6, 16), metal * 0.9), (0, 0, -PAINT), axis="-z"))
-    # Strap: from the lugs down to the table, the longer half with holes, the shorter with a buckle.
+    # Strap: from the lugs down to the table, one half with holes, the other with a buckle.
     total = longest - 2 * radius
     section = np.array([[0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
     tall = 2.2

@@ -1,4 +1,4 @@
-"""Geometry of solids on the host, NumPy in float64: moments, convex hulls, rest poses, corner normals, assembly.
+"""Geometry of solids on the host, in NumPy float64: moments, convex hulls, rest poses, corner normals, assembly.
 
 Triangles are counter-clockwise seen from outside. A row of moments is `[1, x, y, z, xx, yy, zz, xy, xz, yz]`
 integrated over a solid or a surface.
@@ -15,12 +15,12 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, Body
 
-WALL = 1.2  # kg/m^2, plastic about 1.2 mm thick: the shell of everything that holds something
+WALL = 1.2  # kg/m^2, default shell of a hollow object: plastic about 1.2 mm thick
 CONTENTS = 1000.0  # kg/m^3, water
-CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are made
-HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less
-SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull that lean less against one another are one face
-REST_GRAIN = 2e-5  # m, points of a hull this near a face's plane belong to it
+CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are computed
+HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less than this
+SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull whose normals differ by less than this form one face
+REST_GRAIN = 2e-5  # m, points of a hull this near a face's plane belong to the face
 REST_MARGIN = 5e-4  # m, how far inside the outline of a face the centre of mass must lie for the object to rest on it
 
 NUM_DIRECTIONS = 128
@@ -40,21 +40,21 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def solid_moments(
     triangles: Float[np.ndarray, "f 3 3"], *, reference: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "f 10"]:
-    """Moments of the signed tetrahedra between a reference point and each triangle; summed, those of the solid.
+    """Moments of the signed tetrahedra between a reference point and each triangle, which sum to the solid's.
 
     For a tetrahedron with corners `0, a, b, c` relative to the reference, v = a . (b x c) / 6, int r = v s / 4 and
     int r r^T = v (s s^T + a a^T + b b^T + c c^T) / 20 with s = a + b + c.
 
     Args:
         triangles: corners, m.
-        reference: any point; for a clipped solid one on the cutting plane, so that the cut's own face adds nothing.
+        reference: any point. For a clipped solid, a point on the cutting plane, so that the cut contributes nothing.
 
     Returns:
         One row per triangle: m^3, m^4, m^5.
@@ -87,13 +87,13 @@ def _shifted(measure: np.ndarray, mean: np.ndarray, second: np.ndarray, origin: 
 def convex_hull(
     points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
 ) -> Float[np.ndarray, "h 3"]:
-    """Vertices of the convex hull: all that matter to within the tolerance, at most as many as the limit.
+    """Vertices of a convex hull, simplified to a tolerance and a maximum number of vertices.
 
-    Starting from a simplex, the point furthest outside is added until none is outside by more than the tolerance.
+    Starting from a simplex, the point furthest outside is added until no point is outside by more than the tolerance.
 
     Args:
         points: m.
-        limit: most vertices.
+        limit: maximum number of vertices, which takes precedence over the tolerance.
         tolerance: m.
 
     Returns:
@@ -124,7 +124,7 @@ def convex_hull(
 
 
 def support(body: Body) -> Float[np.ndarray, "128"]:
-    """The support function of the convex hull of what collides, about the mesh origin: h(d) = max over vertices v . d.
+    """Support function of the collision parts' convex hull, about the mesh origin: h(d) = max over vertices v . d.
 
     Args:
         body: one body.
@@ -136,7 +136,7 @@ def support(body: Body) -> Float[np.ndarray, "128"]:
         ValueError: `body` has leading axes.
     """
     if np.ndim(body.hulls) != 3:
-        raise ValueError(f"hulls has the shape {np.shape(body.hulls)}; one body has (p, h, 3): take one of the bodies")
+        raise ValueError(f"hulls has the shape {np.shape(body.hulls)}, but one body has (p, h, 3): pass a single body")
     points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
     return (points @ DIRECTIONS.T.astype(np.float64)).max(axis=0).astype(np.float32)
 
@@ -144,17 +144,17 @@ def support(body: Body) -> Float[np.ndarray, "128"]:
 def rest_poses(
     points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
-    """The attitudes in which a convex hull rests on a plane.
+    """Attitudes in which a convex hull rests on a plane.
 
-    It rests on a face where the centre of mass lies above the face and at least REST_MARGIN inside its outline.
+    The hull rests on a face if the centre of mass lies above the face and at least REST_MARGIN inside its outline.
 
     Args:
-        points: m, whose convex hull rests.
+        points: m. Their convex hull is the object at rest.
         com: centre of mass, m.
 
     Returns:
-        For each such face the unit vector that points up while it lies below, and its share of the solid angle in
-        which the centre of mass sees all of them.
+        For each such face, the unit vector that points up when the hull rests on it, and a weight: the face's solid
+        angle seen from the centre of mass, as a share of the sum over these faces.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
@@ -176,7 +176,7 @@ def rest_poses(
         across = np.linalg.svd(normal[None])[2][1:]
         try:
             edges = ConvexHull(support @ across.T).equations
-        except QhullError:  # an edge or a corner
+        except QhullError:  # the points form an edge or a corner
             continue
         above = normal @ com + offsets[first] < 0
         if above and np.max(edges[:, :2] @ (across @ com) + edges[:, 2]) < -REST_MARGIN:
@@ -186,13 +186,14 @@ def rest_poses(
 
 
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
-    """Distance (m) of each point from a convex hull; 0 inside."""
+    """Distance (m) of each point from a convex hull, 0 inside."""
     shape = ConvexHull(hull)
     normals, offsets = shape.equations[:, :3], shape.equations[:, 3]
     sides = points @ normals.T + offsets
     plane = np.argmax(sides, axis=1)
     distance = np.maximum(sides[np.arange(len(points)), plane], 0.0)
-    # Where the foot on the plane it is furthest beyond lies on the hull, that was the distance; else an edge is nearer.
+    # The distance to the plane that a point is furthest beyond is exact if the foot of the perpendicular lies on the
+    # hull. Otherwise the nearest point of the hull lies on an edge.
     feet = points - distance[:, None] * normals[plane]
     rows = np.nonzero((distance > 0) & ((feet @ normals.T + offsets).max(axis=1) > 1e-12))[0]
     triangles = hull[shape.simplices]
@@ -206,7 +207,7 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
 def surface_samples(
     triangles: Float[np.ndarray, "f 3 3"], num: int
 ) -> tuple[Int[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
-    """Places spread evenly by area over triangles, always the same: the face of each and its corners' weights."""
+    """Points spread evenly by area over triangles, with a fixed seed: the face and barycentric weights of each."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     share = np.cumsum(np.linalg.norm(cross, axis=1))
     face = np.searchsorted(share, (np.arange(num) + 0.5) / num * share[-1])
@@ -222,18 +223,18 @@ def convex_parts(
     limit: int = PART_CLASSES[-1],
     vertices_per_part: int = HULL_CLASSES[0],
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """A surface as several convex parts, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
+    """Decompose a surface into convex parts, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
 
-    The same mesh gives the same parts. Open surfaces are closed by the library first, which thickens them a little.
+    The same mesh gives the same parts. CoACD first closes open surfaces, which thickens them a little.
 
     Args:
         vertices: m.
         faces: counter-clockwise from outside.
-        limit: most parts.
-        vertices_per_part: most vertices of each.
+        limit: maximum number of parts.
+        vertices_per_part: maximum number of vertices of each part.
 
     Returns:
-        The vertices of each part, m; one part where the surface is convex.
+        The vertices (m) of each part. A convex surface gives a single part.
 
     Raises:
         ImportError: coacd is not installed.
@@ -264,14 +265,14 @@ def convex_parts(
 
 
 def decompose(body: Body) -> Body:
-    """A body that collides as several convex parts instead of its convex hull: scissors, a bowl, a mug.
+    """Let a body, such as scissors, a bowl or a mug, collide as several convex parts instead of its convex hull.
 
     Args:
         body: one body.
 
     Returns:
-        The same body with the parts as `hulls`, at most PART_CLASSES[-1] of HULL_CLASSES[0] vertices each; the body
-        itself where one part is all it takes.
+        The body with the parts as `hulls`, at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each.
+        If a single part suffices, the body is returned unchanged.
 
     Raises:
         ImportError: coacd is not installed.
@@ -287,7 +288,7 @@ def decompose(body: Body) -> Body:
 
 
 def gaps(body: Body) -> tuple[float, float]:
-    """`surface_gaps` (m) of one body: how far its surface sticks out of what collides, and the other way round."""
+    """`surface_gaps` (m) of one body: how far its surface sticks out of the collision parts, and the reverse."""
     parts = np.asarray(body.hulls, float)
     new = np.array([True, *(parts[1:] != parts[:-1]).any(axis=(1, 2))])  # padding repeats the last part
     return surface_gaps(*_surface(body), [np.unique(part, axis=0) for part in parts[new]])
@@ -301,10 +302,10 @@ def _surface(body: Body) -> tuple[np.ndarray, np.ndarray]:
 def surface_gaps(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> tuple[float, float]:
-    """Largest distances (m) between the visible surface and what collides.
+    """Largest distances (m) between the visible surface and the collision parts.
 
-    Each is taken over the corners and 10,000 points of the one and exact to the other, so a peak between two points
-    can be missed by about half their spacing; the first is exact for one hull.
+    Each is the maximum over the corners and 10,000 points of one surface of the exact distance to the other. A maximum
+    between two points can be missed by about half their spacing. The first distance is exact for a single hull.
 
     Args:
         vertices: m.
@@ -312,8 +313,8 @@ def surface_gaps(
         hulls: the vertices of each convex part.
 
     Returns:
-        How far the surface sticks out of every part: what is drawn sinks in by so much. How far from the surface, and
-        outside it, the parts reach: they collide by so much where nothing is seen, as in a bowl's hollow.
+        How far the surface sticks out of all parts, which is how deep the drawn surface can sink in. How far the parts
+        reach outside the surface, where the object collides although nothing is visible, as in a bowl's hollow.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
@@ -333,10 +334,10 @@ def _points(triangles: np.ndarray, num: int) -> np.ndarray:
 
 
 def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
-    """Largest distance from the triangles of those points that lie outside them: all, where they enclose nothing.
+    """Largest distance from the triangles over the points outside them, or over all points if they are not closed.
 
-    The nearest corner or sample bounds a point's distance from above, so only points that may exceed the largest found
-    so far are measured, each against the triangles that may be as near.
+    The distance to the nearest corner or sample is an upper bound for a point. Therefore only points whose bound
+    exceeds the largest distance so far are measured, each against the triangles within its bound.
     """
     bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
     center = triangles.mean(axis=1)
@@ -352,7 +353,7 @@ def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
         lengths = np.linalg.norm(away, axis=1)
         distance = np.full(len(some), np.inf)
         np.minimum.at(distance, row, lengths)
-        # Of a closed surface, the nearest faces say which side a point is on; where they disagree, the winding does.
+        # The nearest faces of a closed surface decide which side a point is on. If they disagree, the winding decides.
         nearest = lengths <= distance[row] + 1e-9
         front = np.zeros((2, len(some)), bool)
         np.logical_or.at(front, ((np.einsum("pi,pi->p", away, normals[column]) > 0).astype(int), row), nearest)
@@ -367,7 +368,7 @@ def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
 
 
 def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
-    """How often the triangles wind around a point (van Oosterom and Strackee, 1983): 1 inside, 0 outside."""
+    """Winding number of the triangles around a point (van Oosterom and Strackee, 1983): 1 inside, 0 outside."""
     a, b, c = np.moveaxis(triangles - point, 1, 0)
     one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     across = np.einsum("fi,fi->f", a, np.cross(b, c))
@@ -377,7 +378,7 @@ def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
 
 
 def hull_gap(body: Body) -> float:
-    """Largest distance (m) by which the visible surface of one body sticks out of what collides."""
+    """Largest distance (m) by which the visible surface of one body sticks out of the collision parts."""
     surface = np.unique(np.asarray(body.vertices, float), axis=0)
     parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
     return float(np.min(parts, axis=0).max())
@@ -386,15 +387,15 @@ def hull_gap(body: Body) -> float:
 def corner_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Unit normal of each corner: the mean, weighted by angle, of the faces at its vertex within the crease angle.
+    """Unit normal of each corner: the angle-weighted mean over the faces at its vertex within the crease angle.
 
     Args:
         vertices: m.
-        faces: indices; vertices at one place are one vertex where the surface is to be smooth.
+        faces: indices. Faces must share the index of a vertex for the surface to be smooth there.
         crease: rad.
 
     Returns:
-        Normals; a face without area gets (0, 0, 1).
+        Normals. A face without area counts as facing (0, 0, 1).
     """
     triangles = vertices[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
@@ -406,7 +407,7 @@ def corner_normals(
     order = np.argsort(corner_vertex, kind="stable")
     count = np.bincount(corner_vertex, minlength=len(vertices))
     start = np.cumsum(count) - count
-    # Every corner with every corner at its vertex.
+    # Pair every corner with all corners at its vertex.
     repeats = count[corner_vertex]
     first = np.repeat(np.arange(len(corner_vertex)), repeats)
     within = np.arange(len(first)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
@@ -444,26 +445,26 @@ def assemble(
     two_sided: Bool[np.ndarray, ""] | bool = False,
     category: int = -1,
 ) -> Body:
-    """A surface with its material as a padded `Body`, moved so that its hull's centroid is the origin.
+    """Assemble a padded `Body` from a surface and its material, with the hull's centroid as the origin.
 
     Args:
         vertices: m, +z up.
-        faces: counter-clockwise from outside; at most FACE_CLASSES[-1].
+        faces: counter-clockwise from outside, at most FACE_CLASSES[-1] of them.
         colors: [0, 1], linear light, of each corner.
         density: kg/m^2 of each face.
-        interior: a closed mesh in the same frame that bounds the contents, or None for a solid thing.
+        interior: a closed mesh in the same frame that bounds the contents, or None for a solid object.
         contents_density: kg/m^3.
-        mass: kg, of the shell; None takes area times density.
+        mass: kg, of the shell. None takes area times density.
         uv: texture coordinates of each corner, v = 0 at the texture's top row.
         texture: [0, 1], linear light, of one of TEXTURE_CLASSES.
-        two_sided: whether the surface is seen from behind too.
+        two_sided: whether the surface is visible from behind too.
         category: index into CATEGORIES, or -1.
 
     Returns:
         The body.
 
     Raises:
-        ValueError: the convex hull has no volume.
+        ValueError: the convex hull or the interior has no volume.
     """
     hull = convex_hull(vertices)
     shape = ConvexHull(hull)

@@ -1,4 +1,4 @@
-"""Sight: the camera, the rasteriser (plain arrays in), the light above the skin."""
+"""Vision: the camera, the rasteriser (on plain arrays) and the light above the skin."""
 
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
 from sts_jax.optics.photograph import photograph

@@ -1,7 +1,7 @@
 """The pinhole under the gel, and the part of its view that an image shows.
 
-A window is `(left, top, width, height)` in metres on the gel's outer face (z = 0), which the camera sees square on:
-a smaller window is a smaller frustum, so a crop costs its own pixels and no more.
+A window is `(left, top, width, height)` in metres on the gel's outer face (z = 0), to which the optical axis is
+perpendicular. A smaller window is a smaller frustum, so a crop costs its own pixels only.
 """
 
 import dataclasses
@@ -19,17 +19,17 @@ Scalar = float | Array
 class Camera:
     """A pinhole on the sensor's z axis, looking out through the gel along +z."""
 
-    distance: Scalar = 0.1  # m, from the pinhole to the gel's outer face (the original's camera: bottom of the block)
-    fov: Scalar = 2 * math.atan(0.75)  # rad, vertical field of view (the original's): the pad's edges touch the image's
-    aspect: Scalar = 4 / 3  # width / height of the native view (the device's 1640x1232, the original's 640x480)
+    distance: Scalar = 0.1  # m, from the pinhole to the gel's outer face (paper's code: bottom of the block)
+    fov: Scalar = 2 * math.atan(0.75)  # rad, vertical field of view (paper's code): the pad is as high as the image
+    aspect: Scalar = 4 / 3  # width / height of the native view (device: 1640x1232, paper's code: 640x480)
     near: Scalar = 0.02  # m, a face with a corner nearer to the pinhole than this is not drawn
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:
-    """The largest centred part of the view that has the aspect of an image: nothing is squeezed.
+    """The largest centred part of the view with the aspect ratio of an image, which is then not stretched.
 
     Args:
-        camera: whose view it is.
+        camera: the pinhole.
         resolution: (height, width) of the image, pixels.
 
     Returns:
@@ -45,16 +45,16 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
 def object_window(
     camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
 ) -> Float[Array, "4"]:
-    """The window of an image's aspect around an object, as the paper crops (supplement, "Training Details").
+    """The window around an object with the aspect ratio of an image, as in the paper (supplement, "Training Details").
 
-    It is as small as it can be while it holds all that the full window shows of the projected points in front of the
-    camera, and it never leaves the full window. With nothing in view it is the full window.
+    It is the smallest one that contains the bounding box of the projected points, as far as that is in the full window,
+    and it lies in the full window. Points nearer than `near` do not count. With nothing in view it is the full window.
 
     Args:
-        camera: whose view it is.
+        camera: the pinhole.
         points: points of the object, sensor frame (m).
         resolution: (height, width) of the image, pixels.
-        smallest: shortest side (m).
+        smallest: least length of the shorter side (m).
 
     Returns:
         Window (m).
@@ -77,11 +77,11 @@ def object_window(
 def to_pixels(
     camera: Camera, window: Float[Array, "4"], shape: tuple[int, int], points: Float[Array, "v 3"]
 ) -> tuple[Float[Array, "v 2"], Float[Array, "v"]]:
-    """Where points land in an image: `(column, row)`, whole numbers at pixel centres, and their depth.
+    """Project points into an image: `(column, row)`, whole numbers at pixel centres, and depth.
 
     Args:
         camera: the pinhole.
-        window: what the image shows (m).
+        window: part of the gel's face in the image (m).
         shape: (height, width) of the image, pixels.
         points: sensor frame (m).
 
@@ -102,11 +102,11 @@ def rays(
 
     Args:
         camera: the pinhole.
-        window: what the image shows (m).
+        window: part of the gel's face in the image (m).
         shape: (height, width) of the image, pixels.
 
     Returns:
-        Both slopes; the point at depth D on a ray is (D x, D y, D - camera.distance).
+        Both slopes, x and y. The point at depth D on a ray is (D x, D y, D - camera.distance).
     """
     x = (window[0] + (jnp.arange(shape[1]) + 0.5) / shape[1] * window[2]) / camera.distance
     y = (window[1] + (jnp.arange(shape[0]) + 0.5) / shape[0] * window[3]) / camera.distance

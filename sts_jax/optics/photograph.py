@@ -1,4 +1,4 @@
-"""The scene from outside, for people to look at: any triangles, any viewpoint, the same rasteriser."""
+"""Pictures of a scene from outside, to look at: any triangles from any viewpoint, with the sensor's rasteriser."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -9,8 +9,8 @@ from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
 from sts_jax.optics.shading import to_srgb
 
 _SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # light from above and from below, linear
-_LAMP = (0.45, 0.43, 0.40)  # of a lamp over the photographer's left shoulder, linear
-_SAMPLES = 3  # a pixel's samples along each side
+_LAMP = (0.45, 0.43, 0.40)  # light of a lamp over the viewer's left shoulder, linear
+_SAMPLES = 3  # samples along each side of a pixel
 
 
 def photograph(
@@ -25,18 +25,18 @@ def photograph(
     resolution: tuple[int, int] = (200, 200),
     two_sided: Bool[Array, ""] | bool = False,
 ) -> Float[Array, "h w 3"]:
-    """A picture of triangles from a free viewpoint, z up, by daylight and a lamp, on white.
+    """Draw triangles from any viewpoint, z up, by daylight and a lamp, on white.
 
     Args:
         vertices: World frame (m).
         faces: Corner indices, counter-clockwise seen from outside.
-        normals: Unit, of each corner of each face.
-        albedo: Linear, of each corner of each face.
-        eye: Where the pinhole is (m); not straight above or below the target.
-        target: What is in the middle of the picture (m).
+        normals: Unit normal at each corner of each face.
+        albedo: Linear colour at each corner of each face.
+        eye: Position of the pinhole (m), not straight above or below the target.
+        target: Point in the middle of the picture (m).
         fov: Vertical field of view (rad).
         resolution: (height, width), pixels.
-        two_sided: Whether faces are seen from behind too.
+        two_sided: Whether faces are visible from behind too.
 
     Returns:
         Image, sRGB in [0, 1].
@@ -46,7 +46,7 @@ def photograph(
     right = geometry.normalize(jnp.cross(forward, jnp.array([0.0, 0.0, 1.0])))
     turn = jnp.stack([right, jnp.cross(forward, right), forward])
     shape = (resolution[0] * _SAMPLES, resolution[1] * _SAMPLES)
-    # The pinhole of `camera` sits at z = -distance; the point it looks at, one metre ahead, is the origin.
+    # The pinhole of `camera` is at z = -distance, so the origin is the point one metre ahead.
     camera = Camera(distance=1.0, fov=fov, aspect=resolution[1] / resolution[0], near=0.01)
     window = full_window(camera, shape)
     points = (vertices - eye) @ turn.T - jnp.array([0.0, 0.0, 1.0])

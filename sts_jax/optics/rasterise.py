@@ -1,12 +1,12 @@
-"""Which face each pixel sees: a z-buffer in plain JAX, for triangles of any size on screen.
+"""A z-buffer in plain JAX: the nearest face at each pixel, for triangles of any size on the screen.
 
-Every face is cut into its rows of pixels, and these, where it is wide, into runs of a few pixels. The list of runs is
-walked in chunks, and a chunk column by column, so the work follows what is covered and not the number of faces times
-pixels. Each step is one scatter-min of a 32-bit key, depth in its high bits and the face's index in its low ones. All
-of this decides and has no gradient; what is interpolated from the winning face has.
+Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop takes the list of runs in chunks,
+and each chunk column by column, so the work grows with the covered pixels and not with the number of faces times
+pixels. Each step is one scatter-min of a 32-bit key, with the depth in the high bits and the index of the face in the
+low ones. The choice of the face has no gradient. Values interpolated from the chosen face have one.
 
 Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. `order` is smaller for
-what is nearer and affine across a face on the screen: -1/depth in a pinhole's view, depth itself in a parallel one.
+nearer points and affine across a face on the screen: -1/depth in the view of a pinhole, depth in a parallel view.
 """
 
 import math
@@ -19,9 +19,9 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
 from sts_jax import _math
 
-_SLACK = 1e-4  # pixels by which faces are grown, so that no pixel centre on a shared edge falls between two
-_GROUP = 1024  # faces prepared at a time
-_RUN = 8  # pixels, longest run
+_SLACK = 1e-4  # pixels by which faces are enlarged, so that no pixel centre on a shared edge is missed
+_GROUP = 1024  # faces cut at a time
+_RUN = 8  # pixels of the longest run
 _Corner = tuple[Array, Array, Array]  # column, row, order
 _NOTHING = np.uint32(0xFFFFFFFF)
 
@@ -41,18 +41,18 @@ def rasterise(
 
     Args:
         points: vertices on the screen, (column, row) in pixels.
-        order: of each vertex; smaller is nearer.
-        faces: corner indices, counter-clockwise seen from outside the object by a right-handed eye. Faces at the end
-            all of whose corners are one vertex, padding, cost next to nothing.
-        keep: vertices that can be drawn; a face needs all three.
-        two_sided: whether faces are seen from behind too.
+        order: of each vertex, smaller is nearer.
+        faces: corner indices, counter-clockwise seen from outside the object in a right-handed frame. Padding faces at
+            the end, whose corners are all one vertex, cost next to nothing.
+        keep: vertices that can be drawn. A face needs all three.
+        two_sided: whether faces are visible from behind too.
         shape: (height, width) of the image, pixels.
-        within: an order, to have an image by themselves of the faces that have a corner nearer than it.
-        chunk: runs walked at a time.
+        within: an order. If given, the faces with a corner nearer than this have an image of their own too.
+        chunk: runs drawn at a time.
 
     Returns:
-        Face indices, -1 where no face is seen. With `within` two such images, (2, h, w): of those faces, and of all. No
-        gradient.
+        Face indices, -1 where no face is visible. With `within` two such images, (2, h, w): of the near faces, and of
+        all. No gradient.
     """
     height, width = shape
     layers = () if within is None else (2,)
@@ -71,18 +71,18 @@ def rasterise(
         return a, b, c
 
     def collect(state: tuple[Array, Array, Array, list[Array]]) -> tuple[Array, Array, Array, list[Array]]:
-        """Of a group of faces, those that have runs: from which number on, which they are, runs in a row."""
+        """List the faces of a group that have runs: number of the first run, index of the face, runs per row."""
         base, count, total, lists = state
         face = jnp.minimum(base, num_faces - group) + jnp.arange(group, dtype=jnp.int32)
         a, b, c = corners_of(face)
         area = _cross(a, b, c)
-        # Seen along +z with x right and y down, a face that looks at us runs counter-clockwise: negative area.
+        # Seen along +z with x right and y down, a face towards the camera is counter-clockwise: negative area.
         drawn = jnp.where(two_sided, area != 0, area < 0) & jnp.all(keep[faces[face]], axis=1)
         left, right = _lowest(a[0], b[0], c[0]), _highest(a[0], b[0], c[0])
         top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
         tall = bottom - top
         widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
-        # Rows that are nearly flat on screen are as wide as the face is.
+        # A face that is nearly flat on the screen has rows as wide as the face.
         widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
         outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
         empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
@@ -109,7 +109,7 @@ def rasterise(
     def body(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         base, current, image = state
         run = base + jnp.arange(chunk, dtype=jnp.int32)
-        # Every face has a run, so no more than `chunk` faces begin among these: the next ones of the list.
+        # Every listed face has a run, so at most `chunk` faces begin in this chunk: the next ones of the list.
         begins = jax.lax.dynamic_slice(first_run, (current + 1,), (chunk,)) - base
         of = current + _math.running_sum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"))
         following = of[-1] + (first_run[of[-1] + 1] == base + chunk)
@@ -121,10 +121,10 @@ def rasterise(
         slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
         slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
         top, bottom = _lowest(y0, y1, y2), _highest(y0, y1, y2)
-        line = jnp.floor((run - begin + 0.5) / across)  # whole numbers below 2^22: exact
+        line = jnp.floor((run - begin + 0.5) / across)  # exact, for whole numbers below 2^22
         row = _first_row(top, height) + line
-        # From the edges that it lies to the right of to those that it lies to the left of, and not beyond its corners.
-        # A face that lies within one row's slack covers that row from end to end.
+        # A row runs from the face's left edges to its right edges, and not beyond its corners. A face within one row's
+        # slack covers that row from end to end.
         flat = bottom - top <= 1e-3
         at = jnp.clip(row, top, bottom)
         starts, stops = [], []
@@ -149,7 +149,7 @@ def rasterise(
             key = (level.astype(jnp.uint32) << face_bits) | face.astype(jnp.uint32)
             return image.at[jnp.where(along < length, pixel + along, pixels)].min(key, mode="drop")
 
-        # As many steps for every chunk: under `vmap` a loop that may end sooner copies the image in each.
+        # The same number of steps for every chunk, because under `vmap` a loop of variable length copies the image.
         return base + chunk, following, jax.lax.fori_loop(0, _RUN, step, image)
 
     blank = jnp.full(pixels, _NOTHING)
@@ -166,18 +166,18 @@ def barycentrics(
     column: Float[Array, "*n"],
     row: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Weights of a face's corners at a place on the screen, affine on the screen.
+    """Weights of a face's corners at a point on the screen, affine on the screen.
 
     Args:
         corners: the three corners, (column, row) in pixels.
-        column: of the place, pixels.
-        row: of the place, pixels.
+        column: of the point, pixels.
+        row: of the point, pixels.
 
     Returns:
-        Weights that sum to 1, none below 0 even where rounding puts a place outside its face; (1, 0, 0) for a face
-        without area.
+        Weights that sum to 1, none below 0 even where rounding puts a point outside its face. A face without area has
+        (1, 0, 0).
     """
-    # Relative to the place: in absolute pixels float32 loses per cents on slivers.
+    # Relative to the point, because with absolute pixels float32 errs by per cents on slivers.
     a, b, c = ((x - column, y - row) for x, y in corners)
     area = _cross(a, b, c)
     ok = area != 0

@@ -1,6 +1,6 @@
-"""How the world above looks through the skin: a lit object, its shadow on the skin, the haze of a translucent gel.
+"""The view through the skin: a lit object, its shadow on the skin, the haze of a translucent gel.
 
-Light is added up in linear units; `to_srgb` is the last step of an image. What takes samples takes them in any shape.
+Light is summed in linear units, and `to_srgb` is the last step of an image. Functions of samples accept any shape.
 """
 
 import dataclasses
@@ -19,34 +19,34 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """The light above the sensor, and what the skin does to it on the way to the camera. Constants are ours."""
+    """The light above the sensor, and its way through the skin to the camera. Constants are our choice."""
 
-    # light that reaches a surface from all sides, what leaks through and under the object included
+    # light that reaches a surface from all sides, including the light that leaks through and under the object
     ambient: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.36, 0.36, 0.37]))
-    # unit vectors from the object towards a window, a lamp and what the table throws back up
+    # unit vectors from the object towards a window, a lamp and the table, which reflects light
     directions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[-0.8, -0.5, 0.1], [0.6, 0.3, 0.74], [0.4, -0.5, -0.77]])
     )
     colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[0.7, 0.7, 0.68], [0.3, 0.29, 0.27], [0.3, 0.3, 0.31]])
     )
-    # sRGB of the empty view; the original's (178, 178, 204) / 255
+    # sRGB of the empty view (paper's code: (178, 178, 204) / 255)
     background: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
     haze: Scalar = 3.0  # m, height over the skin at which 1/e of an object's own light comes through
-    milk: Scalar = 0.25  # share of the empty view that the skin scatters: of as much of the sky as shines on the place
-    # of an object's light that skin and gel let through: most of the background's tint
+    milk: Scalar = 0.25  # share of the empty view that is scattered by the skin, where no object hides the sky
+    # share of an object's light that skin and gel transmit, close to the background's tint
     tint: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.8, 0.8, 1.0]))
-    crease: Scalar = 0.4  # share of its light that an object lacks on the skin, where it hides all of the sky
-    crease_height: Scalar = 0.015  # m, height over the skin at which 1/e of that is lacking
+    crease: Scalar = 0.4  # share of its light that an object on the skin loses where it hides all of the sky
+    crease_height: Scalar = 0.015  # m, height over the skin at which 1/e of this is lost
     vignette: Scalar = 0.1  # share of light lost at the pad's edge, as the square of the distance from the centre
-    rim: Scalar = 0.3  # brightness, as shown, of the housing's walls right under the pad's edge, over the pad's
-    rim_depth: Scalar = 0.03  # m, under the skin, at which the walls are 1/e as bright
-    exposure: Scalar = 1.0  # how many times longer the camera exposes for the view than for the lit skin (`expose`)
+    rim: Scalar = 0.3  # sRGB value of the housing's walls just below the pad's edge, relative to the pad
+    rim_depth: Scalar = 0.03  # m, depth below the skin at which the walls are 1/e as bright
+    exposure: Scalar = 1.0  # exposure time of the visual stream over that of the tactile stream (`expose`)
 
 
-_SKY_CELLS = 30  # about, along each side of the grid on which the sky is hidden
-_SLICES = 4  # into which an object is cut to see what it hides
-_LOWEST = 0.0015  # m, of a slice
+_SKY_CELLS = 30  # approximate number of cells along each side of the grid of `hidden_sky`
+_SLICES = 4  # slices of an object, to find the sky that it hides
+_LOWEST = 0.0015  # m, least height of a slice
 
 
 def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -62,7 +62,7 @@ def to_srgb(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    """Bilinear look-up; u runs to the right, v = 0 is the top row, and both wrap.
+    """Bilinear look-up. u runs to the right, v = 0 is the top row, and both wrap.
 
     Args:
         texture: any values.
@@ -93,22 +93,22 @@ def hidden_sky(
     x: Float[Array, "w"],
     y: Float[Array, "h"],
 ) -> Float[Array, "h w"]:
-    """Share of the sky, weighted by the cosine, that an object hides from places of the skin.
+    """Share of the sky, weighted by the cosine, that an object hides from points on the skin.
 
-    The object is cut at a few heights z, from its lowest point to its top; a slice is what of its underside lies below
-    z. At a distance d from its edge, where that is straight, a slice hides (1 - d / sqrt(d^2 + z^2)) / 2. So with K_z,
-    which integrates that edge's derivative over each cell, along y and along x, `hidden = max_z K_z slice_z K_z^T` on
-    a grid of some 5 mm; between its cells run quadratic splines.
+    The object is cut at a few heights z, from its lowest point to its top. A slice is the part of its underside below
+    z. At a distance d from a straight edge, a slice hides (1 - d / sqrt(d^2 + z^2)) / 2. K_z integrates the derivative
+    of this term over each cell, along y and along x. Then `hidden = max_z K_z slice_z K_z^T` on a grid of about 5 mm,
+    with quadratic splines between its cells.
 
     Args:
-        heights: of the object's underside over the gel's face (m), `inf` where there is none, on an even grid.
-        size: of that grid along x and y (m), the pad's; it is centred on the sensor's axis.
+        heights: of the object's underside over the gel's face (m), `inf` where there is none, on a uniform grid.
+        size: of this grid along x and y (m), which is the pad, centred on the sensor's axis.
         top: height of the object's highest point (m).
-        x: of the places, along an image's rows (m).
-        y: of the places, along its columns (m).
+        x: of the points, along an image's rows (m).
+        y: of the points, along its columns (m).
 
     Returns:
-        Shares in [0, 1]; beyond the pad those of its edge.
+        Shares in [0, 1]. Points beyond the pad have the share at its edge.
     """
     blocks = [max(1, round(cells / _SKY_CELLS)) for cells in heights.shape]
     padding = [(0, -cells % block) for cells, block in zip(heights.shape, blocks, strict=True)]
@@ -137,7 +137,7 @@ def hidden_sky(
 
 
 def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
-    """What a strip one cell wide, at a height of 1, hides from the middle of each cell."""
+    """Share of the sky that a strip, one cell wide at a height of 1, hides from the middle of each cell."""
     index = jnp.arange(number, dtype=jnp.float32)
     away = (index[None, :] - index[:, None] - 0.5) * pitch
     edge = away + pitch
@@ -145,7 +145,7 @@ def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
 
 
 def _spline(rows: Float[Array, "n k"], place: Float[Array, "m"]) -> Float[Array, "m k"]:
-    """Quadratic spline between rows, which lie at whole numbers; beyond the ends is the last of them."""
+    """Quadratic spline over rows at whole numbers, constant beyond the ends."""
     last = rows.shape[0] - 1
     place = jnp.clip(place, 0, last)
     nearest = jnp.round(place)
@@ -163,9 +163,10 @@ def housing(
     size: tuple[Scalar, Scalar],
     distance: Scalar,
 ) -> Float[Array, "*n"]:
-    """Brightness, as shown, where rays pass by the pad and meet the housing's walls, over the pad's.
+    """sRGB value of the housing's walls, relative to the pad, for rays that pass beside the pad.
 
-    A wall stands under each edge, dark, and lit by what gets in there: `rim exp(-t / rim_depth)` at t under the skin.
+    A dark wall stands below each edge of the pad. With the light that enters there, its value is
+    `rim exp(-t / rim_depth)` at a depth t below the skin.
 
     Args:
         room: its constants.
@@ -185,12 +186,12 @@ def housing(
 def empty_view(
     room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
 ) -> Float[Array, "*n 3"]:
-    """What is seen where there is no object, in linear light.
+    """The view without an object, in linear light.
 
     Args:
         room: its constants.
-        square_radius: of the place on the gel's face, from the pad's centre, over half the pad's side.
-        walls: from `housing`; its square is about linear.
+        square_radius: squared distance from the pad's centre on the gel's face, in units of half the pad's side.
+        walls: from `housing`. The square is nearly linear light.
         hidden: from `hidden_sky`.
 
     Returns:
@@ -210,9 +211,9 @@ def shade(
 ) -> Float[Array, "*n 3"]:
     """Colour of an object seen through the skin.
 
-    Lambert's law under ambient and directional light, `E = ambient + sum_m max(0, L_m . N) c_m`, of which a share of
-    `crease hidden exp(-height / crease_height)` is lacking near the skin; then the haze: `exp(-height / haze)` of it,
-    tinted, comes through, and the empty view takes the rest; then the skin's milk: `1 - milk` of that and
+    Lambert's law gives the light on the object, `E = ambient + sum_m max(0, L_m . N) c_m`. Near the skin it loses the
+    share `crease hidden exp(-height / crease_height)`. Haze transmits `exp(-height / haze)` of the object's colour,
+    tinted, and replaces the rest by the empty view. The milky skin transmits `1 - milk` of the sum and adds
     `milk (1 - hidden)` of the sky's light.
 
     Args:
@@ -221,19 +222,19 @@ def shade(
         normals: unit.
         heights: over the gel's face (m).
         empty: from `empty_view`.
-        hidden: from `hidden_sky`, of the places of the skin that the samples are seen through.
+        hidden: from `hidden_sky`, at the points of the skin in front of the samples.
 
     Returns:
         Linear light.
     """
-    # Channel by channel: an XLA program on a CPU is slow along an axis of three.
+    # Channel by channel, because XLA on a CPU is slow along an axis of three.
     directions, colors = geometry.normalize(room.directions), room.colors
     ambient, tint = jnp.asarray(room.ambient), jnp.asarray(room.tint)
     incidence = [jnp.maximum(_dot(direction, normals), 0) for direction in directions]
     heights = jnp.maximum(heights, 0)
     lit = 1 - room.crease * hidden * jnp.exp(-heights / room.crease_height)
     through = jnp.exp(-heights / room.haze)
-    # `empty` is the sky's light, less what the skin does not scatter where it is hidden.
+    # `empty` is the sky's light less the hidden part of the scattered light.
     veil = room.milk * (1 - hidden) / jnp.maximum(1 - room.milk * hidden, 1e-3)
     channels = []
     for k in range(3):

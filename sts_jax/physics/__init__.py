@@ -1,4 +1,4 @@
-"""Physics: objects fall, slide and topple on the pad in MuJoCo (`simulate`), or lie there at rest (`place`)."""
+"""Physics: objects fall, slide and topple on the pad in MuJoCo (`simulate`) or rest on it (`place`)."""
 
 from sts_jax.physics.draws import Starts, starts
 from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight

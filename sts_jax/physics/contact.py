@@ -1,18 +1,17 @@
-"""Where convex hulls touch a box's top and sides: exact candidates, and some contact points chosen among them.
+"""Contacts of convex hulls with a box's top and sides: exact candidates, and the contact points chosen from them.
 
-MJX's own test of a mesh against a box was tried and left: beside a face it counts every pair of edges, so a small
-object lying on a pad much larger than itself is pushed by contacts between its edges and the pad's distant rims (it
-never comes to rest, and some are thrown off), and every mesh compiles anew. The pad is a box
-whose sides face along the axes (the stop wall of the slope is another), so its contacts with a convex hull are of
-three kinds:
+MJX's own test of a mesh against a box is unsuitable. Beside a face it counts every pair of edges, so a small object on
+a large pad is pushed by contacts between its edges and the distant rims of the pad. It never comes to rest, or is even
+thrown off. Every mesh also compiles anew. The pad and the stop wall of the slope are boxes whose sides are parallel to
+the axes, so their contacts with a convex hull are of three kinds:
 
-- a vertex of the hull inside the box: the nearest of the top and the four sides pushes it out;
-- an edge of the hull across a rim of the top: pushed along the common normal of the two lines;
-- a corner of the top inside the hull: pushed along the normal of the nearest of the hull's lower faces.
+- a vertex of the hull inside the box. The nearest of the top and the four sides pushes it out.
+- an edge of the hull across a rim of the top. It is pushed along the common normal of the two lines.
+- a corner of the top inside the hull. The hull is pushed along the normal of the nearest of its lower faces.
 
-Each holds the true distance along its own normal. A fourth is left out: an edge across one of the box's upright edges,
-below the top, which only things that have fallen off can meet; they pass through it. C MuJoCo with a mesh is the truth
-that this is tested against.
+Each contact has the true distance along its own normal. A fourth kind is omitted: an edge across an upright edge of the
+box, below the top. Only objects that have fallen off meet these edges, and pass through them. The tests compare the
+contacts with those of a mesh in C MuJoCo.
 """
 
 from typing import NamedTuple
@@ -26,35 +25,35 @@ from scipy.spatial import ConvexHull, QhullError
 from sts_jax import geometry
 
 PAD_CONTACTS, WALL_CONTACTS = 8, 4  # MJX reserves four for each pair of boxes
-STEEP = 5.0  # depth against extent in the choice of points
-APART = 0.001  # m, between the two deepest points
-SKIN = 0.001  # m; points this much higher than the deepest one may still belong to the support
+STEEP = 5.0  # weight of depth relative to reach in the choice of contact points
+APART = 0.001  # m, least distance between the two deepest points
+SKIN = 0.001  # m, points up to this far above the deepest one may still support the object
 
 
 class Hull(NamedTuple):
     """The convex parts of an object in the mesh frame, padded to their class by repetition.
 
-    Coordinates come before points: XLA makes vector instructions of what runs along the last axis.
+    Coordinates come before points, because XLA vectorises along the last axis.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m
-    edges: Float[Array | np.ndarray, "*n 2 3 p e"]  # m, both ends; diagonals of flat faces do no harm among them
-    planes: Float[Array | np.ndarray, "*n 4 p f"]  # outward unit normal, offset (m): inside is normal . x < offset
+    edges: Float[Array | np.ndarray, "*n 2 3 p e"]  # m, both ends, including harmless diagonals of flat faces
+    planes: Float[Array | np.ndarray, "*n 4 p f"]  # outward unit normal and offset (m), with normal . x < offset inside
 
 
 class Contacts(NamedTuple):
     """Contact points in the sensor frame, in MuJoCo's convention."""
 
-    dist: Float[Array, "k"]  # m, negative is penetration, 1 where there is no contact
+    dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact
     pos: Float[Array, "k 3"]  # m, halfway between the two surfaces
     frame: Float[Array, "k 3 3"]  # rows: normal from pad to object, two tangents
 
 
 def hull(parts: np.ndarray) -> Hull:
-    """Edges and faces of the convex hulls of points; counts depend on the number of points alone.
+    """Vertices, edges and faces of convex parts. Their numbers depend only on the number of points.
 
     Args:
-        parts: (p, n, 3) m, points of each part; repetitions are ignored.
+        parts: (p, n, 3) m, points of each part. Repeated points have no effect.
 
     Raises:
         ValueError: the points of a part span no volume.
@@ -67,7 +66,7 @@ def _part(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     try:
         found = ConvexHull(points)
     except QhullError as error:
-        raise ValueError("the collision hull spans no volume; give at least four points that do") from error
+        raise ValueError("the collision hull spans no volume: give at least four non-coplanar points") from error
     sides = np.sort(found.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges = points[np.unique(sides, axis=0)]
     planes = found.equations * [1, 1, 1, -1]
@@ -85,7 +84,7 @@ _Candidates = tuple[Float[Array, "c"], Float[Array, "3 c"], Float[Array, "3 c"]]
 
 
 def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 3 h"]) -> Float[Array, "*n 3 h"]:
-    """`rotation @ points`, without the small matrix product that XLA is slow at on a CPU."""
+    """`rotation @ points` without a matrix product, because XLA is slow at small ones on a CPU."""
     x, y, z = points[..., :1, :], points[..., 1:2, :], points[..., 2:, :]
     return rotation[:, :1] * x + rotation[:, 1:2] * y + rotation[:, 2:] * z
 
@@ -106,23 +105,24 @@ def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: 
     crosses = out[0] * out[1] < 0
     share = jnp.where(crosses, out[0] / jnp.where(crosses, out[0] - out[1], 1.0), 0.0)
     point = ends[0] + share * along
-    # Where the edge ends over the box, or leaves it at a side next to the rim, across a corner.
+    # The inner end of the edge, or where it leaves the box by a side next to the rim, across a corner.
     inner, other = jnp.where(out[0] < out[1], ends[0], ends[1]), 1 - axis
     beyond = jnp.abs(inner[other]) > half[other]
     to_corner = jnp.where(inner[other] < 0, -half[other], half[other]) - point[other]
     whole = jnp.where(beyond & (inner[other] != point[other]), inner[other] - point[other], 1.0)
     inner = jnp.where(beyond, point + to_corner / whole * (inner - point), inner)
-    # It ends above the box, or inside it nearer to the top than to a side, or beyond it: it came through the top.
+    # The edge came through the top if this end is above the box, inside it and nearer to the top than to a side, or
+    # beyond its far side.
     cut = jnp.abs(sign * half[axis] - inner[axis])
     aside = jnp.abs(to_corner) * cut / jnp.sqrt(jnp.maximum(to_corner**2 + cut**2, 1e-12))
     inside = jnp.where(beyond, aside, jnp.minimum(half[0] - jnp.abs(inner[0]), half[1] - jnp.abs(inner[1])))
     through_top = (-inner[2] <= jnp.maximum(0, inside)) | (sign * inner[axis] < -half[axis])
-    # Normal to the edge and to the rim, which runs along the other axis.
+    # The normal is perpendicular to the edge and to the rim, which runs along the other axis.
     across, up = along[2], -along[axis]
     length = jnp.sqrt(across**2 + up**2)
     scale = jnp.where(up < 0, -1.0, 1.0) / jnp.where(length > 0, length, 1.0)
     across, up = scale * across, scale * up
-    # A lower inner end is itself the contact; the rim then only supports from below.
+    # If the inner end is lower, it is itself a contact, and the rim only supports the edge from below.
     tilted = sign * across >= 0
     across, up = jnp.where(tilted, across, 0.0), jnp.where(tilted, up, 1.0)
     on_rim = jnp.abs(point[other]) < half[other]
@@ -146,19 +146,19 @@ def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidate
 
 
 def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> Int[Array, "k"]:
-    """Which points to take: the two deepest, over which it would tip, and those that reach farthest around them."""
+    """Indices of the contact points: the two deepest, over which it would tip, and those that reach farthest."""
     deepest = jnp.max(depth)
     candidate = depth > jnp.maximum(0, deepest - SKIN)
 
     def best(score: Float[Array, "s c"]) -> Int[Array, "s"]:
-        # XLA's argmax is slow on CPU: the largest value, then the first place where it stands.
+        # XLA's argmax is slow on a CPU, so find the largest value and then its first index.
         score = jnp.where(candidate, score, -jnp.inf)
         places = jnp.where(score == jnp.max(score, axis=1, keepdims=True), jnp.arange(len(depth)), len(depth) - 1)
         return jnp.min(places, axis=1)
 
     first = best(depth[None])
     elsewhere = jnp.sum((across - across[:, first]) ** 2, axis=0) > APART**2
-    # Directions at fixed odd angles: no symmetric object has two equally good points at rest.
+    # An odd first angle, so that no symmetric object at rest has two equally good points.
     angle = 0.4 + 2 * np.pi * np.arange(num - 2) / (num - 2)
     reach = [x * across[0] + y * across[1] for x, y in zip(np.cos(angle), np.sin(angle), strict=True)]
     others = jnp.stack([jnp.where(elsewhere, depth, -1.0), *(r + STEEP * depth for r in reach)])
@@ -178,20 +178,20 @@ def collide(
     num: int = PAD_CONTACTS,
     plane: tuple[int, int] = (0, 1),
 ) -> Contacts:
-    """The contacts of an object with a box whose top is centred in the origin.
+    """Find the contacts of an object with a box whose top is centred at the origin.
 
-    Among them are the deepest point and, of those within SKIN of it, the deepest that is APART from it; the others,
-    within SKIN too, reach farthest in fixed directions.
+    They include the deepest point and the deepest one at least APART from it. The others reach farthest in fixed
+    directions. The depths of all are within SKIN of the largest.
 
     Args:
-        body: its convex parts.
+        body: convex parts of the object.
         pose: (7,) mesh frame in the frame of the box's top.
-        half: (2,) m, half the box's size; its top is z = 0, its depth has no end.
-        num: how many contacts.
-        plane: the axes of the plane in which they are to reach far.
+        half: (2,) m, half the size of the box in x and y. Its top is at z = 0, and its depth is infinite.
+        num: number of contacts.
+        plane: axes of the plane in which the contacts reach far.
 
     Returns:
-        `num` contacts in the frame of the box's top; those that are not needed have a distance of 1 m.
+        `num` contacts in the frame of the box's top. Unused contacts have a distance of 1 m.
     """
     rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

@@ -1,4 +1,4 @@
-"""Further starts of bodies, without a trajectory."""
+"""Further starts of bodies, without their trajectories."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,11 +14,11 @@ from sts_jax.physics.scenarios import Hidden, Scenario
 from sts_jax.physics.simulate import _check, _draw, _shapes
 from sts_jax.sensor import Sensor
 
-_FURTHER = 2**32 - 1  # folded into the key; `simulate` folds in the numbers of bodies, which are lower
+_FURTHER = 2**32 - 1  # folded into the key. `simulate` folds in the indices of bodies, which are lower
 
 
 class Starts(NamedTuple):
-    """Starts of one or more bodies, body-major; n of them."""
+    """n starts of one or more bodies, body-major."""
 
     pose: Float[Array, "n 7"]  # mesh frame in the sensor frame, w >= 0
     hidden: Hidden  # (n,) each, `up` (n, 3)
@@ -28,15 +28,15 @@ class Starts(NamedTuple):
 def starts(
     key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
 ) -> Starts:
-    """Draws `num` further starts of each body and their hidden values, without simulating them.
+    """Draw `num` further starts of each body and their hidden values, without simulating them.
 
-    They are distributed as those of `simulate` and independent of its draws with the same key. Start j of body i
-    depends on `key`, i, j and the body, not on how many others there are.
+    They have the distribution of the starts of `simulate` and are independent of its draws with the same key. Start j
+    of body i depends on `key`, i, j and the body, not on the number of other starts.
 
     Args:
-        key: of the whole set; that of `simulate` may be used again.
-        bodies: one, or a sequence of different ones.
-        sensor: `sensor.gel.size` is the pad.
+        key: for the whole set. The key of `simulate` may be used again.
+        bodies: one body, or a sequence of different ones.
+        sensor: `sensor.gel.size` is the pad's size.
         scenario: `Freefall()`, `Inclined()` or `Perturbed()`.
         num: starts of each body.
 
@@ -44,9 +44,9 @@ def starts(
         bodies * num starts, body-major.
 
     Raises:
-        BodyError: a ValueError: a body that cannot start as the scenario asks, or has bad values.
-        ValueError: another argument out of range, named.
-        TypeError: an argument that is no key, body, sensor or scenario.
+        BodyError: (a ValueError) a body cannot start in the scenario, or has bad values.
+        ValueError: another argument, which the message names, is out of range.
+        TypeError: an argument is of another type.
     """
     bodies = list(bodies) if isinstance(bodies, Sequence) and not isinstance(bodies, str) else [bodies]
     check_key(key)

@@ -1,8 +1,8 @@
-"""Trajectories in C MuJoCo, the engine of a CPU. It keeps the promises of `roll`, for several trajectories of one body.
+"""Several trajectories of one body in C MuJoCo, the engine for CPUs. The results mean the same as those of `roll`.
 
 Every vertex of the hull is a contact point of its own, as in `contact`. MuJoCo keeps only four contacts of a mesh that
-stands on a face, and a round base would be a square. The mesh itself is there for the rims of pad and wall, which
-touch the hull between its vertices.
+stands on a face, which would turn a round base into a square. The mesh itself collides with the rims of pad and wall,
+which touch the hull between its vertices.
 """
 
 from collections.abc import Sequence
@@ -19,17 +19,17 @@ from sts_jax.physics import scene
 from sts_jax.physics.roll import GONE_DEPTH, PARTED_TIME, SLOW_SPEED, SLOW_TURN, Record
 from sts_jax.physics.scenarios import Start
 
-POINT = 1e-6  # m, radius of a vertex that is a contact
-MESH_GAP = 0.0001  # m; the mesh pushes only where it is this deep, deeper than vertices at rest
-BLOCK = 8  # frames that are rolled before worlds that have ended are dropped
-# An object that is slower than both speeds for this time, under constant gravity, does not move again.
+POINT = 1e-6  # m, radius of the contact sphere at each vertex
+MESH_GAP = 0.0001  # m, depth from which the mesh pushes, more than that of vertices at rest
+BLOCK = 8  # frames rolled before worlds that have ended are dropped
+# An object slower than both speeds for this time, under constant gravity, is taken to stay at rest.
 STILL_SPEED = 0.001  # m/s
 STILL_TURN = 0.02  # rad/s
 STILL_TIME = 0.5  # s
 
 FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # the part of the state that is set at every step
-_PAD, _WALL = slice(0, 9), slice(11, 17)  # force, torque, place; force, torque
-_DEEPEST = slice(9, 11)  # whether there is any contact, and the distance of the deepest
+_PAD, _WALL = slice(0, 9), slice(11, 17)  # force, torque, position; force, torque
+_DEEPEST = slice(9, 11)  # whether there is a contact, and the distance of the deepest one
 _SENSORS = """
 <sensor>
   <contact geom1="pad" subtree2="object" reduce="netforce" data="force torque pos"/>
@@ -42,7 +42,7 @@ _WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="
 
 
 class Ends(NamedTuple):
-    """The ends of trajectories. The fields are those of `roll.State`."""
+    """Final values of trajectories. The fields mean the same as in `roll.State`."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -52,7 +52,7 @@ class Ends(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """The counts that are carried from step to step, beside MuJoCo's own state."""
+    """Counts carried from block to block, in addition to MuJoCo's own state."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -63,23 +63,23 @@ class _Counts(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """Every step of some worlds."""
+    """All steps of some worlds."""
 
     qpos: Float[np.ndarray, "n t 7"]
     qvel: Float[np.ndarray, "n t 6"]
     sensors: Float[np.ndarray, "n t k"]
-    gone: Int[np.ndarray, "n"]  # the step after which a world is gone, t for none
+    gone: Int[np.ndarray, "n"]  # the step after which the object is gone, t for none
 
     @property
     def moving(self) -> Bool[np.ndarray, "n t"]:
-        """The steps that count: all until the world is gone."""
+        """Whether a step counts: all do until the object is gone."""
         return np.arange(self.qpos.shape[1]) <= self.gone[:, None]
 
 
 def compile_body(
     parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
 ) -> mujoco.MjModel:
-    """The scene with the contacts and the sensors that `roll` needs; arguments as for `scene.compile_scene`."""
+    """The scene with the contacts and the sensors that `roll` needs. Arguments as for `scene.compile_scene`."""
     sensors = _SENSORS.format(wall=_WALL_SENSOR if wall else "")
     spec = mujoco.MjSpec.from_string(scene.scene_xml(parts, pad, contact, wall).replace("</mujoco>", sensors))
     owner = spec.body("object")
@@ -92,7 +92,7 @@ def compile_body(
 
 
 def _run(before: Int[np.ndarray, "n"], holds: Bool[np.ndarray, "n t"]) -> Int[np.ndarray, "n t"]:
-    """How many steps in a row a condition has held after each step, given how many before the first."""
+    """For how many steps in a row a condition has held, after each step, if it held for `before` at the start."""
     step = np.arange(holds.shape[1])
     return step - np.maximum.accumulate(np.where(holds, -1 - before[:, None], step), axis=1)
 
@@ -101,9 +101,9 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
     """The first step after which the whole object is GONE_DEPTH below the gel's face, t for none.
 
     Args:
-        qpos: after each step.
-        points: of the hull.
-        lowest: m, of the origin in the mesh frame, above which an object cannot be gone.
+        qpos: pose after each step.
+        points: m, vertices of the hull in the mesh frame.
+        lowest: m, height of the mesh frame's origin above which an object cannot be gone.
     """
     low = qpos[..., 2] < lowest
     gone = np.zeros(low.shape, bool)
@@ -114,7 +114,7 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
 
 
 def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
-    """The counts after some steps."""
+    """Update the counts by some steps."""
     speed, turn = (np.linalg.norm(steps.qvel[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
     sensors, moving = steps.sensors, steps.moving
     touched = (np.any(sensors[..., _PAD], axis=-1) | np.any(sensors[..., _WALL], axis=-1)) & moving
@@ -133,7 +133,7 @@ def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
 
 
 def _record(steps: _Steps, frames: int) -> Record:
-    """The last step of each frame's interval, and the mean wrench of the unbroken contact that it ends with."""
+    """Record the last step of each frame's interval, and the mean wrench of the unbroken contact at its end."""
     worlds, count = steps.gone.shape[0], steps.qpos.shape[1] // frames
     ends = np.arange(frames) * count + count - 1
     last = np.minimum(ends, steps.gone[:, None])[..., None]
@@ -168,28 +168,29 @@ def roll(
     *,
     freeze: bool = True,
 ) -> tuple[Ends, Record]:
-    """Trajectories of one body from its starts to the last frame; each depends on its own model and start alone.
+    """Roll trajectories of one body from their starts to the last frame. Each depends only on its own arguments.
 
-    The gravity of the last step is the models'; where it is another one, the difference is a force on the object's
-    centre of mass.
+    Each model has the gravity of the last step of its trajectory. In steps with another gravity, the difference acts as
+    a force on the object's centre of mass.
 
     Args:
-        models: of each trajectory, copies of one `compile_body`; their gravity is overwritten.
-        points: m, of the hull, mesh frame.
-        start: n of them.
+        models: for each trajectory, a copy of one `compile_body`. Its gravity is overwritten.
+        points: m, vertices of the hull in the mesh frame.
+        start: n starts.
         gravity: m/s^2, sensor frame, for every step of every frame's interval.
-        freeze: whether a trajectory ends once the object has been still for STILL_TIME. The object then stays where it
-            is, and its velocity becomes 0.
+        freeze: whether a trajectory ends once the object has been still for STILL_TIME. The object then keeps its pose
+            and wrench, and its velocity becomes 0.
 
     Returns:
-        How each ended, and one record per trajectory and frame.
+        Final values of each trajectory, and one record per trajectory and frame.
     """
     count, frames, steps, _ = gravity.shape
     timestep = models[0].opt.timestep
     mass = np.array([model.body("object").mass[0] for model in models])
     change = mass[:, None, None, None] * (gravity - gravity[:, -1:, -1:])
     changing = np.any(change, axis=(2, 3))
-    calm = np.where(changing.any(axis=1), frames - changing[:, ::-1].argmax(axis=1), 0)  # first frame that is
+    # The first frame from which gravity is constant.
+    calm = np.where(changing.any(axis=1), frames - changing[:, ::-1].argmax(axis=1), 0)
     for model, pull in zip(models, gravity[:, -1, -1], strict=True):
         model.opt.gravity[:] = pull
     radius = np.linalg.norm(points, axis=1).max()
@@ -213,7 +214,7 @@ def roll(
     records.pose[:] = pose[:, None]
 
     def advance(which: np.ndarray, begin: int, end: int, per_frame: int) -> _Counts:
-        """Roll some worlds through frames, the last `per_frame` steps of each interval, and keep their records."""
+        """Roll worlds through the last `per_frame` steps of each interval, and keep their records."""
         push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
         push[:, :, 1, :3] = change[which, begin:end, steps - per_frame :].reshape(len(which), -1, 3)
         xfrc[which] = 0

@@ -1,4 +1,4 @@
-"""One trajectory as a pure function: step, what is measured at every step, and one record per frame."""
+"""One trajectory as a pure function: the step, the measurements in each step, and one record per frame."""
 
 from typing import NamedTuple
 
@@ -12,43 +12,43 @@ from sts_jax.physics import scene
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide, turned
 from sts_jax.physics.scene import mjx
 
-SLOW_SPEED = 0.005  # m/s; slower than this ...
-SLOW_TURN = 0.1  # rad/s; ... and this ...
-SLOW_TIME = 0.2  # s; ... for this long is settled
-PARTED_TIME = 0.005  # s; two touches are two when they are this far apart
-GONE_DEPTH = 0.01  # m; the whole object this far below the gel's face has left the pad
+SLOW_SPEED = 0.005  # m/s, an object slower than this ...
+SLOW_TURN = 0.1  # rad/s, ... and slower than this ...
+SLOW_TIME = 0.2  # s, ... for this long has settled
+PARTED_TIME = 0.005  # s, shortest time without contact between two touches
+GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has left the pad
 
 
 class State(NamedTuple):
-    """What one step hands to the next."""
+    """The state that one step passes to the next."""
 
     qpos: Float[Array, "7"]  # m, quaternion: the pose
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
     warmstart: Float[Array, "6"]  # acceleration from which the solver starts
-    held: Int[Array, ""]  # steps until it is let go: everything is frozen
-    gone: Bool[Array, ""]  # has left the pad: everything is frozen
+    held: Int[Array, ""]  # steps until release. The state is frozen until then
+    gone: Bool[Array, ""]  # the object has left the pad. The state is frozen from then on
     slow: Int[Array, ""]  # consecutive slow steps
     apart: Int[Array, ""]  # consecutive steps without contact
-    touches: Int[Array, ""]  # contacts begun after PARTED_TIME without
-    sunk: Float[Array, ""]  # m, deepest any hull vertex or contact has been
-    finite: Bool[Array, ""]  # no state so far was non-finite
+    touches: Int[Array, ""]  # contacts that began after PARTED_TIME without contact
+    sunk: Float[Array, ""]  # m, largest depth of a hull vertex or a contact so far
+    finite: Bool[Array, ""]  # all states so far were finite
     impulse: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
     loaded: Int[Array, ""]  # number of those steps
     wall: Bool[Array, ""]  # the stop wall pushes
 
 
 class Record(NamedTuple):
-    """What is kept of one frame."""
+    """The recorded values of one frame."""
 
     pose: Float[Array | np.ndarray, "*n 7"]  # m and quaternion, w >= 0
     velocity: Float[Array | np.ndarray, "*n 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
     wrench: Float[Array | np.ndarray, "*n 6"]  # N, N m about the sensor's origin
     contact: Bool[Array | np.ndarray, "*n"]  # the pad pushes in the last step
-    wall: Bool[Array | np.ndarray, "*n"]  # the wall does
+    wall: Bool[Array | np.ndarray, "*n"]  # the stop wall pushes in the last step
 
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:
-    """The state of an object with a pose and a velocity (m/s, rad/s, sensor frame), let go after some steps."""
+    """The state of an object with a pose and a velocity (m/s, rad/s, sensor frame), released after `held` steps."""
     turn = velocity[3:] @ geometry.quat_to_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
     return State(
@@ -69,7 +69,7 @@ def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Arra
 
 
 def _fixed(model: mjx.Model) -> list[tuple[Array, Array]]:
-    """Of the pad, and of the wall where there is one: centre of the top (m) and half the size (m)."""
+    """Centre of the top (m) and half the size (m) of the pad, and of the wall if there is one."""
     geoms = np.flatnonzero(model.geom_bodyid == 0)
     return [(model.geom_pos[i] + jnp.zeros(3).at[2].set(model.geom_size[i, 2]), model.geom_size[i, :2]) for i in geoms]
 
@@ -84,7 +84,7 @@ def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts
 
 
 def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
-    """How deep (m) the deepest point is in the pad or the wall."""
+    """Depth (m) of the deepest point in the pad or the wall."""
     depths = []
     for top, half in _fixed(model):
         x, y, z = points - top[:, None]
@@ -93,9 +93,9 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
-    """One time step under a gravity (m/s^2, sensor frame) that holds for this step.
+    """Take one time step under its gravity (m/s^2, sensor frame).
 
-    The wrench is what the pad's contacts exert, without the wall's, its moment about the sensor's origin.
+    The wrench is that of the pad's contacts, without the wall's. Its moment is about the sensor's origin.
     """
     old = state
     model = model.tree_replace({"opt.gravity": gravity})
@@ -155,12 +155,12 @@ def roll(
     state: State,
     gravity: Float[Array, "frames steps 3"],
 ) -> tuple[State, Record]:
-    """One trajectory: for each frame the steps of the interval that ends with it.
+    """Roll one trajectory: for each frame, take the steps of the interval that ends with it.
 
     Args:
-        model, data: one scene.
-        hull: of the object.
-        state: at the beginning of the first frame's interval.
+        model, data: the scene in MJX.
+        hull: hull of the object.
+        state: state at the beginning of the first frame's interval.
         gravity: (frames, steps, 3) m/s^2 in the sensor frame, for every step of every interval.
 
     Returns:

@@ -1,11 +1,11 @@
-"""The one scene of all scenarios, as MuJoCo and as MJX models: a fixed pad and one free object above it.
+"""The scene of all scenarios as MuJoCo and MJX models: a fixed pad and one free object above it.
 
-The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope a stop wall, as deep as the pad, stands
-just beyond the gel's lower edge (y high). The object's body frame is its mesh frame (its inertia is given about an
-explicit centre of mass), so `qpos` is the object's pose.
+The pad is a box whose top face lies in z = 0 of the sensor frame. On the slope, a stop wall as deep as the pad stands
+just beyond the gel's lower edge (large y). The object's body frame is its mesh frame, with its inertia about an
+explicit centre of mass, so `qpos` is the object's pose.
 
-MJX steps one template model for all objects (`step`, `template`): what differs between two is a few arrays and the
-contacts. `compile_scene` is the same scene with the object's mesh, for C MuJoCo.
+MJX steps one template model for all objects (`step`, `template`). Objects differ only in a few arrays and in their
+contacts. `compile_scene` compiles the same scene with the object's mesh for C MuJoCo.
 """
 
 import contextlib
@@ -22,14 +22,14 @@ from jaxtyping import Array, Float
 
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that warp, another engine, is not installed
+with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp, another engine, is not installed
     from mujoco import mjx
 
-PAD_DEPTH = 0.2  # m; what leaves the pad slides down its side and never gets beneath it
+PAD_DEPTH = 0.2  # m, an object that leaves the pad slides down its side and never gets beneath it
 WALL_DEPTH = 0.01  # m, thickness of the stop wall
-WALL_OVERHANG = 0.5  # m, how far the wall reaches beyond the pad to either side: nothing gets to its ends
-SMALLEST_SLIP = 1e-6  # of |u|^2, what |u + alpha v|^2 is at least in the line search: more than float32's rounding
-CONDIM = 6  # rows of the solver a contact: normal, two of sliding, one of torsion, two of rolling
+WALL_OVERHANG = 0.5  # m, reach of the wall beyond the pad on either side, so that no object gets to its ends
+SMALLEST_SLIP = 1e-6  # lower bound of |u + alpha v|^2 / |u|^2 in the line search, above float32's rounding
+CONDIM = 6  # solver rows of a contact: normal, two for sliding, one for torsion, two for rolling
 
 _SCENE = """
 <mujoco>
@@ -55,28 +55,28 @@ _SCENE = """
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """The contact and solver constants of every scenario (MuJoCo's names and meanings)."""
+    """The contact and solver constants of a scenario, with MuJoCo's names and meanings."""
 
     timestep: float = 0.0005  # s
-    time_constant: float = 0.003  # s, solref; stiff: less than 0.1 mm deep at rest, about 1 mm at impact
-    damping_ratio: float = 0.8  # solref; a gel bounces little: most drops still touch, part and touch again
-    # A contact that is stiff at first touch, or whose `width` is short for the time step, rattles under what slides,
-    # and its friction is then off by up to 10 %. Where `width` is long, what leans over an edge sinks in and tips
-    # early. Both are so in C MuJoCo too.
+    time_constant: float = 0.003  # s, solref. Stiff: less than 0.1 mm deep at rest, about 1 mm at impact
+    damping_ratio: float = 0.8  # solref. A gel bounces little, but most drops still touch, part and touch again
+    # A contact that is stiff at first touch, or whose `width` is short for the time step, rattles under a sliding
+    # object, and its friction is then off by up to 10 %. With a long `width`, an object that leans over an edge sinks
+    # in and tips early. C MuJoCo behaves the same.
     soft: float = 0.02  # solimp at first touch
     hard: float = 0.99  # solimp at `width`
     width: float = 0.00002  # m, solimp
     torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
-    # Rolling friction widens the base that an object topples over by its length, so it must be small beside it.
+    # Rolling friction widens the base over which an object topples by its own length, so it must be much smaller.
     rolling: float = 0.0002  # m
-    impratio: float = 10.0  # stiffness of friction against the normal force: what holds does not creep
+    impratio: float = 10.0  # stiffness of friction against the normal force, so that objects at rest do not creep
     iterations: int = 8  # Newton iterations of one step
     ls_iterations: int = 8  # line-search iterations of one Newton iteration
 
 
 def boxes(pad: tuple[float, float], wall: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Centre (m) and half size (m) of what is fixed: the pad, and the wall where its height (m) is not 0."""
-    beneath = WALL_DEPTH if wall else 0.0  # the pad goes on beneath the wall
+    """Centre (m) and half size (m) of the fixed boxes: the pad, and the wall if its height (m) is not 0."""
+    beneath = WALL_DEPTH if wall else 0.0  # the pad extends beneath the wall
     found = [([0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2])]
     if wall:
         middle = [0, (pad[1] + WALL_DEPTH) / 2, (wall - PAD_DEPTH) / 2]
@@ -101,19 +101,19 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 
 
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
-    """The scene for C MuJoCo, which finds the contacts itself; mass properties are placeholders (`set_rigid`).
+    """Compile the scene for C MuJoCo, which finds the contacts itself. `set_rigid` replaces the mass properties.
 
     Args:
-        parts: (p, n, 3) m, points of convex parts that collide, in the mesh frame.
+        parts: (p, n, 3) m, points of the convex parts that collide, in the mesh frame.
         pad: (x, y) m, size of the pad.
-        contact: constants.
-        wall: m, height of the stop wall; 0 is none.
+        contact: contact and solver constants.
+        wall: m, height of the stop wall, 0 for none.
     """
     return mujoco.MjModel.from_xml_string(scene_xml(parts, pad, contact, wall))
 
 
 def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> str:
-    """`compile_scene`'s scene as MuJoCo's XML."""
+    """The scene of `compile_scene` as MuJoCo's XML."""
     meshes, shapes = [], []
     for index, part in enumerate(np.unique(parts, axis=0)):
         points = " ".join(f"{x:.9g}" for x in np.unique(part, axis=0).ravel())
@@ -125,22 +125,22 @@ def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wal
 def set_rigid(
     model: mujoco.MjModel, data: mujoco.MjData, mass: float, com: np.ndarray, inertia: np.ndarray, friction: float
 ) -> None:
-    """Writes an object's mass (kg), centre of mass (m), inertia about it (kg m^2) and friction into a model.
+    """Write an object's mass (kg), centre of mass (m), inertia about it (kg m^2) and friction into a model.
 
-    All constants derived from them follow (`mj_setConst`); without them the contact's stiffness would change.
+    Also update all constants derived from them (`mj_setConst`). Stale ones would change the stiffness of the contacts.
 
     Raises:
-        ValueError: a mass, inertia or friction that is not positive or not finite.
+        ValueError: a mass, inertia or friction is not positive, or a value is not finite.
     """
     if not (np.isfinite(mass) and mass > 0):
-        raise ValueError(f"mass is {mass} kg; it must be positive and finite")
+        raise ValueError(f"mass is {mass} kg, but it must be positive and finite")
     if not (np.isfinite(friction) and friction > 0):
-        raise ValueError(f"friction is {friction}; it must be positive and finite")
+        raise ValueError(f"friction is {friction}, but it must be positive and finite")
     if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
-        raise ValueError("centre of mass or inertia is not finite")
-    principal, axes = (x[..., ::-1].copy() for x in np.linalg.eigh(inertia))  # largest first, as MuJoCo does
+        raise ValueError("com or inertia has a value that is not finite, but all must be finite")
+    principal, axes = (x[..., ::-1].copy() for x in np.linalg.eigh(inertia))  # largest first, as in MuJoCo
     if principal[2] <= 0:
-        raise ValueError(f"principal moments of inertia are {principal} kg m^2; they must be positive")
+        raise ValueError(f"principal moments of inertia are {principal} kg m^2, but they must be positive")
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     body = model.body("object")
     body.mass = mass
@@ -149,10 +149,10 @@ def set_rigid(
     mujoco.mju_mat2Quat(model.body_iquat[body.id], axes.ravel())
     model.geom_friction[model.geom_bodyid > 0, 0] = friction
     mujoco.mj_setConst(model, data)
-    model.stat.meaninertia = model.dof_M0.mean()  # scales the solver's tolerance; the compiler alone sets it
+    model.stat.meaninertia = model.dof_M0.mean()  # scales the solver's tolerance. Only the compiler sets it
 
 
-# The fields of mjx.Model that `set_rigid` changes; a test compares all fields with a freshly compiled model's.
+# The fields of mjx.Model that `set_rigid` changes. A test compares all fields with a freshly compiled model's.
 DRAWN = (
     "body_mass",
     "body_subtreemass",
@@ -170,8 +170,10 @@ DRAWN = (
 def template(
     pad: tuple[float, float], contact: Contact, wall: float = 0.0
 ) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
-    """The scene that MJX steps, for every object: small boxes, of which MJX takes each for four contacts with the pad,
-    stand for the object, whose contacts with pad and wall `collide` finds.
+    """The scene that MJX steps for every object.
+
+    Small boxes stand in for the object, because MJX reserves four contacts with the pad for each box. `collide` finds
+    the contacts of the object itself with pad and wall.
     """
     count = (PAD_CONTACTS + (WALL_CONTACTS if wall else 0)) // 4
     shapes = ['type="box" size=".01 .01 .01"'] * count
@@ -180,17 +182,17 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """What `set_rigid` changed, under the names of `mjx.Model`'s fields."""
+    """The values that `set_rigid` changed, under the names of `mjx.Model`'s fields."""
     fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 
 
 def _sound_solver() -> ModuleType:
-    """A copy of MJX 3.17's solver whose line search never meets NaN.
+    """Load a copy of MJX 3.17's solver whose line search never computes NaN.
 
-    At each step length alpha it takes the root of |u + alpha v|^2, as uu + alpha (2 uv + alpha vv). In float32 that may
-    come out below zero where the tangential part is zero, which is so in free fall; the search then gives up. Of the
-    first touches of drops without spin, one in six stopped short of the contact's force, up to 0.15 m/s wrong.
+    At each step length alpha, the line search takes the root of |u + alpha v|^2 = uu + alpha (2 uv + alpha vv). In
+    float32 this sum can be negative where the tangential part is zero, as in free fall, and the search then stops.
+    One in six first touches of drops without spin missed part of the contact's force (up to 0.15 m/s wrong).
     """
     spec = importlib.util.find_spec("mujoco.mjx._src.solver")
     assert spec is not None
@@ -199,7 +201,7 @@ def _sound_solver() -> ModuleType:
     spec.loader.exec_module(solver)
     create = solver._LSPoint.create
 
-    # MJX's own signature; it has no public types.
+    # MJX's own signature, for which there are no public types.
     def point(m, d, ctx, alpha, jv, quad, quad_gauss, uu, v0, uv, vv):  # type: ignore[no-untyped-def]
         short = SMALLEST_SLIP * uu - (uu + alpha * (2 * uv + alpha * vv))
         return create(m, d, ctx, alpha, jv, quad, quad_gauss, uu + jnp.maximum(0, short), v0, uv, vv)
@@ -212,22 +214,22 @@ _SOLVER = _sound_solver()
 
 
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """The position stage of `mjx.forward`, with given contacts in place of those of the stand-in boxes."""
+    """The position stage of `mjx.forward`, with the given contacts instead of those of the stand-in boxes."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
     data = mjx.collision(model, data)
-    # MJX has no public way to hand in contacts. Should this path move, `tree_replace` fails at the first step.
+    # MJX has no public way to pass contacts in. If this path moves, `tree_replace` fails at the first step.
     data = data.tree_replace({f"_impl.contact.{name}": value for name, value in contacts._asdict().items()})
     return mjx.make_constraint(model, data)
 
 
 def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """`mjx.step` (semi-implicit Euler) with given contacts."""
+    """`mjx.step` (semi-implicit Euler) with the given contacts."""
     data = mjx.fwd_velocity(model, position(model, data, contacts))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     return mjx.euler(model, _SOLVER.solve(model, data))
 
 
 def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:
-    """Force (N, sensor frame) and moment about the object's origin (N m, mesh frame) that some contacts exert."""
+    """Force (N, sensor frame) and moment about the object's origin (N m, mesh frame) of some of the contacts."""
     rows = slice(contacts.start * CONDIM, contacts.stop * CONDIM)
     return data._impl.efc_force[rows] @ data._impl.efc_J[rows]

@@ -1,4 +1,4 @@
-"""`simulate`: bodies, draws and chunks on the host, MJX or C MuJoCo underneath."""
+"""`simulate`: prepares bodies, draws and chunks on the host, and runs them in MJX or C MuJoCo."""
 
 import concurrent.futures
 import contextlib
@@ -28,14 +28,14 @@ from sts_jax.physics.scenarios import Hidden, Outcome, Scenario, Shape, Start
 from sts_jax.physics.scene import Contact, mjx
 from sts_jax.sensor import Sensor
 
-# m, the paper's gel is as thick; a trajectory in which the object went deeper is drawn again. Contacts are found once a
-# step: what turns fast and hits with a corner, at 3 m/s, is 3 mm deep before they push.
+# m, thickness of the paper's gel. A trajectory in which the object goes deeper is drawn again. Contacts are found once
+# per step, so a fast-turning object whose corner hits at 3 m/s is 3 mm deep before they push.
 SUNK_LIMIT = 0.005
 ATTEMPTS = 5  # draws of one trajectory before giving up
-RIGIDS = 8  # draws of which mass properties are computed at once
-COMPILED = 64  # bodies whose model C MuJoCo keeps
-CONTENTS = 16  # of each body, by which a start may be chosen
-WORKERS = 2  # chunks under way at once in MJX: XLA runs these small steps on one CPU core each
+RIGIDS = 8  # draws whose mass properties are computed at once
+COMPILED = 64  # bodies whose compiled model is kept for C MuJoCo
+CONTENTS = 16  # draws of a body's contents by which a start may be chosen
+WORKERS = 2  # chunks at once in MJX, because XLA runs these small steps on one CPU core each
 
 Engine = Literal["mjx", "mujoco"]
 
@@ -53,30 +53,30 @@ class BodyError(ValueError):
 
 
 class Trajectory(NamedTuple):
-    """Trajectories of one or more bodies, body-major; n of them, f frames each."""
+    """n trajectories of one or more bodies, body-major, with f frames each."""
 
     time: Float[Array, "n f"]  # s, 0 at frame 0
     pose: Float[Array, "n f 7"]  # mesh frame in the sensor frame, w >= 0
     velocity: Float[Array, "n f 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
-    # N, N m about the sensor's origin: what the pad exerts on the object, the mean over the unbroken contact that ends
-    # with the frame, within its interval; 0 where the last step before the frame has no contact.
+    # N, N m about the sensor's origin, exerted by the pad on the object: the mean over the unbroken contact at the end
+    # of the frame's interval, or 0 if the last step of the interval has no contact.
     wrench: Float[Array, "n f 6"]
     contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
     wall: Bool[Array, "n f"]  # the stop wall pushes in the frame's last step
     gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
     settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
-    # Outcome, of the poses of the first and the last frame; an end where `settled`, else what it is at the last frame
+    # Outcome from the poses of the first and the last frame. It is final where `settled`
     outcome: Int[Array, "n"]
-    touches: Int[Array, "n"]  # contacts with pad or wall, parted by at least 5 ms
-    sunk: Float[Array, "n"]  # m, deepest the hull went into pad or wall
+    touches: Int[Array, "n"]  # contacts with pad or wall, separated by at least 5 ms
+    sunk: Float[Array, "n"]  # m, largest depth of the hull in pad or wall
     condition: Float[Array, "n c"]  # the scenario's input
     hidden: Hidden  # (n,) each, `up` (n, 3)
     body: Int[Array, "n"]  # index into the sequence of bodies
-    resampled: Int[Array, "n"]  # draws thrown away because non-finite or sunken
+    resampled: Int[Array, "n"]  # draws discarded because non-finite or too deep
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
-        """The outcome of each trajectory: `Outcome.FELL_OFF` is printed as "fell off"."""
+        """The outcome of each trajectory. `Outcome.FELL_OFF` prints as "fell off"."""
         return tuple(Outcome(int(number)) for number in np.ravel(self.outcome))
 
     def __repr__(self) -> str:
@@ -96,9 +96,9 @@ class Trajectory(NamedTuple):
 
 
 class _Worlds(NamedTuple):
-    """What one call of MJX steps, a leading axis of trajectories everywhere."""
+    """The arrays that one call of MJX steps, with a leading axis of trajectories."""
 
-    fields: dict[str, Array]  # of the model, see scene.drawn
+    fields: dict[str, Array]  # fields of the model, see `scene.drawn`
     hull: Hull
     start: Start
     gravity: Float[Array, "n f s 3"]
@@ -142,12 +142,12 @@ _rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
 
 @contextlib.contextmanager
 def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[int], object]]:
-    """The function to call with the number of trajectories done: the caller's, a bar's, or one that does nothing."""
+    """The function to call with the number of trajectories done: the caller's, a bar's, or one without effect."""
     if callable(progress):
         yield progress
         return
     if not isinstance(progress, bool):
-        raise TypeError(f"progress is {progress!r}; it takes True, False or a function of the number done")
+        raise TypeError(f"progress is {progress!r}, but it must be True, False or a function of the number done")
     first = "simulate: compiling" if engine == "mjx" else "simulate"
     with tqdm(total=count, desc=first, unit=" trajectories", disable=not progress) as bar:
 
@@ -159,35 +159,35 @@ def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[i
 
 
 def _check(bodies: Sequence[Any], sensor: Any, scenario: Any, num: Any, chunk: Any) -> None:
-    """Raise an error for any argument that `simulate` cannot take, of whatever kind it is."""
+    """Raise an error for any argument that `simulate` cannot take, whatever its type."""
     for name, count in (("num", num), ("chunk", chunk)):
         whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
         if not whole or count < 1:
-            raise ValueError(f"{name} is {count!r}; it takes a whole number of trajectories, at least 1")
+            raise ValueError(f"{name} is {count!r}, but it must be a whole number of trajectories >= 1")
     if not bodies:
-        raise ValueError("no body was given; pass one Body or a sequence of them")
+        raise ValueError("no body was given: pass one Body or a sequence of them")
     if not isinstance(sensor, Sensor):
-        raise TypeError(f"sensor is {sensor!r}; it takes a Sensor, for instance sts.Sensor()")
+        raise TypeError(f"sensor is {sensor!r}, but it must be a Sensor, for instance sts.Sensor()")
     if isinstance(scenario, type) or not hasattr(scenario, "check"):
-        raise TypeError(f"scenario is {scenario!r}; it takes Freefall(), Inclined() or Perturbed()")
+        raise TypeError(f"scenario is {scenario!r}, but it must be Freefall(), Inclined() or Perturbed()")
     scenario.check()
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):
             raise TypeError(
-                f"body {i} is {body!r}; it takes a Body or a sequence of them: objects.make draws one, objects.load "
-                "reads a mesh file"
+                f"body {i} is {body!r}, but it must be a Body: objects.make draws one, objects.load reads a mesh file. "
+                "For several, pass a sequence of them"
             )
         known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
         if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
             raise BodyError(
                 i,
-                f"hulls has shape {body.hulls.shape}; expected (p, n, 3), p in {objects.PART_CLASSES}, "
+                f"hulls has shape {body.hulls.shape}, but it must be (p, n, 3) with p in {objects.PART_CLASSES} and "
                 f"n in {objects.HULL_CLASSES}",
             )
         if not np.isfinite(body.hulls).all():
-            raise BodyError(i, "hulls has a non-finite vertex")
+            raise BodyError(i, "hulls has a non-finite vertex, but all must be finite")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
-            raise BodyError(i, f"shell_mass is {body.shell_mass} kg; it must be positive and finite: give load a mass")
+            raise BodyError(i, f"shell_mass is {body.shell_mass} kg, but it must be > 0 and finite: give load a mass")
         try:
             body.check()
         except ValueError as error:
@@ -195,18 +195,18 @@ def _check(bodies: Sequence[Any], sensor: Any, scenario: Any, num: Any, chunk: A
 
 
 def refusal(body: Body, scenario: Scenario) -> str | None:
-    """Why an object cannot start as a scenario asks, or None if it can.
+    """The reason why an object cannot start in a scenario, or None if it can.
 
     Args:
         body: one object, whose hull spans a volume.
-        scenario: what is asked.
+        scenario: scenario of the start.
     """
     return _refusal(_rests(body)[0], scenario)
 
 
 def _refusal(rests: np.ndarray, scenario: Scenario) -> str | None:
     if not len(rests):
-        return "its centre of mass lies outside its hull, it rests on no face"
+        return "it rests on no face, because its centre of mass lies outside its hull or at the edge of every face"
     if scenario.must_stand and rests[:, 2].max() < math.cos(UPRIGHT):
         return f"it does not stand upright (+z up), as {type(scenario).__name__} needs"
     return None
@@ -228,7 +228,7 @@ def _hulls(bodies: Sequence[Body]) -> list[Hull]:
 
 
 def _shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
-    """What decides the starts of each body, padded to a common size."""
+    """The properties that determine the starts of each body, padded to a common size."""
     found = [(np.asarray(body.hulls).reshape(-1, 3), *_rests(body)) for body in bodies]
     for index, (_, rests, _) in enumerate(found):
         reason = _refusal(rests, scenario)
@@ -253,17 +253,19 @@ def _check_hidden(hidden: Hidden, count: int) -> Hidden:
     for name, values in arrays.items():
         expected = (count, 3) if name == "up" else (count,)
         if values.shape != expected:
-            raise ValueError(f"hidden.{name} has shape {values.shape}; expected {expected}, {count} = bodies times num")
+            raise ValueError(
+                f"hidden.{name} has shape {values.shape}, but it must be {expected}, because bodies * num is {count}"
+            )
         if not np.isfinite(values).all():
-            raise ValueError(f"hidden.{name} has a value that is not finite")
+            raise ValueError(f"hidden.{name} has a value that is not finite, but all must be finite")
     fill = arrays["fill"]
     if fill.min() < 0 or fill.max() > 1:
-        raise ValueError(f"hidden.fill reaches from {fill.min()} to {fill.max()}; a share is from 0 to 1")
+        raise ValueError(f"hidden.fill reaches from {fill.min()} to {fill.max()}, but a share must be from 0 to 1")
     for name in ("shell_scale", "friction"):
         if arrays[name].min() <= 0:
-            raise ValueError(f"hidden.{name} has the value {arrays[name].min()}; it must be positive")
+            raise ValueError(f"hidden.{name} has the value {arrays[name].min()}, but it must be > 0")
     if not np.allclose(np.linalg.norm(arrays["up"], axis=1), 1, atol=1e-3):
-        raise ValueError("hidden.up has rows that are no unit vectors; divide each by its length")
+        raise ValueError("hidden.up has rows that are not unit vectors: divide each row by its length")
     return Hidden(**jax.tree.map(jnp.asarray, arrays))
 
 
@@ -277,7 +279,7 @@ class Rigid(NamedTuple):
 
 
 def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
-    """Mass properties (`objects.rigid`) and friction of draws.
+    """Compute the mass properties (`objects.rigid`) and the friction of draws.
 
     Args:
         bodies: the bodies.
@@ -285,14 +287,14 @@ def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) 
         hidden: the hidden values of each draw.
 
     Returns:
-        (n,) each, in the order of the draws.
+        n values each, in the order of the draws.
     """
     values = jax.tree.map(np.asarray, hidden)
     found = []
     for index in np.unique(which).tolist():
         mine = np.flatnonzero(which == index)
         for rows in np.split(mine, range(RIGIDS, len(mine), RIGIDS)):
-            # Always as many at once: another number rounds differently, and compiles anew.
+            # Always the same number at once, because another number rounds differently and compiles anew.
             own = Hidden(*(x[np.resize(rows, RIGIDS)] for x in values))
             rigid = _rigid(bodies[index], own.fill, own.shell_scale, own.up)
             found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])
@@ -309,7 +311,7 @@ def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rig
 def _draws(
     bodies: Sequence[Body], which: np.ndarray, hidden: Hidden, pad: tuple[float, float], constants: Contact, wall: float
 ) -> dict[str, np.ndarray]:
-    """The fields of MJX's model of each draw: MuJoCo derives them from mass, centre of mass, inertia and friction."""
+    """The fields of MJX's model for each draw, which MuJoCo derives from mass properties and friction."""
     original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
     data = mujoco.MjData(model)
@@ -321,19 +323,19 @@ def _draws(
     return {name: np.stack([f[name] for f in fields]) for name in fields[0]}
 
 
-# The end and the records of the trajectories with some indices.
+# Takes indices of trajectories, and returns their final values and records.
 _Run = Callable[[np.ndarray], tuple[State | native.Ends, Record]]
 
 
 class _Set(NamedTuple):
-    """Everything about a set of trajectories that no draw changes."""
+    """The properties of a set of trajectories that no draw changes."""
 
     bodies: list[Body]
-    which: Int[np.ndarray, "n"]  # index of the body of each
+    which: Int[np.ndarray, "n"]  # index of the body of each trajectory
     hulls: list[Hull]
     scenario: Scenario
     pad: tuple[float, float]  # m
-    time: Float[Array, "f s"]  # s, at which each step begins
+    time: Float[Array, "f s"]  # s, time at which each step begins
 
 
 def _in_mjx(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _Run:
@@ -356,7 +358,7 @@ def _in_mjx(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _R
 
 
 def _in_c(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _Run:
-    """As `_in_mjx`; the trajectories of one call are of one body."""
+    """As `_in_mjx`, but all trajectories of one call have the same body."""
     bodies, which, _, scenario, pad, time = trajectories
     rigid = rigids(bodies, which, hidden)
     starts = jax.tree.map(np.asarray, starts)
@@ -373,7 +375,7 @@ def _in_c(trajectories: _Set, starts: Start, hidden: Hidden, chunk: int) -> _Run
             models.append(copy.copy(compiled(body)))
             _set_rigid(models[-1], data, body, rigid, i)
         start = jax.tree.map(lambda x: x[indices], starts)
-        padded = np.pad(start.condition, ((0, chunk - len(indices)), (0, 0)))  # one size: `_gravity` compiles once
+        padded = np.pad(start.condition, ((0, chunk - len(indices)), (0, 0)))  # so that `_gravity` compiles once
         gravity = np.asarray(_gravity(padded, time, scenario=scenario), np.float64)[: len(indices)]
         return native.roll(models, np.unique(np.asarray(bodies[body].hulls).reshape(-1, 3), axis=0), start, gravity)
 
@@ -392,41 +394,41 @@ def simulate(
     chunk: int = 32,
     engine: Engine | None = None,
 ) -> Trajectory:
-    """Simulates `num` trajectories of each body: random start, hidden values, contact with the pad.
+    """Simulate `num` trajectories of each body with random starts and hidden values.
 
-    Trajectory j of body i depends on `key`, i, j and the body, not on how many others there are. Non-finite ones and
-    those sunken into the pad deeper than SUNK_LIMIT are drawn again with a fresh key and counted in `resampled`.
+    Trajectory j of body i depends on `key`, i, j and the body, not on the number of other trajectories. Trajectories
+    that are non-finite or sink deeper into the pad than SUNK_LIMIT are drawn again with a fresh key (`resampled`).
 
     Args:
-        key: of the whole set.
-        body: one, or a sequence of different ones.
-        sensor: `sensor.gel.size` is the pad.
+        key: for the whole set.
+        body: one body, or a sequence of different ones.
+        sensor: `sensor.gel.size` is the pad's size.
         scenario: `Freefall()`, `Inclined()` or `Perturbed()`.
         num: trajectories of each body.
-        hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major: rolls the starts of `key` with these instead
-            of drawn ones; where `resampled` is not 0 the start is another one.
-        progress: True shows a bar on standard error, or in a notebook: MJX compiles for tens of seconds before the
-            first chunk is done. A function is called with the number of trajectories done so far, after each chunk.
-        chunk: trajectories that MJX steps at once; another number compiles anew and rounds differently. Larger ones
-            suit a GPU. C MuJoCo takes at most so many, of one body, in one thread; its results do not depend on it.
-        engine: "mujoco" is C MuJoCo, on all CPU cores, several times as fast there and with nothing to compile; "mjx"
-            runs on the device of JAX. None takes the faster one of the machine: "mujoco" where
-            `jax.default_backend()` is "cpu". Both have the same starts and hidden values for a key.
+        hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major. Replaces the drawn values. The starts remain
+            those of `key`, except where `resampled` is not 0.
+        progress: True shows a bar on standard error or in a notebook. MJX compiles for tens of seconds before the first
+            chunk is done. A function is called after each chunk with the number of trajectories done so far.
+        chunk: trajectories that MJX steps at once. Another number compiles anew and rounds differently. Larger ones
+            suit a GPU. C MuJoCo takes at most this many, of one body, in one thread. Its results do not depend on it.
+        engine: "mujoco" is C MuJoCo on all CPU cores, where it is several times as fast and compiles nothing. "mjx"
+            runs on the device of JAX. None takes the faster one, "mujoco" if `jax.default_backend()` is "cpu". Both
+            have the same starts and hidden values for a key.
 
     Returns:
         bodies * num trajectories, body-major.
 
     Raises:
-        BodyError: a ValueError: a body that cannot start as the scenario asks, has bad values, or a trajectory of which
-            fails in every attempt.
-        ValueError: another argument out of range, named.
-        TypeError: an argument that is no key, body, sensor or scenario.
+        BodyError: (a ValueError) a body cannot start in the scenario, has bad values, or has a trajectory that fails in
+            every attempt.
+        ValueError: another argument, which the message names, is out of range.
+        TypeError: an argument is of another type.
     """
     bodies = list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
     check_key(key)
     _check(bodies, sensor, scenario, num, chunk)
     if engine not in (None, *get_args(Engine)):
-        raise ValueError(f"engine is {engine!r}; it takes {', '.join(map(repr, get_args(Engine)))} or None")
+        raise ValueError(f"engine is {engine!r}, but it must be {', '.join(map(repr, get_args(Engine)))} or None")
     count = len(bodies) * num
     given = None if hidden is None else _check_hidden(hidden, count)
     pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
@@ -434,12 +436,12 @@ def simulate(
     shapes = _shapes(bodies, scenario)
     which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
     frame = np.arange(scenario.frames)[:, None] / scenario.rate
-    time = jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep)  # of each step
+    time = jnp.asarray(frame - np.arange(scenario.steps, 0, -1) * scenario.contact.timestep)  # begin of each step
     trajectories = _Set(bodies, which, hulls, scenario, pad, time)
     if engine is None:
         engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     prepare, workers = (_in_mjx, WORKERS) if engine == "mjx" else (_in_c, os.cpu_count() or 1)
-    # Those of one call: of one size in MJX, of one body in C.
+    # The trajectories of one call have hulls of one size in MJX, and one body in C MuJoCo.
     alike = np.array([b.hulls.size for b in bodies])[which] if engine == "mjx" else which
 
     attempt = np.zeros(count, np.int32)
@@ -466,8 +468,8 @@ def simulate(
                 worst = int(attempt.argmax())
                 raise BodyError(
                     int(which[worst]),
-                    f"trajectory {nth[worst]} is non-finite or sunken deeper than {SUNK_LIMIT} m in {ATTEMPTS} draws; "
-                    "is its hull too thin or its mass out of scale?",
+                    f"trajectory {nth[worst]} is non-finite or sinks deeper than {SUNK_LIMIT} m in {ATTEMPTS} draws: "
+                    "check the thickness of the hull and the mass",
                 )
 
     last, records = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))

@@ -1,7 +1,7 @@
 """The gel as a bed of springs, in equilibrium with the wrench that the pad exerts on the object.
 
-Heights are those of the object's underside over the gel's face (m, positive outwards), on a grid of the gel's own;
-row 0 is the cell row of lowest y, column 0 that of lowest x, as in an image.
+Heights are those of the object's underside over the gel's face (m, positive outwards), on the gel's grid. As in an
+image, row 0 has the lowest y and column 0 the lowest x.
 """
 
 import dataclasses
@@ -13,12 +13,12 @@ from jaxtyping import Array, Bool, Float, ScalarLike
 from sts_jax import _math
 
 _NEWTON_STEPS = 20  # at most
-_SETTLED = 1e-7  # m, a step shorter than this is the last
-_ENOUGH = 0.5  # of the energy's slope along a whole step may be left at its end; else a shorter one is tried
+_SETTLED = 1e-7  # m, the iteration ends after a step shorter than this
+_ENOUGH = 0.5  # a full step is accepted if it reduces the energy's slope along it to this share
 _STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
-_LEVER = 0.02  # m, by which tilts are scaled
-_BOTTOM = 300.0  # how many times stiffer the springs are beyond the deepest imprint
-_FAR = 1.0  # m, stands for the height where there is no object
+_LEVER = 0.02  # m, lever by which tilts are scaled to heights
+_BOTTOM = 300.0  # stiffness of the hard bottom beyond `max_depth`, relative to the springs
+_FAR = 1.0  # m, height in the place of inf, where there is no object
 
 
 Scalar = float | Array
@@ -31,19 +31,19 @@ class Gel:
 
     size: tuple[Scalar, Scalar] = (0.15, 0.15)  # m, along x and y (paper, "Real-World Dataset")
     thickness: Scalar = 0.005  # m (paper, supplement "Simulator Details")
-    stiffness: Scalar = 2e6  # N/m^3, per area; about 10 kPa over 5 mm: a bottle sinks 0.2-0.3 mm. Ours.
-    max_depth: Scalar = 0.003  # m, deepest imprint that an equilibrium may ask for. Ours.
-    max_tilt: Scalar = 0.0873  # rad (5 degrees), about x and about y each, from the given pose. Ours.
-    tolerance: Scalar = 0.005  # of Fz, and of Fz times 1 cm for the moments: what counts as balanced. Ours.
+    stiffness: Scalar = 2e6  # N/m^3, about 10 kPa over 5 mm, so that a bottle sinks 0.2-0.3 mm. Our choice.
+    max_depth: Scalar = 0.003  # m, limit of the imprint in an equilibrium. Our choice.
+    max_tilt: Scalar = 0.0873  # rad (5 degrees), limit about x and about y, from the given pose. Our choice.
+    tolerance: Scalar = 0.005  # allowed error, over Fz, or over Fz times 1 cm for moments. Our choice.
     cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata={"static": True})  # rows, columns: 1 mm
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """How a rigid object lies in the gel."""
+    """The equilibrium of a rigid object in the gel."""
 
-    sink: Float[Array, "*n"]  # m, how far it moves along -z, after the turn
+    sink: Float[Array, "*n"]  # m, motion of the object along -z, after the turn
     turn: Float[Array, "*n 2"]  # rad, rotation vector about the sensor's x and y axes
     pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid
     balanced: Bool[Array, "*n"]  # whether the pressure balances Fz, Mx and My
@@ -64,14 +64,14 @@ def cell_area(gel: Gel) -> Float[Array, ""]:
 
 
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
-    """The imprint that a pose asks for by itself: the object stays where it is, `p = k max(0, -h)`.
+    """The imprint of an object that stays in its pose, `p = k max(0, -h)`.
 
     Args:
-        gel: its constants.
+        gel: constants of the gel.
         heights: of the object's underside over the gel's face (m), `inf` where there is none.
 
     Returns:
-        Equilibrium without motion; balanced, as there is no wrench to balance.
+        Equilibrium without motion, balanced because there is no wrench to balance.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))
@@ -84,27 +84,27 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
         Fz = sum p A,   Mx = sum y p A,   My = -sum x p A
 
-    are the stationarity of `E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b`, which is convex and piecewise
-    quadratic: projected Newton steps with a line search, from an imprint as deep as the limit allows below first
-    touch. Beyond `max_depth` the springs meet a hard bottom, which carries what is left and counts for nothing in the
+    are the conditions for a minimum of `E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b`, which is convex and
+    piecewise quadratic. Projected Newton steps with a line search find it, starting at the largest depth below first
+    touch. Beyond `max_depth` the springs meet a hard bottom, which carries the rest of the load and adds nothing to the
     pressure. Derivatives are those of the equilibrium (implicit function theorem: one more Newton step, undamped).
 
     Args:
-        gel: its constants.
+        gel: constants of the gel.
         heights: of the object's underside over the gel's face (m), `inf` where there is none.
-        wrench: force (N) and moment about the sensor's origin (N m) of the pad on the object; Fx, Fy and Mz are
-            friction and play no part.
+        wrench: force (N) and moment about the sensor's origin (N m) of the pad on the object. Fx, Fy and Mz are
+            friction and ignored.
 
     Returns:
-        Equilibrium. With `Fz <= 0` nothing moves and nothing is pressed. Where no equilibrium exists (first touch
-        farther off than `max_depth`, centre of pressure outside what the footprint can carry, a limit reached) it is
-        what the limits allow, and `balanced` is False.
+        Equilibrium. With `Fz <= 0` there is no motion and no pressure. If no equilibrium exists (first touch farther
+        off than `max_depth`, centre of pressure that the footprint cannot carry, a limit reached), the result is within
+        the limits, and `balanced` is False.
     """
     force = wrench[2]
     pressed = force > 0
     safe_force = jnp.where(pressed, force, 1)
-    load = jnp.where(pressed, force, 0) / (gel.stiffness * cell_area(gel))  # sum of the springs' lengths (m)
-    # Tilts are taken about the centre of pressure, and measured by the height they make a lever's length from it.
+    load = jnp.where(pressed, force, 0) / (gel.stiffness * cell_area(gel))  # sum of the springs' compressions (m)
+    # Tilts are about the centre of pressure, in metres of height at a distance of `_LEVER` from it.
     half_x, half_y = gel.size[0] / 2, gel.size[1] / 2
     wanted_x, wanted_y = -wrench[4] / safe_force, wrench[3] / safe_force
     on_pad = (jnp.abs(wanted_x) <= half_x) & (jnp.abs(wanted_y) <= half_y)
@@ -124,11 +124,12 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
     u = jnp.where(pressed & reach, u, 0)
     length = _plane(u, x, y) - height
-    # The hard bottom gives way, far where it is all that carries: the deepest spring ends at the limit.
+    # The hard bottom yields, and far if it alone carries the load: lift the object until the deepest spring is at the
+    # limit.
     beyond = jnp.where(pressed & reach, jnp.maximum(_math.most(jnp.max(length, axis=0)) - gel.max_depth, 0), 0)
     length = jnp.where(pressed & reach, jnp.clip(length - beyond, 0, gel.max_depth), 0)
 
-    # the moments' errors over a lever of 1 cm
+    # moments count as forces at a lever of 1 cm
     residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
     balanced = ~pressed | (reach & on_pad & jnp.all(residual <= gel.tolerance * load))
     return Equilibrium(
@@ -148,7 +149,7 @@ def _newton(
     bound: Float[Array, "3"],
     limit: Scalar,
 ) -> Float[Array, "3"]:
-    """The plane `u0 + u1 y + u2 x` whose springs to `height` have the moments `target`, or what comes nearest."""
+    """The plane `u0 + u1 y + u2 x` whose springs to `height` have the moments `target`, or the nearest ones."""
     near_bound = 0.9999 * bound
 
     def pushed(length: Array) -> Array:
@@ -157,7 +158,7 @@ def _newton(
     def slopes(
         u: Float[Array, "3"], height: Array, x: Array, y: Array, target: Array
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Of the energy: its gradient and its Hessian, a little stiffened."""
+        """Gradient and slightly stiffened Hessian of the energy."""
         length = _plane(u, x, y) - height
         weight = (length > 0) + _BOTTOM * (length > limit)
         gradient = _moments(pushed(length), x, y) - target
@@ -169,7 +170,7 @@ def _newton(
         count, u, _, gradient, matrix = state
         held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
         step = -_solve(matrix, gradient, held)
-        # At a limit, and still led beyond it by the other unknowns: without this one.
+        # Hold an unknown at its limit too if the other unknowns would drive it beyond.
         held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
         step = -_solve(matrix, gradient, held)
         room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
@@ -206,7 +207,7 @@ def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> 
 
 def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"], degree: int) -> Float[Array, "k k"]:
     """`sum value y^i x^j` at [i, j]."""
-    # Sums along columns, one by one: products of matrices as narrow as this are several times slower on a CPU.
+    # One sum along columns per power, because products of such narrow matrices are several times slower on a CPU.
     rows = [jnp.sum(value, axis=0), *(y**power @ value for power in range(1, degree + 1))]
     return jnp.stack(rows) @ jnp.stack([x**power for power in range(degree + 1)], axis=1)
 
@@ -217,7 +218,7 @@ def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "
 
 
 def _solve(matrix: Float[Array, "3 3"], vector: Float[Array, "3"], held: Bool[Array, "3"]) -> Float[Array, "3"]:
-    """Solve among the unknowns that are not held; 0 for those that are."""
+    """Solve for the unknowns that are not held. The others are 0."""
     matrix = jnp.where(held[:, None] | held[None, :], jnp.eye(3), matrix)
     vector = jnp.where(held, 0, vector)
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]

@@ -1,6 +1,6 @@
-"""The drawn skin: lateral coupling, surface normals, lights far and near, shadows, Phong's reflectance, darkening.
+"""The lit skin: lateral coupling, surface normals, far and near lights, shadows, Phong reflectance, darkening.
 
-Images are float32, (height, width, 3). Nothing here clips to [0, 1]: a pixel adds up its light first.
+Images are float32, (height, width, 3), and not clipped to [0, 1], because a pixel first sums its light.
 """
 
 import dataclasses
@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 
 from sts_jax import _math, geometry
 
-_NEAREST = 1e-4  # m, a light is never nearer than this to what it lights
-_BRIGHTEST = 60.0  # log of how much brighter than at its reference distance a light can get: no overflow
-_FAINTEST = 1e-20  # cosines below it make no highlight: their power would not be a number in the gradient
+_NEAREST = 1e-4  # m, least distance between a light and a lit point
+_BRIGHTEST = 60.0  # log of the largest brightness relative to the reference distance, against overflow
+_FAINTEST = 1e-20  # smaller cosines make no highlight, because the gradient of their power would be NaN
 
 
 Scalar = float | Array
@@ -24,7 +24,7 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lights:
-    """Directional lights in the gel's plane, one from each edge: red, green, blue, white (the original's)."""
+    """Directional lights in the gel's plane, one from each edge: red, green, blue, white (paper's code)."""
 
     # unit vectors from the skin towards the lights, sensor frame: left, right, top, bottom edge of the image
     directions: Float[Array, "*n m 3"] = dataclasses.field(
@@ -39,10 +39,10 @@ class Lights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Leds:
-    """Near lights: points that light the skin from where they are. All constants are ours.
+    """Near lights: points at a finite distance. All constants are our choice.
 
-    By default they shine at a grazing angle into the pad's edges, as bright as the camera's range allows: on the empty
-    pad no pixel is at the end of the range. Each side of the pad has its colour, and so have the flanks that face it.
+    By default they shine at a grazing angle into the pad's edges, as brightly as the camera's range allows: no pixel of
+    the empty pad is clipped. Each side of the pad has its own colour, which lights the flanks that face it.
     """
 
     # m, sensor frame: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm under the gel's face
@@ -55,20 +55,20 @@ class Leds:
     colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[0.7, 0, 0], [0, 0.7, 0], [0, 0, 0.7], [0.7, 0.7, 0.7]])
     )
-    falloff: Scalar = 1.0  # power of the distance by which light falls off; 2: a point, 1: a long strip, 0: none
-    reference: Scalar = 0.08  # m, distance at which a light has its colour
+    falloff: Scalar = 1.0  # exponent of the fall-off with distance. 2: a point, 1: a long strip, 0: none
+    reference: Scalar = 0.08  # m, distance at which a light has the intensity `colors`
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """How the skin follows what presses on it, and whether its raised parts stand in each other's light."""
+    """How the skin follows an object that presses on it, and whether its raised parts cast shadows on each other."""
 
-    coupling: Scalar = 0.0  # m, standard deviation of the Gaussian that smooths the imprint; 0 as in the paper
-    # steps along the way to each light; 0: no shadows, as in the paper
+    coupling: Scalar = 0.0  # m, standard deviation of the Gaussian that smooths the imprint, 0 as in the paper
+    # steps along the way to each light, 0 for no shadows as in the paper
     shadow_steps: int = dataclasses.field(default=0, metadata={"static": True})
-    shadow_reach: Scalar = 0.02  # m along the gel's face: how far a raised part's shadow is followed. Ours.
-    penumbra: Scalar = 0.1  # rad, how tall a light looks: where all of it is hidden it is dark. Ours.
+    shadow_reach: Scalar = 0.02  # m along the gel's face, longest shadow of a raised part. Our choice.
+    penumbra: Scalar = 0.1  # rad, angular height of a light, which is dark where all of it is hidden. Our choice.
 
 
 @jax.tree_util.register_dataclass
@@ -81,23 +81,23 @@ class Phong:
     specular: Scalar = 0.5  # k_s (paper, as above)
     shininess: Scalar = 5.0  # alpha (paper, as above)
     ambient_color: tuple[Scalar, Scalar, Scalar] = (0.8725, 0.8725, 1.0)  # i_a: a flat gel is (178, 178, 204) / 255
-    darkening: Scalar = 0.001  # m, depth at which the skin is 1/e as bright; the paper names the mask, not its shape
+    darkening: Scalar = 0.001  # m, depth at which the skin is 1/e as bright (paper: a mask, without its shape)
 
 
 def surface_normals(
     points: tuple[Float[Array, "a b *n"], Float[Array, "a b *n"], Float[Array, "a b *n"]],
 ) -> Float[Array, "h w *n 3"]:
-    """Unit normals of a grid of points: the axis of least covariance of each point's 3x3 neighbourhood.
+    """Unit normals of a grid of points: the axis of least variance of each point's 3x3 neighbourhood.
 
     Args:
-        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`. Further
-            axes hold more of such grids.
+        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`. Further axes are
+            further grids.
 
     Returns:
         Unit normals towards the camera (z <= 0) (paper, supplement "Simulator Details").
     """
     height, width = (n - 2 for n in points[0].shape[:2])
-    # Differences from the middle point in millimetres: float32 keeps its digits.
+    # Differences from the middle point, in millimetres, keep the digits of float32.
     padded = [1e3 * part for part in points]
     planes = [part[1:-1, 1:-1] for part in padded]
     near = [
@@ -118,14 +118,14 @@ def surface_normals(
 
 
 def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
-    """The imprint as a skin has it that does not follow a sharp edge: smoothed by a Gaussian.
+    """Smooth an imprint by a Gaussian, because real skin does not follow a sharp edge.
 
-    The weights are `exp(-r^2 / (2 length^2))` at the pixels' distances r, divided by their sum over the image: a
-    uniform imprint stays what it is, at the border too. Two dense products, exact for any length.
+    The weights are `exp(-r^2 / (2 length^2))` at the pixels' distances r, divided by their sum over the image, so that
+    a uniform imprint is unchanged, at the border too. Two dense products compute this, exactly for any length.
 
     Args:
         depth: of the imprint (m), finite.
-        length: standard deviation (m). 0, or less than a twentieth of a pixel, gives `depth` itself.
+        length: standard deviation (m). 0, or less than a twentieth of a pixel, returns `depth` unchanged.
         pitch: of a pixel along x and y (m).
 
     Returns:
@@ -133,7 +133,7 @@ def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"])
     """
 
     def band(number: int, step: Array) -> Float[Array, "a a"]:
-        sigma = jnp.maximum(length / step, 0.05)  # pixels: the next weighs exp(-200), which is 0 in float32
+        sigma = jnp.maximum(length / step, 0.05)  # pixels. At 0.05 the next pixel weighs exp(-200), 0 in float32
         place = jnp.arange(number)
         weights = jnp.exp(-0.5 * ((place[:, None] - place[None, :]) / sigma) ** 2)
         return weights / jnp.sum(weights, axis=1, keepdims=True)
@@ -145,35 +145,35 @@ def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"])
 def shadows(
     skin: Skin, lights: Lights | Leds, depth: Float[Array, "h w"], window: Float[Array, "4"]
 ) -> Float[Array, "m h w"]:
-    """Share of each light that raised parts of the skin let through to each pixel.
+    """Share of each light that reaches each pixel past raised parts of the skin.
 
-    What is pressed stands out towards the camera, into the gel that the light runs through. Along the way from a point
-    to a light, the horizon is the steepest rise to what stands there; a light as tall as `penumbra`, whose lower end
-    is at the elevation e over the gel's plane, is hidden up to it:
+    Pressed parts of the skin stand out towards the camera, into the gel through which the light travels. Along the way
+    from a point to a light, the horizon is the steepest rise to the skin there. It hides the lower part of a light
+    whose angular height is `penumbra` and whose lower end has the elevation e over the gel's plane:
 
         share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
 
-    A light in the gel's plane, as the paper's are, has e = 0. It lights a part of the skin only by its flank, and of
-    that only what stands out farther than all that stands before it; flat skin and the tops of what is pressed get
-    nothing of it, in shadow or not (L . N = 0). So such shadows are seen on flanks behind other raised parts alone.
-    They would be endless, were the light a point; the penumbra ends them where a part looks lower than it from there.
-    A flank that faces away is dark by its normal before it is in shadow.
+    A light in the gel's plane, such as the paper's, has e = 0. It lights flanks only, and only those parts of them that
+    rise above everything on the way to the light. Flat skin and the tops of pressed parts receive none of this light,
+    in shadow or not (L . N = 0). Its shadows are therefore visible only on flanks behind other raised parts. The
+    shadows of a point light would be endless. The penumbra ends them where a raised part appears lower than `penumbra`.
+    A flank that faces away from a light is dark because of its normal, before it is in shadow.
 
     Args:
-        skin: number of steps, how far they go, penumbra. Steps are short near the point and longer away from it
-            (`t = reach (k / steps)^2`): what is narrower than a step may cast no shadow far away.
-        lights: far or near. Nothing behind a near light is in its way.
-        depth: of the skin below the gel's face (m). What lies beyond the image casts no shadow.
-        window: what the image shows, (left, top, width, height) on the gel's face (m).
+        skin: number of steps, reach and penumbra. Steps are short near the point and longer away from it
+            (`t = reach (k / steps)^2`), so that a part narrower than a step may cast no shadow far away.
+        lights: far or near. Skin behind a near light does not hide it.
+        depth: of the skin below the gel's face (m). Skin beyond the image casts no shadow.
+        window: part of the gel's face in the image, (left, top, width, height) (m).
 
     Returns:
-        Shares, 1: all of the light arrives. Light from all sides (`Phong.ambient`) has no shadow.
+        Shares, 1 where all of the light arrives. Ambient light (`Phong.ambient`) has no shadow.
     """
     rows, columns = depth.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     lengths = skin.shadow_reach * (jnp.arange(1, skin.shadow_steps + 1) / max(skin.shadow_steps, 1)) ** 2
     if isinstance(lights, Lights):
-        # The way to a light is the same everywhere: the whole image moves, with room for another on every side.
+        # The way to a far light is the same everywhere, so the whole image is shifted, with an image's room around it.
         places = geometry.normalize(lights.directions)
         around = jnp.pad(depth, ((rows + 1, rows + 1), (columns + 1, columns + 1)))
         look = functools.partial(_moved, around)
@@ -202,7 +202,7 @@ def shadows(
 
 
 def _moved(around: Float[Array, "a b"], across: Float[Array, ""], down: Float[Array, ""]) -> Float[Array, "h w"]:
-    """Values so many pixels away from every pixel of the middle third, bilinear."""
+    """Bilinear values at an offset in pixels from every pixel of the middle third."""
     rows, columns = around.shape[0] // 3, around.shape[1] // 3
     across, down = jnp.clip(across, -columns, columns), jnp.clip(down, -rows, rows)
     left, top = jnp.floor(across), jnp.floor(down)
@@ -216,7 +216,7 @@ def _moved(around: Float[Array, "a b"], across: Float[Array, ""], down: Float[Ar
 def _sampled(
     padded: Float[Array, "a b"], across: Float[Array, "h w"], down: Float[Array, "h w"]
 ) -> Float[Array, "h w"]:
-    """Values so many pixels away from each pixel, bilinear; the image has a border of one pixel more."""
+    """Bilinear values at an offset in pixels from each pixel. The padded image has a border of one pixel."""
     rows, columns = across.shape
     column = jnp.clip(jnp.arange(1, columns + 1)[None, :] + across, 0, columns + 1)
     row = jnp.clip(jnp.arange(1, rows + 1)[:, None] + down, 0, rows + 1)
@@ -238,16 +238,16 @@ def phong(
 
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
-    with both products clipped at 0. V is the optical axis, as for a distant viewer: a skin that lies flat under far
-    lights is then uniform, whatever its place. A near light at p_m has L_m towards p_m and its intensity is
-    `(reference / |p_m - x|)^falloff i_m`, where no distance counts as less than 0.1 mm.
+    with both products clipped at 0. V is the optical axis, as for a distant viewer, so that flat skin under far lights
+    is uniform. For a near light at p_m, L_m points to p_m and the intensity is `(reference / |p_m - x|)^falloff i_m`,
+    where distances below 0.1 mm count as 0.1 mm.
 
     Args:
-        phong: the skin's constants.
+        phong: constants of the skin's reflectance.
         lights: far (directions need not be of unit length) or near.
         normals: unit, towards the camera.
-        points: of the skin, sensor frame (m); far lights do not need them.
-        shares: of each light that arrives, from `shadows`; all of it if not given.
+        points: of the skin, sensor frame (m). Far lights do not need them.
+        shares: of each light that arrives, from `shadows`. Default: all of it.
 
     Returns:
         Image, not clipped (paper, equation "phong").
@@ -273,12 +273,12 @@ def phong(
 
 
 def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
-    """A vector over its length, by components, and the length, which is never below `_NEAREST`."""
+    """Components of a vector divided by its length, and the length, which is at least `_NEAREST`."""
     square = functools.reduce(operator.add, (p * p for p in parts))
     length = jnp.sqrt(jnp.maximum(square, _NEAREST**2))
     return (*(p / length for p in parts), length)
 
 
 def darken(phong: Phong, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Brightness of the skin by how deep it is pressed, `exp(-depth / darkening)` (m)."""
+    """Relative brightness of skin at a depth (m) of the imprint, `exp(-depth / darkening)`."""
     return jnp.exp(-depth / phong.darkening)

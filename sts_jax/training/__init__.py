@@ -1,4 +1,4 @@
-"""Training of `sts_jax.statespace` and `sts_jax.mvae` models: arrays, loop, schedules, checkpoints."""
+"""Training of `sts_jax.statespace` and `sts_jax.mvae` models: arrays, loop, schedules and checkpoints."""
 
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
 from sts_jax.training.moments import moments, paper_model, state_codes, state_model, state_moments

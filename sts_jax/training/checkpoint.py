@@ -1,9 +1,9 @@
 """Training states on disk.
 
 A model's folder holds `config.json` (the model, the run and the caller's preprocessing), `metrics.jsonl`,
-`checkpoints/STEP/` and `manifest.json`, which names the checkpoint that counts and holds the checksums of its files
-(`sts_jax.training.manifest`). A kill while a checkpoint is written leaves the one before. A checkpoint is written by
-Orbax, or is one small file (`sts_jax.training.rounded`).
+`checkpoints/STEP/` and `manifest.json`, which names the current checkpoint and holds the checksums of its files
+(`sts_jax.training.manifest`). If the process is killed while it writes a checkpoint, the previous one stays current. A
+checkpoint is written by Orbax, or as one small file (`sts_jax.training.rounded`).
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from sts_jax.training import manifest, rounded
 
 
 class TrainState(NamedTuple):
-    """All that changes while a model is trained."""
+    """Everything that changes during training."""
 
     params: nnx.State
     stats: nnx.State  # running batch statistics
@@ -50,10 +50,10 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
     Args:
         folder: the model's folder.
         state: the state to write.
-        compact: round the weights, and write one small file, see `training.rounded`.
+        compact: whether to round the weights and write one small file, see `training.rounded`.
 
     Raises:
-        OSError: the disk is full or the folder is not writable. The checkpoint before is still valid.
+        OSError: the disk is full or the folder is not writable. The previous checkpoint stays valid.
         ValueError: the folder holds a checkpoint without a manifest.
     """
     before = _manifest(folder)
@@ -62,7 +62,7 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
     step, kept = int(state.step), before.step
     path = manifest.checkpoint(folder, step)
     try:
-        _keep_only(folder, kept)  # a kill may have left a checkpoint that the manifest does not name
+        _keep_only(folder, kept)  # an interrupted call may have left a checkpoint that the manifest does not name
         try:
             if compact:
                 path.mkdir(parents=True)
@@ -71,10 +71,10 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with _quiet_orbax():
                     ocp.save(str(path.absolute()), _plain(state))
-        except Exception as error:  # Orbax and TensorStore raise many kinds, with pages of their own traces
+        except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
             left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
-                f"cannot write {path}: {_first_line(error)}. {_files.remedy(error)}, then start again; {left}."
+                f"cannot write {path}: {_first_line(error)}. {_files.remedy(error)}, then start again ({left})."
             ) from None
         manifest.write(folder, step)
         kept = step
@@ -83,25 +83,25 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
 
 
 def restore(folder: Path, like: State) -> State | None:
-    """The newest state in `folder`, or None where there is none yet.
+    """Restore the newest state in `folder`, or return None if there is none yet.
 
     Args:
         folder: the model's folder.
-        like: a state, or the `jax.eval_shape` of one, with the structure, shapes and dtypes wanted.
+        like: a state, or the `jax.eval_shape` of one, with the structure, shapes and dtypes to restore.
 
     Returns:
         A state of the same structure and dtypes.
 
     Raises:
         TornFileError: a file is damaged, missing or not listed in the manifest.
-        ValueError: the checkpoint is of another model, or has no manifest.
+        ValueError: the checkpoint belongs to another model, or has no manifest.
     """
     path = verified(folder)
     return None if path is None else read(path, like)
 
 
 def verified(folder: Path) -> Path | None:
-    """The checkpoint that counts, once all files of the model match their checksums; None where there is none yet.
+    """Compare all files of a model with their checksums, and return its current checkpoint, or None before the first.
 
     Raises:
         TornFileError, ValueError: as `restore`.
@@ -114,15 +114,15 @@ def verified(folder: Path) -> Path | None:
 
 
 def read(path: Path, like: State) -> State:
-    """The arrays of a checkpoint that `like` asks for; further ones in it are not read.
+    """Read the arrays of a checkpoint that `like` contains, and no others.
 
     Raises:
-        ValueError: it lacks one of them, or has it with another shape.
+        ValueError: the checkpoint lacks one of them, or has it with another shape or dtype.
     """
     wanted = _plain(like)
     try:
         loaded = (_read_rounded if (path / rounded.NAME).exists() else _read_orbax)(path, wanted)
-    except Exception as error:  # Orbax, TensorStore and zipfile raise many kinds, some with pages of their own traces
+    except Exception as error:  # Orbax, TensorStore and zipfile raise many types, some with pages of traceback
         raise ValueError(
             f"{path} cannot be read ({type(error).__name__}: {_first_line(error)}): it was damaged before its "
             "checksums were taken, or belongs to another model, or was saved by Predictor.save, which leaves out the "
@@ -137,7 +137,7 @@ def _read_orbax(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     with _quiet_orbax():
-        # Compared first: Orbax cuts or pads arrays of another shape, or prints thousands of lines.
+        # Compare first, because Orbax cuts or pads arrays of another shape, or prints thousands of lines.
         _compare(ocp.metadata(str(path.absolute())).metadata, wanted)
         with context:
             return ocp.load(str(path.absolute()), abstract)
@@ -156,7 +156,7 @@ def _compare(there: dict[str, Any], wanted: dict[str, Any]) -> None:
 
 
 def seal(folder: str | os.PathLike[str]) -> None:
-    """Write the manifest of a model of sts_jax 0.1, which had none, from the files as they are now.
+    """Write a manifest of the present files of a model that was trained by sts_jax 0.1, which wrote none.
 
     Raises:
         FileNotFoundError: the folder has no checkpoint.
@@ -170,7 +170,7 @@ def seal(folder: str | os.PathLike[str]) -> None:
         )
     steps = _steps(folder)
     if not steps:
-        raise FileNotFoundError(f"{folder} has no checkpoint; give the folder of a trained model.")
+        raise FileNotFoundError(f"{folder} has no checkpoint: give the folder of a trained model.")
     manifest.write(folder, max(steps))
 
 
@@ -178,7 +178,7 @@ def _manifest(folder: Path) -> manifest.Manifest | None:
     found = manifest.read(folder)
     if found is None and _steps(folder):
         raise ValueError(
-            f"{folder} has a checkpoint and no {manifest.NAME}: it was trained by an earlier version of sts_jax, or "
+            f"{folder} has a checkpoint but no {manifest.NAME}: it was trained by an earlier version of sts_jax, or "
             "the file was deleted, and nothing shows that its files are undamaged. Delete the folder and train again, "
             f"or, if you trust these files, call training.seal({str(folder)!r}) once."
         )
@@ -194,14 +194,14 @@ def _keep_only(folder: Path, step: int | None) -> None:
     checkpoints = folder / "checkpoints"
     for path in checkpoints.iterdir() if checkpoints.is_dir() else ():
         if step is None or path != manifest.checkpoint(folder, step):
-            shutil.rmtree(path, ignore_errors=True)  # one that stays does no harm: the manifest does not name it
+            shutil.rmtree(path, ignore_errors=True)  # a leftover does no harm, because the manifest does not name it
 
 
 @contextlib.contextmanager
 def _quiet_orbax() -> Iterator[None]:
-    """Silence the log in which Orbax prints its threads' traces before it raises their error.
+    """Silence the log in which Orbax prints the tracebacks of its threads before it raises their error.
 
-    For a full disk these are 237 lines. A thread that fails after the error was raised still logs its own.
+    A full disk gives 237 lines of them. A thread that fails after the error was raised still logs its traceback.
     """
     logger = logging.getLogger("absl")
     disabled, logger.disabled = logger.disabled, True
@@ -217,6 +217,6 @@ def _first_line(error: Exception) -> str:
 
 
 def _plain(state: TrainState | Weights) -> dict[str, Any]:
-    """The leaves by their paths, so that the files do not depend on the classes of Flax and optax."""
+    """The leaves by path, so that the files do not depend on the classes of Flax and optax."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

@@ -1,8 +1,8 @@
 """Checksums of a model's folder.
 
-`manifest.json` holds the SHA-256 of `config.json`, of `blank.npz` where the folder has one, and of every file of one
-checkpoint. This checkpoint is the one that counts: it is written first, then the manifest is replaced as a whole, then
-the older checkpoint is deleted. A kill at any moment leaves a manifest whose files are complete.
+`manifest.json` holds the SHA-256 of `config.json`, of `blank.npz` if the folder has one, and of every file of the
+current checkpoint. A new checkpoint is written first, then the manifest is replaced as a whole, then the older
+checkpoint is deleted. The files of the manifest are therefore complete whenever the process is killed.
 """
 
 from pathlib import Path
@@ -12,13 +12,13 @@ from sts_jax import _files
 
 NAME = "manifest.json"
 _FORMAT = 1
-_BESIDE = ("config.json", "blank.npz")  # files outside the checkpoint that a manifest lists where they exist
+_BESIDE = ("config.json", "blank.npz")  # files outside the checkpoint that a manifest lists if they exist
 
 
 class Manifest(NamedTuple):
     """The files that belong to a model."""
 
-    step: int | None  # of the checkpoint that counts; None before the first one
+    step: int | None  # of the current checkpoint, None before the first one
     files: dict[str, str]  # SHA-256 by path relative to the folder
 
 
@@ -28,7 +28,7 @@ def checkpoint(folder: Path, step: int) -> Path:
 
 
 def read(folder: Path) -> Manifest | None:
-    """The manifest of a model's folder, or None where there is none.
+    """Read the manifest of a model's folder. Return None if there is none.
 
     Raises:
         TornFileError: the manifest is damaged.
@@ -38,14 +38,14 @@ def read(folder: Path) -> Manifest | None:
         return None
     content = _files.read_json(path, remedy)
     if not _is_manifest(content):
-        raise _files.TornFileError(f"{path} is damaged, or of another version of sts_jax; {remedy}.")
+        raise _files.TornFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
     return Manifest(content["step"], content["files"])
 
 
 def write(folder: Path, step: int | None) -> Manifest:
-    """Make a checkpoint the one that counts.
+    """Write a manifest that makes a checkpoint the current one.
 
-    The checksums of `config.json` and `blank.npz` stay those of the manifest before, so that damage done in between is
+    The checksums of `config.json` and `blank.npz` are kept from the previous manifest, so that damage in between is
     still found.
 
     Raises:
@@ -60,7 +60,7 @@ def write(folder: Path, step: int | None) -> Manifest:
 
 
 def add(folder: Path, name: str) -> None:
-    """Enter the present content of a file beside the checkpoint in the manifest, if the folder has one."""
+    """Record the checksum of a file outside the checkpoint, if the folder has a manifest."""
     old = read(folder)
     if old is not None:
         files = old.files | {name: _files.sha256(folder / name)}
@@ -85,19 +85,19 @@ def verify(folder: Path, manifest: Manifest) -> None:
         try:
             found = _files.sha256(path)
         except FileNotFoundError:
-            raise _files.TornFileError(f"{path} is missing, and {NAME} lists it; {remedy}.") from None
+            raise _files.TornFileError(f"{path} is missing, but {NAME} lists it: {remedy}.") from None
         except (OSError, ValueError) as error:  # ValueError: a damaged manifest may list a name with a null byte
-            raise _files.TornFileError(f"{path} cannot be read ({error}); {remedy}.") from error
+            raise _files.TornFileError(f"{path} cannot be read ({error}): {remedy}.") from error
         if found != digest:
             again = " or delete this file and start the training again" if name == "blank.npz" else ""
             raise _files.TornFileError(
-                f"{path} is not the file that {NAME} lists (its SHA-256 differs): it was edited, exchanged or damaged; "
-                f"{remedy}{again}."
+                f"{path} is not the file that {NAME} lists (its SHA-256 differs) because it was edited, exchanged or "
+                f"damaged: {remedy}{again}."
             )
 
 
 def _is_manifest(content: Any) -> bool:
-    """Whether the content has the fields of a manifest, and lists files of its own checkpoint alone."""
+    """Whether the content has the fields of a manifest, and lists files of no other checkpoint."""
     if not isinstance(content, dict) or content.keys() != {"format", "step", "files"} or content["format"] != _FORMAT:
         return False
     step, files = content["step"], content["files"]

@@ -1,4 +1,4 @@
-"""From a collection's first and last moments to the arrays and the model of a training."""
+"""Training arrays and models from the first and last moments of trajectories."""
 
 import dataclasses
 
@@ -18,16 +18,16 @@ SOME = 512  # items that are encoded at once
 def moments(
     pairs: Pairs, modalities: tuple[str, ...], preprocessing: Preprocessing, blank: np.ndarray
 ) -> tuple[Arrays, Preprocessing]:
-    """The first moments as inputs and the last ones as targets.
+    """Make training arrays, with first moments as inputs and last moments as targets.
 
     Args:
         pairs: trajectories, from `dataset.Dataset.pairs`.
-        modalities: of the model: some of `visual`, `tactile`, `pose`.
-        preprocessing: how the networks see measurements.
+        modalities: modalities of the model, some of `visual`, `tactile` and `pose`.
+        preprocessing: how measurements are encoded for the networks.
         blank: the tactile image of the untouched sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:
-        The arrays; and the preprocessing with `absent` set: touch is no input where no first moment has a contact.
+        The arrays, and the preprocessing with `absent` set: touch is not an input if no first moment has a contact.
     """
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -44,7 +44,7 @@ def moments(
 
 
 def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mvae.Config:
-    """The paper's networks for some modalities; the weight lambda is 1 for images and 1000 for the pose."""
+    """The paper's networks for some modalities. The weight lambda is 1 for images and 1000 for the pose."""
     pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
     shape = (*preprocessing.resolution, 3)
     images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
@@ -62,15 +62,15 @@ def state_moments(
     views: Views | None = None,
     falls: Ends | None = None,
 ) -> Arrays:
-    """The arrays that train a state-space model.
+    """Make the arrays that train a state-space model.
 
     Args:
         pairs: trajectories, from `dataset.Dataset.pairs`, with images of the model's `input_size`.
         model: from `state_model`.
-        scenario: whose outcomes the trajectories have.
-        preprocessing: how the networks see measurements.
+        scenario: the scenario of the trajectories.
+        preprocessing: how measurements are encoded for the networks.
         empty: the images of the untouched sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
-        views: further pictures of the start, from `dataset.Dataset.views`; used if the model takes `visual`.
+        views: pictures at further starts, from `dataset.Dataset.views`, used if the model takes `visual`.
         falls: further trajectories without images, from `dataset.Dataset.ends`.
 
     Raises:
@@ -117,7 +117,7 @@ def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarra
     numbers = np.array([int(known) for known in scenario.outcomes])
     if not np.isin(outcome, numbers).all():
         raise ValueError(
-            f"pairs have the outcomes {np.unique(outcome).tolist()}; those of {type(scenario).__name__} are "
+            f"pairs have the outcomes {np.unique(outcome).tolist()}, but {type(scenario).__name__} has the outcomes "
             f"{numbers.tolist()}: give the scenario of the collection"
         )
     return (outcome[:, None] == numbers).argmax(1).astype(np.int32)
@@ -126,12 +126,12 @@ def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarra
 def state_codes(
     preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
 ) -> np.ndarray:
-    """The true states (n, code) as a state-space model has them, see `statespace.encode`.
+    """Encode true states as codes (n, code) of a state-space model, see `statespace.encode`.
 
     Args:
-        preprocessing: of the model.
+        preprocessing: the preprocessing of the model.
         pose: (n, 7), m and unit quaternion.
-        support: (n, 128), m; this and the following as in `dataset.Pairs`.
+        support: (n, 128), m. This and the following arguments are as in `dataset.Pairs`.
         mass: (n,), kg.
         com: (n, 3), m, mesh frame.
     """
@@ -153,16 +153,16 @@ def state_model(
 ) -> tuple[statespace.Config, Preprocessing]:
     """A state-space model of the size that the experiments use, and the preprocessing with `absent` set.
 
-    Touch is no input where no first moment has a contact. Other arguments as of `state_moments`.
+    Touch is not an input if no first moment has a contact. The arguments are those of `state_moments`, and the sensor.
 
     Raises:
-        ValueError: the images are not square, or are cropped: the model finds the object itself.
+        ValueError: the images are not square, or are cropped. The model finds the object itself.
     """
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
         raise ValueError(
-            f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}; a state-space model takes "
-            "square images of the whole view"
+            f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}, but a state-space model "
+            "takes square images of the whole view"
         )
     absent = () if _touched(pairs, preprocessing, empty["tactile"]).any() else ("tactile",)
     model = statespace.Config(
@@ -178,7 +178,7 @@ def state_model(
 
 
 def _touched(pairs: Pairs, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
-    """Whether the first tactile image of each trajectory shows a contact; some at a time, which bounds the memory."""
+    """Whether the first tactile image of each trajectory shows a contact. Images are split to bound the memory."""
     parts = np.array_split(pairs.tactile[:, 0], max(len(pairs.tactile) // 256, 1))
     return np.concatenate(
         [

@@ -1,8 +1,8 @@
-"""Rounded weights in one small file, for models that are passed on.
+"""Rounded weights in one small file, for models that are shared.
 
-The kernel of a layer is stored as whole numbers q of steps s, `w = q s`. Each output channel has its own step, the root
-mean square of its weights divided by 128, so that a weight changes by at most half a step. Compressed, a weight takes
-about 1.2 bytes, and 1.9 in half precision. Vectors, such as biases, are stored unchanged.
+The kernel of a layer is stored as integers q and steps s, `w = q s`. Each output channel has its own step, the root
+mean square of its weights divided by 128, so that a weight changes by at most half a step. A compressed weight takes
+about 1.2 bytes, compared with 1.9 in half precision. Vectors, such as biases, are stored unchanged.
 """
 
 import io
@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike
 
 NAME = "weights.npz"
 _LEVELS = 128  # steps in a channel's root mean square
-_LARGEST = 2**15 - 1  # of q, which has 16 bits; a channel with a larger weight has longer steps
+_LARGEST = 2**15 - 1  # of q, which has 16 bits (a channel with a larger weight has a longer step)
 _STEP = ":step"  # appended to the name of a kernel
 
 
@@ -22,7 +22,7 @@ def write(path: Path, arrays: dict[str, ArrayLike]) -> None:
 
     Args:
         path: the file, with the suffix `.npz`.
-        arrays: by name. The last axis of a kernel is that of the output channels.
+        arrays: arrays by name. The output channels are the last axis of a kernel.
 
     Raises:
         OSError: the file cannot be written.
@@ -36,17 +36,17 @@ def write(path: Path, arrays: dict[str, ArrayLike]) -> None:
         rms = np.sqrt(np.mean(np.square(values, dtype=np.float64), axis=inputs))
         step = np.maximum(rms / _LEVELS, np.abs(values).max(axis=inputs) / _LARGEST).astype(np.float32)
         number = np.rint(values / np.where(step == 0, 1, step)).astype(np.int32)
-        # High bytes take few values, and compress better where no low bytes lie between them.
+        # High bytes take few values, and compress better if no low bytes lie between them.
         stored[name] = np.stack([number >> 8, number & 255]).astype(np.uint8)
         stored[name + _STEP] = step
     np.savez_compressed(path, allow_pickle=False, **stored)
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of a file of `write` by name, the rounded ones as float32.
+    """Read the arrays by name from a file that `write` wrote. Rounded arrays become float32.
 
     Raises:
-        Exception: the file is damaged; zipfile, zlib and NumPy raise many kinds.
+        Exception: the file is damaged. zipfile, zlib and NumPy raise many types.
     """
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         stored = dict(file)

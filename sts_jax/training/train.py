@@ -1,4 +1,4 @@
-"""The training loop: a Python loop over one compiled step (a convolution inside `lax.scan` is slow on a CPU)."""
+"""The training loop: a Python loop over one compiled step, because convolutions in `lax.scan` are slow on a CPU."""
 
 import contextlib
 import json
@@ -20,20 +20,20 @@ from sts_jax import _files, mvae, statespace
 from sts_jax.training import manifest
 from sts_jax.training.checkpoint import TrainState, Weights, read, restore, save, verified
 
-Batch = dict[str, Any]  # dicts by name, as in `Arrays`; `condition`: array or None
-Config = mvae.Config | statespace.Config  # of the two kinds of models
+Batch = dict[str, Any]  # dictionaries by name as in `Arrays`, and `condition`, an array or None
+Config = mvae.Config | statespace.Config  # of either kind of model
 Terms = dict[str, Array]  # the parts of a loss
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How a model is trained."""
+    """Options of a training run."""
 
-    steps: int | None = None  # gradient steps; None: `epochs` decide
+    steps: int | None = None  # gradient steps (None: as many as `epochs` need)
     epochs: int = 200  # paper
     batch_size: int = 64  # paper
-    # Of a state-space model: first moments without an end, and trajectories without images, in each batch; where the
-    # data has some
+    # State-space models: views (first moments without a last one) and falls (trajectories without images) in a batch,
+    # if the data has some
     views: int = 16
     falls: int = 96
     learning_rate: float = 1e-3  # not in the paper
@@ -42,56 +42,58 @@ class TrainConfig:
     b1: float = 0.9  # Adam
     b2: float = 0.999
     epsilon: float = 1e-8
-    # Of an `mvae` model's encoders, in nats: Adam makes steps of full length of any gradient, however small beta makes
-    # the divergence's, so that encoders collapse during the warm-up; gradients far below this one move them little.
+    # Adam's epsilon for the encoders of an `mvae` model (nats). Adam takes steps of full length even if a small beta
+    # makes the gradient of the divergence small, so that encoders collapse during the warm-up. Gradients far below this
+    # epsilon move them little.
     encoder_epsilon: float = 1.0
     clip: float | None = None  # largest global norm of the gradient
     beta_warmup: float = 0.25  # share of the steps over which beta goes from 0 to 1 (paper: 50 of 200 epochs)
     seed: int = 0
-    log_every: int = 10  # steps; a record is the mean over them
+    log_every: int = 10  # steps per record, which is their mean
     checkpoint_every: int = 200  # steps, a multiple of log_every
 
     def __post_init__(self) -> None:
         if self.checkpoint_every % self.log_every:
-            raise ValueError(f"checkpoint_every={self.checkpoint_every}: give a multiple of log_every={self.log_every}")
+            raise ValueError(f"checkpoint_every={self.checkpoint_every} is no multiple of log_every={self.log_every}")
         if self.schedule not in ("constant", "cosine"):
-            raise ValueError(f"schedule={self.schedule!r}; known are 'constant' and 'cosine'")
+            raise ValueError(f"schedule must be 'constant' or 'cosine', got {self.schedule!r}")
 
     def total(self, samples: int) -> int:
-        """Gradient steps over a data set of so many samples."""
+        """Number of gradient steps for a dataset of `samples` samples."""
         return self.steps if self.steps is not None else self.epochs * -(-samples // self.batch_size)
 
 
 @dataclass(frozen=True)
 class Arrays:
-    """A data set in memory, by modality, `(samples, *shape)`; images uint8, or float32 in [0, 1]."""
+    """A dataset in memory: arrays `(samples, *shape)` by modality. Images are uint8, or float32 in [0, 1]."""
 
     inputs: dict[str, np.ndarray]
-    targets: dict[str, np.ndarray]  # of a state-space model also the codes `state` and `pose`, and `outcome`, an index
-    present: dict[str, np.ndarray] = field(default_factory=dict)  # (samples,) bool; one not given counts always
+    targets: dict[str, np.ndarray]  # for state-space models also the codes `state` and `pose`, and the index `outcome`
+    present: dict[str, np.ndarray] = field(default_factory=dict)  # (samples,) bool, True if not given
     target_present: dict[str, np.ndarray] = field(default_factory=dict)
     condition: np.ndarray | None = None  # (samples, condition)
     empty: dict[str, np.ndarray] = field(default_factory=dict)  # images of the untouched sensor, for state-space models
-    # For state-space models: first moments without an end, `visual` and the code `state`, (views, *shape)
+    # For state-space models: first moments without a last one, `visual` and the code `state`, (views, *shape)
     views: dict[str, np.ndarray] = field(default_factory=dict)
-    # and trajectories without images, with the codes `state` and `pose`, `outcome` and perhaps `condition`
+    # For state-space models: trajectories without images, with the codes `state` and `pose`, `outcome`, and `condition`
+    # if the model has one
     falls: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sizes = {len(x) for x in jax.tree.leaves(self._tree())}
         if len(sizes) != 1 or 0 in sizes:
-            raise ValueError(f"arrays of {sorted(sizes)} samples; all must have the same number, at least one")
+            raise ValueError(f"arrays have {sorted(sizes)} samples, but all must have the same number, at least one")
 
     def __len__(self) -> int:
         return len(next(iter(self.targets.values())))
 
     def take(self, index: np.ndarray, **further: np.ndarray) -> Batch:
-        """These samples, and these of `views` and of `falls` where they are given."""
+        """The batch of samples `index`, and of the given rows of `views` and `falls`."""
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
 
     def checksum(self) -> int:
-        """Changes when the data do."""
+        """CRC-32 of the names, shapes, types and values of all arrays."""
         value = 0
         further = {"empty": self.empty, "views": self.views, "falls": self.falls}
         for path, x in jax.tree_util.tree_leaves_with_path(self._tree() | further):
@@ -103,17 +105,17 @@ class Arrays:
         return {name: getattr(self, name) for name in ("inputs", "targets", "present", "target_present", "condition")}
 
 
-_KINDS: dict[type[Config], str] = {mvae.Config: "mvae", statespace.Config: "statespace"}  # the word in `config.json`
+_KINDS: dict[type[Config], str] = {mvae.Config: "mvae", statespace.Config: "statespace"}  # `kind` in `config.json`
 
 
 class Model(NamedTuple):
-    """A trained model, ready for `mvae.predict` or `statespace.sample` with its `graphdef` and `state`."""
+    """A trained model. `mvae.predict` and `statespace.sample` take its `graphdef` and `state`."""
 
     config: Config
     graphdef: nnx.GraphDef[Any]
     state: nnx.State  # parameters and running batch statistics
     step: int  # gradient steps done
-    settings: dict[str, Any]  # config.json: `model`, `training`, `preprocessing`, ...
+    settings: dict[str, Any]  # content of config.json: `model`, `training`, `preprocessing`, ...
 
     def __repr__(self) -> str:
         config, numbers = self.config, sum(x.size for x in jax.tree.leaves(self.state))
@@ -125,7 +127,7 @@ class Model(NamedTuple):
 
 
 class Learner(NamedTuple):
-    """How one kind of model is made, and the loss that it minimises."""
+    """Initialisation and loss of one kind of model."""
 
     config: Config
     init: Callable[[Array], tuple[nnx.GraphDef[Any], nnx.State, nnx.State]]
@@ -149,9 +151,9 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
     """The learner of a model.
 
     Args:
-        model: its configuration.
-        targets: of an `mvae` model, see `mvae.loss`, `asked`.
-        absent: of an `mvae` model, see `mvae.loss`.
+        model: the configuration of the model.
+        targets: for `mvae` models, the argument `asked` of `mvae.loss`.
+        absent: for `mvae` models, the argument `absent` of `mvae.loss`.
     """
 
     def paper_loss(
@@ -181,7 +183,7 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
-    """Adam as configured, with an epsilon of its own for the parameters of an `mvae` model's `encoders`."""
+    """Adam as configured, with `encoder_epsilon` for the encoders of an `mvae` model."""
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
         rate = optax.cosine_decay_schedule(config.learning_rate, total - config.warmup)
@@ -199,7 +201,7 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
 
 
 def _kinds(params: Any) -> Any:
-    """`encoders` for the encoders of an `mvae` model, `others` for all other parameters."""
+    """The label `encoders` for the encoders of an `mvae` model, and `others` for all other parameters."""
     paper = "decoders" in params
     return jax.tree_util.tree_map_with_path(
         lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params
@@ -207,7 +209,7 @@ def _kinds(params: Any) -> Any:
 
 
 def initial(config: TrainConfig, learner: Learner, total: int) -> tuple[nnx.GraphDef[Any], TrainState]:
-    """A new model and its state, a function of `config.seed`."""
+    """Initialise a model and its training state from `config.seed`."""
     graphdef, params, stats = learner.init(jax.random.key(config.seed))
     return graphdef, TrainState(params, stats, optimiser(config, total).init(params), jnp.zeros((), jnp.int32))
 
@@ -220,21 +222,21 @@ def step(
     state: TrainState,
     batch: Batch,
 ) -> tuple[TrainState, Terms]:
-    """One gradient step; the state keeps its structure and dtypes.
+    """Take one gradient step. The state keeps its structure and dtypes.
 
     Args:
         learner: the loss.
         graphdef: definition of the model.
-        config: how it is trained.
-        total: steps of the whole run; beta and the learning rate follow from it.
-        state: the state before.
-        batch: `Arrays.take`; uint8 becomes float32 in [0, 1] here.
+        config: options of the training run.
+        total: steps of the whole run, which determine beta and the learning rate.
+        state: the state before the step.
+        batch: from `Arrays.take`. Images in uint8 become float32 in [0, 1] here.
 
     Returns:
-        The state after, and the parts of the loss before.
+        The state after the step, and the parts of the loss before it.
     """
     batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
-    # Half of the split is unused: another stream would be as good, but the published results are of this one.
+    # Half of the split is unused. Another stream would be as good, but the published results were made with this one.
     noise, _ = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
     warmup = max(config.beta_warmup * total, 1)
     beta = jnp.minimum(state.step.astype(jnp.float32) / warmup, 1)
@@ -248,10 +250,10 @@ def step(
 
 
 def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
-    """Indices of the batches `start .. stop`, a function of the seed and the step alone.
+    """Indices of the samples of batches `start` to `stop - 1`, a function of the seed and the step alone.
 
-    Permutations of the samples follow one another, one per epoch, and a batch may straddle two: every sample is
-    seen once per epoch and none is dropped.
+    Each epoch has a permutation of the samples, and a batch may straddle two epochs. Every sample is seen once per
+    epoch and none is dropped.
     """
     permutations: dict[int, np.ndarray] = {}
     for number in range(start, stop):
@@ -273,20 +275,20 @@ def train(
     preprocessing: dict[str, Any] | None = None,
     progress: Callable[[int, int, dict[str, float]], None] | None = None,
 ) -> Model:
-    """Train a model in `workdir`, or go on where an earlier call on it stopped.
+    """Train a model in `workdir`, or resume where an earlier call stopped.
 
-    A run that was killed gives the parameters, to the last bit, of one that was not, on one machine. Where the
-    last step is done, nothing is written. Other entries in `workdir` are left alone. One process at a time trains in
-    a folder.
+    On one machine, a run that was killed and resumed gives the same parameters, to the last bit, as an uninterrupted
+    one. A finished run is only read. Other entries in `workdir` are not changed. One process at a time can train in a
+    folder.
 
     Args:
-        config: how.
-        model: what.
+        config: options of the training run.
+        model: configuration of the model.
         arrays: the training set.
-        workdir: the model's folder: `config.json`, `metrics.jsonl`, `checkpoints/`, `manifest.json`.
-        absent: of an `mvae` model: modalities present in no sample; they may be missing from `arrays.inputs`.
-        targets: of an `mvae` model: `all` or `own`, see `mvae.loss`.
-        preprocessing: plain values for `config.json`: how images and vectors were made.
+        workdir: the model's folder, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
+        absent: for `mvae` models, modalities that no sample has. `arrays.inputs` may lack them.
+        targets: for `mvae` models, `all` or `own`, see `mvae.loss`.
+        preprocessing: plain values for `config.json` that describe how images and vectors were made.
         progress: called after every step with the steps done, their total, and the latest record of
             `metrics.jsonl` (empty before the first).
 
@@ -294,7 +296,7 @@ def train(
         The trained model.
 
     Raises:
-        ValueError: `workdir` was made with other settings or data, or holds a checkpoint without a manifest; the
+        ValueError: `workdir` was made with other settings or data, or holds a checkpoint without a manifest, or the
             arrays contradict `absent` or lack a modality.
         OSError: a file in `workdir` is damaged or cannot be written.
         LockedError: another process trains in `workdir`.
@@ -315,7 +317,7 @@ def train(
     }
     settings = json.loads(json.dumps(settings))
     there = manifest.read(workdir)
-    # A finished run is only read, and a lock is a file.
+    # A finished run is only read. It takes no lock, because a lock writes a file.
     finished = there is not None and there.step == total
     with contextlib.nullcontext() if finished else _files.lock(workdir):
         _files.claim(workdir / "config.json", settings)
@@ -342,7 +344,7 @@ def train(
                     _append(log, record)
                     if not np.isfinite(record["loss"]):
                         raise FloatingPointError(
-                            f"{workdir}: the loss is {record['loss']} at step {done}; lower learning_rate="
+                            f"{workdir}: the loss is {record['loss']} at step {done}: lower learning_rate="
                             f"{config.learning_rate} or set clip"
                         )
                 if done % config.checkpoint_every == 0 or done == total:
@@ -353,9 +355,9 @@ def train(
 
 
 def load(workdir: str | os.PathLike[str]) -> Model:
-    """The model in a folder, from this folder alone.
+    """Load a trained model from its folder alone.
 
-    Every file is compared with its checksum before it is used. A training that runs in the folder may go on.
+    Every file is compared with its checksum before it is used. A training may run in the folder meanwhile.
 
     Args:
         workdir: the `workdir` that was given to `train`.
@@ -366,7 +368,7 @@ def load(workdir: str | os.PathLike[str]) -> Model:
     Raises:
         FileNotFoundError: the folder has no `config.json` or no checkpoint.
         OSError: a file is damaged, missing or not listed in `manifest.json`.
-        ValueError: `config.json` is of another version of sts_jax, or the folder has no manifest.
+        ValueError: `config.json` was written by another version of sts_jax, or the folder has no manifest.
     """
     workdir = Path(workdir)
     while True:
@@ -376,26 +378,24 @@ def load(workdir: str | os.PathLike[str]) -> Model:
         except (OSError, ValueError):
             if manifest.read(workdir) == before:
                 raise
-            # A training has replaced the checkpoint while it was read: read the new one.
+            # A training has replaced the checkpoint while it was read, so read the new one.
 
 
 def _load(workdir: Path) -> Model:
     path = workdir / "config.json"
     if not path.exists():
-        raise FileNotFoundError(
-            f"{workdir}: has no config.json; give the folder of a trained model, or train one there"
-        )
+        raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model, or train one there")
     checkpoint = verified(workdir)
     settings = _files.read_json(path, f"delete {workdir} and train again")
     if checkpoint is None:
-        raise FileNotFoundError(f"{workdir}: has no checkpoint; run its training to the first one")
+        raise FileNotFoundError(f"{workdir} has no checkpoint: run its training to the first one")
     try:
-        kind = settings.get("kind", "mvae")  # version 0.1 had no other
+        kind = settings.get("kind", "mvae")  # version 0.1 had no other kind
         model = {name: config for config, name in _KINDS.items()}[kind].from_json(settings["model"])
         like = jax.eval_shape(lambda: Weights(*learner(model).init(jax.random.key(0))[1:], jnp.zeros((), jnp.int32)))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}); load it with the "
+            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}): load it with the "
             f"version that trained it, or delete {workdir} and train again"
         ) from error
     weights = read(checkpoint, like)
@@ -408,12 +408,12 @@ def _module(model: Config) -> nnx.Module:
 
 
 def _truncate(log: Path, start: int) -> dict[str, float]:
-    """Drop the records after step `start` and return the last one that stays."""
+    """Drop the records after step `start` and return the last one that is kept."""
     try:
         lines = log.read_bytes().splitlines() if log.exists() else []
     except OSError as error:
         raise OSError(
-            f"cannot read {log}: {error}. Check its permissions, or delete it to go on without it."
+            f"cannot read {log}: {error}. Check its permissions, or delete it to continue without it."
         ) from error
     records = []
     for number, line in enumerate(lines, 1):
@@ -421,11 +421,11 @@ def _truncate(log: Path, start: int) -> dict[str, float]:
             record = json.loads(line.decode())
             keep = record["step"] <= start
         except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-            if number == len(lines):  # torn by a kill
+            if number == len(lines):  # cut off by a kill
                 break
             raise _files.TornFileError(
-                f"{log}, line {number}, is damaged ({type(error).__name__}: {error}); delete this line, or the "
-                "file, to go on without these records."
+                f"{log}, line {number}, is damaged ({type(error).__name__}: {error}): delete this line, or the "
+                "file, to continue without these records."
             ) from error
         if keep:
             records.append(record)
@@ -439,7 +439,7 @@ def _append(log: Path, record: dict[str, float]) -> None:
             file.write(json.dumps(record) + "\n")
     except OSError as error:
         raise OSError(
-            f"cannot write {log}: {error}. {_files.remedy(error)}, then start again; the last checkpoint is kept."
+            f"cannot write {log}: {error}. {_files.remedy(error)}, then start again (the last checkpoint is kept)."
         ) from error
 
 
@@ -448,11 +448,11 @@ def _record(done: int, recent: list[Terms]) -> dict[str, float]:
 
 
 def _check_state(model: statespace.Config, arrays: Arrays) -> None:
-    """Raise a ValueError where arrays do not fit a state-space model."""
+    """Raise a ValueError if the arrays do not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
-            f"present named {sorted(arrays.present)} and target_present named {sorted(arrays.target_present)}; the "
-            f"model takes masks of its inputs {list(model.inputs)}, and every target"
+            f"present masks {sorted(arrays.present)} and target_present masks {sorted(arrays.target_present)}, but the "
+            f"model takes masks only of its inputs {list(model.inputs)}"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES
@@ -463,7 +463,7 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
         found = {name: x.shape[1:] for name, x in values.items()}
         if found != expected[kind]:
-            raise ValueError(f"{kind} have samples of {found}; the model takes {expected[kind]}")
+            raise ValueError(f"{kind} have samples of {found}, but the model takes {expected[kind]}")
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
         raise ValueError(f"empty needs `visual` and `tactile` of shape {(*size, 3)}, from dataset.empty_frame")
     further = {
@@ -474,12 +474,12 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         found = {name: x.shape[1:] for name, x in values.items()}
         if values and (found != further[kind] or len({len(x) for x in values.values()}) > 1):
             shapes = {name: x.shape for name, x in values.items()}
-            raise ValueError(f"{kind} has {shapes}; it takes equally many samples of {further[kind]}")
+            raise ValueError(f"{kind} has {shapes}, but it takes equally many samples of {further[kind]}")
     for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
             raise ValueError(
-                f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}; give whole numbers from 0 to "
-                f"{model.outcomes - 1}, or a model of more outcomes"
+                f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}, but the model takes whole "
+                f"numbers from 0 to {model.outcomes - 1}: give such numbers, or a model of more outcomes"
             )
     _check_condition(model.condition, arrays)
 
@@ -487,24 +487,24 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
 def _check_condition(expected: int, arrays: Arrays) -> None:
     width = 0 if arrays.condition is None else arrays.condition.shape[1]
     if width != expected:
-        raise ValueError(f"condition of width {width}; the model takes {expected}")
+        raise ValueError(f"condition has width {width}, but the model takes {expected}")
 
 
 def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
     for name in absent:
         if np.any(arrays.present.get(name, False)):
-            raise ValueError(f"{name} is declared absent, and {int(np.sum(arrays.present[name]))} samples have it")
+            raise ValueError(f"{name} is declared absent, but {int(np.sum(arrays.present[name]))} samples have it")
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())
         if not needed <= set(values) <= set(model.names):
-            raise ValueError(f"{kind} named {sorted(values)}; the model {sorted(model.names)} needs {sorted(needed)}")
+            raise ValueError(f"{kind} has {sorted(values)}, but the model {sorted(model.names)} needs {sorted(needed)}")
     for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
         if not set(masks) <= set(model.names):
-            raise ValueError(f"{kind} named {sorted(masks)}; the model has {sorted(model.names)}")
+            raise ValueError(f"{kind} masks {sorted(masks)}, but the model has {sorted(model.names)}")
     for modality in model.modalities:
         for values in (arrays.inputs, arrays.targets):
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
                 raise ValueError(
-                    f"{modality.name}: arrays of {values[modality.name].shape[1:]}, the model takes {modality.shape}"
+                    f"{modality.name}: arrays of {values[modality.name].shape[1:]}, but the model has {modality.shape}"
                 )
     _check_condition(model.condition, arrays)
