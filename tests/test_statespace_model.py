@@ -286,6 +286,27 @@ def test_a_true_state_is_believed(model, empty, batch):
     np.testing.assert_allclose(belief.mean[:, state.CODE :], alone.mean[:, state.CODE :], atol=1e-5)
 
 
+def test_the_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, empty, batch):
+    found = jax.jit(lambda inputs: objective.experts(nnx.merge(*model), inputs, batch.present, empty))(batch.inputs)
+    rows = slice(state.CODE, state.CODE + networks.TINT)
+    for i, image in enumerate(np.asarray(batch.inputs["visual"], np.float64)):
+        change = image - np.asarray(empty["visual"])
+        pixels = [pixel for line in change for pixel in line if max(abs(pixel)) > 12 / 255]
+        np.testing.assert_allclose(found["visual"].mean[i, rows], (np.mean(pixels, axis=0) + 0.3) / 0.12, atol=1e-3)
+    assert np.all(found["visual"].log_var[:, rows] < -5)
+    np.testing.assert_array_equal(found["tactile"].mean[:, rows], 0)  # a tactile image shows no colours
+    for name in ("tactile", "pose"):
+        np.testing.assert_array_equal(found[name].log_var[:, rows], networks.UNKNOWN_LOG_VAR)
+
+
+def test_an_untrained_decoder_draws_objects_in_their_tint(model, batch):
+    tint = jnp.array([[0.5, -1.0, 2.0]])
+    look = jnp.zeros((1, CONFIG.look)).at[:, :3].set(tint)
+    code = batch.targets["state"][:1]
+    layers = nnx.merge(*model).decoder(code[:, :12], jnp.eye(3)[None], code, look)
+    np.testing.assert_allclose(np.mean(layers.colour, axis=(1, 2)), 0.4 + 0.12 * tint, atol=0.1)
+
+
 def test_beliefs_are_products_of_the_single_ones(sample, batch):
     def belief(*names):
         return sample(batch._replace(present={name: x & (name in names) for name, x in batch.present.items()})).belief

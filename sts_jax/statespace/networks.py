@@ -23,10 +23,16 @@ from sts_jax.statespace import harmonics, poses, state, window
 
 IMAGES = ("visual", "tactile")
 INPUTS = (*IMAGES, "pose")
+UNKNOWN_LOG_VAR = 30.0  # of numbers that an expert knows nothing about: no precision at all
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
-_CONTRAST = 4.5  # of the outline of a sample, against that of the mean
+_CONTRAST = 10.0  # of the outline of a sample, against that of the mean
 _OUTSIDE = 8.0  # by how much less the outside of the canvas is covered, in logits
+# The tint: mean change of the pixels that show the object, less _MIDDLE, over _WIDTH
+TINT = 3  # numbers of it
+_MIDDLE, _WIDTH = -0.3, 0.12
+_TINT_LOG_VAR = -6.0  # of the tint in an image
+_BRIGHT = 0.7  # of the empty sensor, about
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
 
 
@@ -46,7 +52,7 @@ class Config:
     camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
     view: float = 0.15  # m, side of the square on the gel's face that an image shows
     position_scale: float = 0.05  # m, see `training.Preprocessing`
-    traits: int = 32  # numbers of the look that do not turn with the object
+    traits: int = 32  # numbers of the look that do not turn with the object, the tint first
     own: int = 4  # functions on the sphere of the look, in the object's frame
     shown: int = 4  # functions on the sphere of the look, as the object is turned at present
     degree: int = 3  # of their harmonics
@@ -66,7 +72,7 @@ class Config:
     outcome_weight: float = 8.0  # of the outcome's nats
     covered_weight: float = 0.15  # of the nats of the object's outline
     first_weight: float = 0.5  # of the nats of the first moment's images
-    look_weight: float = 0.3  # of the look's divergence: below 1, samples are sharper
+    look_weight: float = 0.1  # of the look's divergence: below 1, samples are sharper
     drawn: float = 0.4375  # share of a batch whose last moment is drawn (all train the other parts)
     drawn_first: float = 0.125  # share whose first moment is drawn
 
@@ -82,6 +88,8 @@ class Config:
             raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths, both need 3")
         if self.condition < 0 or self.condition == 1:
             raise ValueError(f"condition is {self.condition} numbers, but it must be 0, or at least the 2 of a vector")
+        if self.traits < TINT:
+            raise ValueError(f"traits is {self.traits}, but it must be at least {TINT}, the numbers of the tint")
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} is {getattr(self, name)}, but a share must be above 0 and at most 1")
@@ -182,10 +190,14 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 
 
 class Encoder(nnx.Module):
-    """One image's expert: a Gaussian over state code and look."""
+    """One image's expert: a Gaussian over state code and look.
 
-    def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
+    The tint is computed from a visual image. A tactile image does not show it.
+    """
+
+    def __init__(self, config: Config, name: str, rngs: nnx.Rngs) -> None:
         self.config = config
+        self.name = name
         half, quarter, eighth = config.encoder
         self.first = nnx.Conv(12, half, (3, 3), rngs=rngs)
         self.halves = nnx.List([_Residual(half, rngs) for _ in range(2)])
@@ -229,12 +241,23 @@ class Encoder(nnx.Module):
         variance = jnp.exp(log_var)
         traits, own, shown = parts(config, mean[:, state.CODE :])
         blur = parts(config, variance[:, state.CODE :])
+        tint, doubt_of_tint = self._tint(change)
+        traits = traits.at[:, :TINT].set(tint)
+        blur = (blur[0].at[:, :TINT].set(jnp.exp(doubt_of_tint)), *blur[1:])
         found = state.turn(place.angle, state.split(mean[:, : state.CODE]))
         doubt = state.turn_variance(place.angle, state.split(variance[:, : state.CODE]))
         return Gaussian(
             _joined(*found, traits, own, harmonics.turn(place.angle, shown)),
             jnp.log(_joined(*doubt, *blur[:2], harmonics.turn_variance(place.angle, blur[2]))),
         )
+
+    def _tint(self, change: Float[Array, "n size size 3"]) -> tuple[Float[Array, "n 3"], float]:
+        """The tint of each image, and the logarithm of its variance."""
+        if self.name == "tactile":
+            return jnp.zeros((len(change), TINT)), UNKNOWN_LOG_VAR
+        seen = window.shows(change)[..., None]
+        mean = jnp.sum(seen * change, axis=(1, 2)) / jnp.maximum(jnp.sum(seen, axis=(1, 2)), 1)
+        return (mean - _MIDDLE) / _WIDTH, _TINT_LOG_VAR
 
 
 class Transition(nnx.Module):
@@ -347,8 +370,10 @@ class Decoder(nnx.Module):
         depth = config.camera_distance + jnp.maximum(pose[:, 2] * config.position_scale - state.reach(shape, turn), 0)
         x = window.sample(x, _on_canvas(config, pose, heading, depth))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
-        # At first, hardly anything is covered.
-        return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=jax.nn.sigmoid(x[..., :3]), touch=x[..., 4:7])
+        # At first, everything has the colour of the present picture, and hardly anything is covered.
+        tint = jnp.clip(_BRIGHT + _MIDDLE + _WIDTH * look[:, None, None, :TINT], 0.03, 0.97)
+        colour = jax.nn.sigmoid(x[..., :3] + jnp.log(tint / (1 - tint)))
+        return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=colour, touch=x[..., 4:7])
 
 
 def compose(
@@ -404,7 +429,7 @@ class Model(nnx.Module):
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
-        self.encoders = nnx.Dict({name: Encoder(config, rngs) for name in config.inputs if name in IMAGES})
+        self.encoders = nnx.Dict({name: Encoder(config, name, rngs) for name in config.inputs if name in IMAGES})
         self.transition = Transition(config, rngs)
         self.decoder = Decoder(config, rngs)
 

@@ -29,10 +29,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state, window
-from sts_jax.statespace.networks import IMAGES, FinalPose, Model, compose
+from sts_jax.statespace.networks import IMAGES, TINT, UNKNOWN_LOG_VAR, FinalPose, Model, compose
 
 EXACT_LOG_VAR = -9.2  # of a pose that is given: 0.5 mm
-UNKNOWN_LOG_VAR = 30.0  # of the rest, of the expert of a pose: no precision at all
 _LEAST = 1 / 1020  # predicted images are kept this far from 0 and 1
 
 
@@ -204,7 +203,8 @@ def loss(
     chosen = jax.random.categorical(choice, jnp.where(usable, 0.0, -jnp.inf))
     stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
     belief = jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
-    terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE :], belief)))
+    # The tint is computed and not learnt: it has no part in the divergence.
+    terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE + TINT :], belief)))
     last = math.ceil(config.drawn * number)
     turn = _turn(targets["state"], targets["pose"])
     after = _Pictures(
