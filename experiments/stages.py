@@ -240,6 +240,7 @@ def jobs(
     if config.model == "statespace":
         state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty)
         arrays = training.state_moments(pairs, state, scenario, own, empty, views=views, falls=falls)
+        del pairs  # as large as the arrays, which hold copies
         yield Job("statespace", config.state_training, state, arrays, own, empty)
         return
     pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
@@ -253,12 +254,11 @@ def jobs(
 
 def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
     """Train the models of an experiment on one split, each with a progress bar."""
-    pairs = data.pairs(rows_of(data, split)["train"], symmetries=True)
-    views, falls = None, None
-    if config.model == "statespace":
-        views = data.views("train")
-        falls = data.ends(data.members("train", rendered=False))
-    for job in jobs(config, sensor, pairs, views, falls):
+    rows, more = rows_of(data, split)["train"], config.model == "statespace"
+    views = data.views("train") if more else None
+    falls = data.ends(data.members("train", rendered=False)) if more else None
+    # The trajectories have no name here, so that `jobs` can free their memory.
+    for job in jobs(config, sensor, data.pairs(rows, symmetries=True), views, falls):
         with Bar() as bar:
 
             def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = job.name) -> None:
