@@ -127,7 +127,8 @@ def test_pictures_to_be_recognised_come_with_their_answers(workdir, tmp_path, mo
     monkeypatch.setattr(recognise, "NUMBER", 2)
     found = [recognise.main(recognise.Args(workdir, tmp_path / f"{seed}.png", seed=seed)) for seed in range(6)]
     assert {text.splitlines()[1] for text in found} == {"answers: A1 B2", "answers: A2 B1"}
-    assert Image.open(tmp_path / "0.png").size[0] > 100
+    with Image.open(tmp_path / "0.png") as picture:
+        assert picture.size[0] > 100
     with pytest.raises(ValueError, match="first is 100: fewer than 2"):
         recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))
 
@@ -144,10 +145,11 @@ def test_a_scaling_curve_is_made_of_models_that_are_kept(workdir, tmp_path):
     text = scaling.main(args)
     rows = [line for line in text.splitlines() if line.startswith(("| visual", "| visual and pose"))]
     assert len(rows) == 2 * 2 * 2  # sizes, seeds, subsets
-    assert {"4 trajectories, 4 steps", "7 trajectories, 4 steps"} >= {
+    assert {"8 trajectories, 4 steps", "14 trajectories, 4 steps"} >= {
         row.split(": ")[1].split(", seed")[0] for row in rows
     }
-    assert Image.open(tmp_path / "a.png").size[0] > 300
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.size[0] > 300
     stamps = {path: path.stat().st_mtime_ns for path in (workdir / "scaling").rglob("*") if path.is_file()}
     assert scaling.main(args) == text
     assert stamps == {path: path.stat().st_mtime_ns for path in (workdir / "scaling").rglob("*") if path.is_file()}
