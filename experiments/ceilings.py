@@ -50,7 +50,8 @@ def ceilings(
         test: The held-out items.
         times: Re-rolls of each.
         num: How many of the items.
-        judge: `evaluation.score`, which knows the outcomes and perhaps their frequencies.
+        judge: the scores of a prediction for some items: `evaluation.score` with the scenario's outcomes and their
+            frequencies, see `stages.judge_of`.
     """
     few = dataset.Pairs(*(leaf[:num] for leaf in test))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"

@@ -1,4 +1,4 @@
-"""The deterministic network learns what a first moment shows, and sees nothing of the end."""
+"""The deterministic network fits simple trajectories, and items of a batch do not influence each other."""
 
 import itertools
 

@@ -132,7 +132,7 @@ def test_a_distribution_is_scored_by_its_samples_and_probabilities():
 
 
 def test_the_outcome_is_decided_for_the_best_balanced_accuracy():
-    """Of items that fall off in one case of ten, with a predictor that knows every probability."""
+    """The true probabilities are given, and one item in ten falls off."""
     count, rng = 20000, np.random.default_rng(0)
     off = np.clip(rng.beta(0.3, 2.7, count), 0.01, 0.99)
     test, predicted = judged(2)

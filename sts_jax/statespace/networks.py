@@ -23,7 +23,7 @@ from sts_jax.statespace import harmonics, poses, state, window
 
 IMAGES = ("visual", "tactile")
 INPUTS = (*IMAGES, "pose")
-UNKNOWN_LOG_VAR = 30.0  # of numbers that an expert knows nothing about: no precision at all
+UNKNOWN_LOG_VAR = 30.0  # of numbers that an input does not determine: their precision is about 0
 _LOG_VAR_LIMIT = 8.0  # of an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
 _CONTRAST = 10.0  # of the outline of a sample, against that of the mean
