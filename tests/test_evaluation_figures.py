@@ -136,3 +136,12 @@ def test_a_scaling_figure_joins_models_of_one_training_time_or_one_number_of_tra
         "vision, 800 trajectories": [[2, 0.16], [5, 0.4]],
         "vision, 100 trajectories": [[2, 0.02], [5, 0.05]],
     }
+
+
+@pytest.mark.parametrize(("last", "scale"), [(0.5, "log"), (-3.0, "linear")])
+def test_a_loss_that_becomes_negative_is_drawn_whole(tmp_path, drawn, last, scale):
+    log = [{"step": step, "loss": loss} for step, loss in ((10, 100.0), (20, last))]
+    figures.training_curves(tmp_path / "a.png", {"model": log})
+    axis = drawn[0].axes[0]
+    assert axis.get_yscale() == scale
+    assert axis.get_ylim()[0] < last

@@ -251,7 +251,7 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
         axis.set_xlabel("gradient step")
         axis.set_ylabel(units.get(key, "nats an item"))
         axis.set_title(key, fontsize=9)
-        if key == "loss":
+        if key == "loss" and all(entry[key] > 0 for log in logs.values() for entry in log if key in entry):
             axis.set_yscale("log")  # models with different numbers of subsets differ in scale
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=7)
