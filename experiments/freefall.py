@@ -38,7 +38,7 @@ DEFAULT = stages.Config(
 LONG = dataclasses.replace(
     DEFAULT,
     collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=20000),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=16000),
 )
 SMOKE = stages.smoke(DEFAULT)
 PAPER = stages.paper(COLLECTION, num_objects=340, num_per_object=5)  # 1,700 trajectories

@@ -38,7 +38,7 @@ DEFAULT = stages.Config(
 LONG = dataclasses.replace(
     DEFAULT,
     collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=10000),
+    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=8000),
 )
 SMOKE = stages.smoke(DEFAULT)
 PAPER = stages.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories

@@ -25,8 +25,8 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
 
     Args:
         folder: folder of the cache, by default JAX_COMPILATION_CACHE_DIR. If that variable is empty, nothing is
-            cached. If it is not set, the cache is in `~/.cache/sts_jax`, in a folder for this kind of processor,
-            because a program compiled for one kind may not run on another.
+            cached. If it is not set, the cache is in `cache_folder()`, in a folder for this kind of processor, because
+            a program compiled for one kind may not run on another.
 
     Returns:
         The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.

@@ -111,10 +111,12 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         if isinstance(thing, Frame):
             _one("Frame", thing.depth, 2)
             image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
-        elif isinstance(thing, tuple(_KINDS.values())):
+        elif isinstance(thing, Body | Prediction | Trajectory):
+            remedies = ["save it as .npz"] * isinstance(thing, tuple(_KINDS.values()))
+            remedies += ["draw it with sts.show(...).savefig(path)"] * (not isinstance(thing, Trajectory))
             raise TypeError(
-                f"a .png file keeps the picture of a Frame or an image, got a {type(thing).__name__}. Save it as .npz, "
-                "or draw it with sts.show(...).savefig(path)"
+                f"a .png file keeps the picture of a Frame or an image, got a {type(thing).__name__}: "
+                f"{', or '.join(remedies)}"
             )
         else:
             image = _image(thing)

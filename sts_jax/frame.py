@@ -251,7 +251,8 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         Image, sRGB in [0, 1], which equals `frame.visual` at 0 and `frame.tactile` at 1.
 
     Raises:
-        ValueError: `light` is outside [0, 1] or not one number, or `Sensor.check` raises an error. Traced values are
+        TypeError: `frame` is no `Frame`, or `light` is no number.
+        ValueError: `light` is outside [0, 1] or has an axis, or `Sensor.check` raises an error. Traced values are
             not checked. If the constants of a traced sensor are invalid, the default exposure is used.
     """
     _check_sensor(sensor)
@@ -291,6 +292,7 @@ def touch(
         with default constants in the place of invalid ones.
 
     Raises:
+        TypeError: `imprint` is no array.
         ValueError: the imprint is not an image or has whole numbers, the window has no area or is not finite, or
             `Sensor.check` raises an error. Traced values are not checked.
     """

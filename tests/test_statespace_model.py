@@ -198,30 +198,27 @@ def test_an_expert_turns_with_the_picture(model, empty):
 
 def test_the_final_pose_turns_with_state_and_condition(model):
     """Exact where the weights of the absolute heading, place and condition are zero, for doubts that are level."""
-    shapes = 2 * CONFIG.support + (CONFIG.own + CONFIG.shown) * CONFIG.directions
-    start = 2 * poses.CODE + 7 + 5 + CONFIG.traits + shapes
+    start = 2 * poses.CODE + 7 + 5 + 2 * CONFIG.support
     absolute = slice(start, start + 4 + 2)
     params = changed(model[1], ("transition", "first"), lambda kernel: kernel.at[absolute].set(0))
     rng = np.random.default_rng(0)
     begin, end, outcome = random_states(rng, 3), random_codes(rng, 3), jnp.array([0, 1, 2])
     condition = jnp.asarray(rng.normal(size=(3, 3)), jnp.float32)
-    traits, own, shown = networks.parts(CONFIG, jnp.asarray(rng.normal(size=(3, CONFIG.look)), jnp.float32))
     angle = jnp.stack([jnp.cos(jnp.array([0.4, 2.0, -1.3])), jnp.sin(jnp.array([0.4, 2.0, -1.3]))], axis=1)
 
     @jax.jit
-    def density(begin, end, condition, shown):
-        mean = jnp.concatenate([begin, traits, own.reshape(3, -1), shown.reshape(3, -1)], axis=1)
-        final = nnx.merge(model[0], params).transition(Gaussian(mean, jnp.full_like(mean, -3.0)), condition)
+    def density(begin, end, condition):
+        final = nnx.merge(model[0], params).transition(Gaussian(begin, jnp.full_like(begin, -3.0)), condition)
         since = poses.matrix(end) @ poses.matrix(begin[:, :12]).swapaxes(1, 2)
         return objective.log_density(final, end, since, outcome)
 
-    before = density(begin, end, condition, shown)
+    before = density(begin, end, condition)
     moved = jnp.concatenate([poses.turn(angle, condition[:, :2]), condition[:, 2:]], axis=1)
     turned = state.join(state.turn(angle, state.split(begin)))
-    after = density(turned, poses.turn_code(angle, end), moved, harmonics.turn(angle, shown))
+    after = density(turned, poses.turn_code(angle, end), moved)
     for a, b in zip(before, after, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4)
-    alone = density(turned, end, condition, shown)
+    alone = density(turned, end, condition)
     assert np.abs(alone[1] - before[1]).min() > 1
 
 
@@ -416,14 +413,12 @@ def test_the_states_of_falls_are_exact_or_have_noise_of_the_size_that_their_beli
     number = 400
     code = jnp.tile(random_states(np.random.default_rng(0), 8), (number // 8, 1))
     falls = {"state": code, "pose": code[:, :12], "outcome": jnp.zeros(number, jnp.int32)}
-    ends = objective._known_ends(jax.random.key(0), falls, CONFIG.look)
+    ends = objective._known_ends(jax.random.key(0), falls)
     mean, variance = (np.asarray(x, np.float64) for x in (ends.belief.mean, jnp.exp(ends.belief.log_var)))
-    np.testing.assert_array_equal(mean[:, state.CODE :], 0)  # nothing is known of the look
-    np.testing.assert_allclose(variance[:, state.CODE :], 1, rtol=1e-5)
     np.testing.assert_allclose(mean[:, :12], code[:, :12], atol=1e-3)
-    np.testing.assert_allclose(mean[::2, : state.CODE], code[::2], atol=1e-3)
+    np.testing.assert_allclose(mean[::2], code[::2], atol=1e-3)
     # Without the prior, the belief is a Gaussian of this mean and variance.
-    mean, variance = mean[1::2, 12 : state.CODE], variance[1::2, 12 : state.CODE]
+    mean, variance = mean[1::2, 12:], variance[1::2, 12:]
     noise = variance / (1 - variance)
     error = (mean * noise / variance - code[1::2, 12:]) / np.sqrt(noise)
     np.testing.assert_allclose(error.mean(), 0, atol=0.03)

@@ -221,7 +221,7 @@ def table(summary: dict, *, title: str, rows: Sequence[str] | None = None, notes
         "Skill is 1 - excess / excess of the constant, of the mean over samples. The energy score is a distance that a "
         "predicted distribution scores, and the error of a single prediction."
     )
-    return "\n".join([f"# {title}", "", f"{_what(summary)} {explained}", "", *lines, "", *notes, ""])
+    return "\n".join([f"# {title}", "", f"{_held_out(summary)} {explained}", "", *lines, "", *notes, ""])
 
 
 def full_table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
@@ -237,7 +237,7 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     lines = [
         f"# {title}",
         "",
-        f"{_what(summary)} {explained}",
+        f"{_held_out(summary)} {explained}",
         "",
         f"| predictor | {' | '.join(head for head, *_ in _ALL)} |",
         "|---" * (len(_ALL) + 1) + "|",
@@ -263,7 +263,7 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = ()) -> str:
     return "\n".join([*lines, "", *notes, ""])
 
 
-def _what(summary: dict) -> str:
+def _held_out(summary: dict) -> str:
     outcomes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items())
     text = (
         f"{summary['items']} held-out trajectories of {summary['objects']} objects ({outcomes}). In brackets: 95 % "

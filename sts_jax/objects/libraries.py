@@ -155,8 +155,9 @@ def library(
         ("longest_side", longest_side, PAD),
         ("largest", largest, PAD),
     ):
-        if value is not None and not 0 < value <= most:
-            raise ValueError(f"{folder}: {name} must be positive and at most {most} m, got {value}")
+        if value is not None and not (0 < value <= most and math.isfinite(value)):
+            allowed = "positive and finite" if most == math.inf else f"positive and at most {most} m"
+            raise ValueError(f"{folder}: {name} is {value} m, but it must be {allowed}")
     if up is not None and up not in AXES:
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
     if faces < 4:

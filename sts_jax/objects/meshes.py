@@ -408,10 +408,11 @@ def _is_closed(faces: np.ndarray) -> bool:
 
 def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
     faces = np.asarray(piece.faces)
-    if faces.min() < 0 or faces.max() >= len(piece.vertices):
+    wrong = faces[(faces < 0) | (faces >= len(piece.vertices))]
+    if wrong.size:
         raise ValueError(
-            f"{path}: a face refers to vertex {faces.max()}, but there are only {len(piece.vertices)}: check that the "
-            "file is complete"
+            f"{path}: a face refers to vertex {wrong[0]}, but vertices are numbered from 0 to "
+            f"{len(piece.vertices) - 1}: check that the file is complete"
         )
     return np.asarray(piece.vertices, float)[faces]
 

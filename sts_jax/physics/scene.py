@@ -136,8 +136,9 @@ def set_rigid(
         raise ValueError(f"mass is {mass} kg, but it must be positive and finite")
     if not (np.isfinite(friction) and friction > 0):
         raise ValueError(f"friction is {friction}, but it must be positive and finite")
-    if not (np.isfinite(com).all() and np.isfinite(inertia).all()):
-        raise ValueError("com or inertia has a value that is not finite, but all must be finite")
+    for name, value in (("com", com), ("inertia", inertia)):
+        if not np.isfinite(value).all():
+            raise ValueError(f"{name} is {np.asarray(value).tolist()}, but all its values must be finite")
     principal, axes = (x[..., ::-1].copy() for x in np.linalg.eigh(inertia))  # largest first, as in MuJoCo
     if principal[2] <= 0:
         raise ValueError(f"principal moments of inertia are {principal} kg m^2, but they must be positive")

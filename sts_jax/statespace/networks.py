@@ -158,19 +158,24 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
     return traits, own.reshape(len(look), -1, count), shown.reshape(len(look), -1, count)
 
 
-def _shapes(
-    config: Config, known: state.State, look: Array, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
+def _shape(
+    config: Config, known: state.State, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
 ) -> list[Array]:
-    """Traits and the values of all functions on the sphere, those of the object's frame turned and those shown."""
-    traits, own, shown = parts(config, look)
-    many, few = objects.lattice(config.support), objects.lattice(config.directions)
+    """Values of the support function, as known in the object's frame and as shown."""
+    directions = objects.lattice(config.support)
     return [
-        traits,
-        harmonics.values(known.own[:, None], own_turn, many),
-        harmonics.values(known.shown[:, None], shown_turn, many),
-        harmonics.values(own, own_turn, few),
-        harmonics.values(shown, shown_turn, few),
+        harmonics.values(known.own[:, None], own_turn, directions),
+        harmonics.values(known.shown[:, None], shown_turn, directions),
     ]
+
+
+def _appearance(
+    config: Config, look: Array, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
+) -> list[Array]:
+    """Traits of the look and the values of its functions, those of the object's frame and those shown."""
+    traits, own, shown = parts(config, look)
+    directions = objects.lattice(config.directions)
+    return [traits, harmonics.values(own, own_turn, directions), harmonics.values(shown, shown_turn, directions)]
 
 
 def _joined(*features: Float[Array, "n ..."]) -> Float[Array, "n k"]:
@@ -261,12 +266,14 @@ class Encoder(nnx.Module):
 
 
 class Transition(nnx.Module):
-    """From a belief about the present state, and the condition, to the density of the final pose."""
+    """From a belief about the present state, and the condition, to the density of the final pose.
+
+    It does not see the look, which would let it recognise training objects (see docs/trials.md).
+    """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
-        shapes = 2 * config.support + (config.own + config.shown) * config.directions
-        number = 2 * poses.CODE + 7 + 5 + config.traits + shapes + 4 + 2 * config.condition
+        number = 2 * poses.CODE + 7 + 5 + 2 * config.support + 4 + 2 * config.condition
         self.first = nnx.Linear(number, config.transition, rngs=rngs)
         self.layers = nnx.List([_ResidualDense(config.transition, rngs) for _ in range(3)])
         self.norm = nnx.LayerNorm(config.transition, rngs=rngs)
@@ -278,22 +285,21 @@ class Transition(nnx.Module):
         """The density, from the means and variances of the fused posterior.
 
         Args:
-            belief: over state code and look, `(n, code + look)`.
+            belief: over the state code, `(n, code)`.
             condition: each number divided by its usual size, or None if the model has none.
 
         Returns:
             The density in the frame of the heading of the belief's mean.
         """
         config = self.config
-        mean, look = jnp.split(belief.mean, [state.CODE], axis=-1)
-        known = state.split(mean)
-        doubt = jnp.clip(belief.log_var[:, : state.CODE], -_LOG_VAR_LIMIT, 2) / 4
+        known = state.split(belief.mean)
+        doubt = jnp.clip(belief.log_var, -_LOG_VAR_LIMIT, 2) / 4
         heading = state.heading(known)
         here = poses.turn_code_back(heading, known.pose)
         level = jnp.swapaxes(poses.about_vertical(heading), -1, -2)
         features = [
             here,
-            *_shapes(config, known, look, poses.matrix(here), level),
+            *_shape(config, known, poses.matrix(here), level),
             jnp.einsum("nij,nj->ni", poses.matrix(here), known.com),
             jnp.einsum("nij,nj->ni", level, known.low),
             known.mass,
@@ -360,8 +366,9 @@ class Decoder(nnx.Module):
         here = poses.turn_code_back(heading, pose)
         level = jnp.swapaxes(poses.about_vertical(heading), -1, -2)
         shape = state.split(known)
-        shapes = _shapes(config, shape, look, poses.matrix(here), level @ turn)
-        x = _joined(here, heading, pose[:, :2], *shapes)
+        turns = (poses.matrix(here), level @ turn)
+        drawn = (*_appearance(config, look, *turns), *_shape(config, shape, *turns))
+        x = _joined(here, heading, pose[:, :2], *drawn)
         x = self.core(jax.nn.swish(self.residual(self.first(x))))
         x = self.widen(x.reshape(len(x), config.canvas // 8, config.canvas // 8, -1))
         for layer, enlarge in zip(self.layers, self.enlarge, strict=False):

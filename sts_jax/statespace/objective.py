@@ -68,6 +68,11 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
 
 
+def of_state(belief: Gaussian) -> Gaussian:
+    """The part of a belief over state code and look that is about the state code."""
+    return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
+
+
 def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Zero in place of the items that do not count."""
     return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
@@ -114,7 +119,7 @@ def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n siz
 class _Ends(NamedTuple):
     """Beliefs about first moments, with the ends that followed."""
 
-    belief: Gaussian  # over state code and look
+    belief: Gaussian  # over the state code
     state: Float[Array, "n code"]
     pose: Float[Array, "n 12"]  # the final one
     outcome: Int[Array, "n"]
@@ -185,7 +190,7 @@ def loss(
     beliefs = [fuse(found, own) for own in members]
     ends = [
         _Ends(
-            belief,
+            of_state(belief),
             targets["state"],
             targets["pose"],
             targets["outcome"],
@@ -195,7 +200,7 @@ def loss(
         for belief, own in zip(beliefs, members, strict=True)
     ]
     if falls is not None:
-        ends.append(_known_ends(blur, falls, config.look))
+        ends.append(_known_ends(blur, falls))
     terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
 
     # A picture is drawn of the belief of one subset with an image.
@@ -280,7 +285,7 @@ def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Ar
     return jnp.sum(counts * error) / number, jnp.sum(counts * nats) / number
 
 
-def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], look: int) -> _Ends:
+def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
     """Trajectories whose first state is known: half of them exactly, half with an uncertain shape and mass.
 
     The uncertain ones have noise of known size added, as an expert has it.
@@ -304,10 +309,9 @@ def _known_ends(key: PRNGKeyArray, falls: dict[str, Array], look: int) -> _Ends:
     exactly = jnp.arange(number)[:, None] % 2 == 0
     doubt = jnp.where(exactly, EXACT_LOG_VAR / 2, doubt)
     noisy = code + jnp.where(exactly, 0, jnp.exp(doubt)) * jax.random.normal(noise, code.shape)
-    mean = jnp.concatenate([code[:, : poses.CODE], noisy[:, poses.CODE :], jnp.zeros((number, look))], axis=-1)
-    expert = Gaussian(mean, jnp.concatenate([2 * doubt, jnp.full((number, look), UNKNOWN_LOG_VAR)], axis=-1))
+    mean = jnp.concatenate([code[:, : poses.CODE], noisy[:, poses.CODE :]], axis=-1)
     known = jnp.ones(number, bool)
-    belief = fuse({"state": expert}, {"state": known})
+    belief = fuse({"state": Gaussian(mean, 2 * doubt)}, {"state": known})
     return _Ends(belief, code, falls["pose"], falls["outcome"], falls.get("condition"), known)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import poses, state
 from sts_jax.statespace.networks import FinalPose, Model, compose
-from sts_jax.statespace.objective import experts, fuse, reduced
+from sts_jax.statespace.objective import experts, fuse, of_state, reduced
 
 
 class Samples(NamedTuple):
@@ -50,7 +50,7 @@ def sample(
     """
     model = nnx.merge(graphdef, params)
     belief = fuse(experts(model, inputs, present, empty), present)
-    final = model.transition(belief, condition)
+    final = model.transition(of_state(belief), condition)
     end, appearance, outline = jax.random.split(key, 3)
     codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
     known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))
