@@ -10,8 +10,8 @@ import trimesh
 from optics_bodies import body_mesh, embree, from_trimesh, interior
 
 import sts_jax as sts
-from sts_jax import frame as frame_module
 from sts_jax import objects, tactile
+from sts_jax.rendering import drawing, equilibrium
 
 SENSOR = sts.Sensor()
 SIZES = [(64, 64), *(pytest.param(size, marks=pytest.mark.slow) for size in ((97, 53), (200, 200)))]
@@ -230,7 +230,7 @@ def test_one_compilation_serves_all_objects_of_a_class():
         body = objects.make(jax.random.key(k), category)
         assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
         sense(SENSOR, body, at(0, 0, 0.05), weight(0, 0, 0))
-        programs.append((frame_module._balance._cache_size(), frame_module._draw._cache_size()))
+        programs.append((equilibrium.balance._cache_size(), drawing.draw._cache_size()))
     assert programs[0] == programs[1] == programs[2]
 
 
@@ -305,14 +305,14 @@ def test_one_program_serves_bodies_that_collide_and_hold_otherwise():
     assert body.hulls.shape != other.hulls.shape
     pose = jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))
-    before = frame_module._balance._cache_size(), frame_module._draw._cache_size()
+    before = equilibrium.balance._cache_size(), drawing.draw._cache_size()
     sts.sense(dataclasses.replace(SENSOR, phong=tactile.Phong(ambient=0.7)), other, pose, resolution=(24, 24))
-    assert (frame_module._balance._cache_size(), frame_module._draw._cache_size()) == before
+    assert (equilibrium.balance._cache_size(), drawing.draw._cache_size()) == before
 
 
 def test_another_resolution_compiles_the_drawing_alone():
     body, pose = sts.objects.make(jax.random.key(0), "bottle"), jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))
-    before = frame_module._balance._cache_size()
+    before = equilibrium.balance._cache_size()
     sts.sense(SENSOR, body, pose, resolution=(2, 3))
-    assert frame_module._balance._cache_size() == before
+    assert equilibrium.balance._cache_size() == before

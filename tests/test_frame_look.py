@@ -14,7 +14,7 @@ from PIL import Image
 
 import sts_jax as sts
 from sts_jax import geometry, objects, optics, tactile
-from sts_jax.frame import underside
+from sts_jax.rendering.equilibrium import underside
 
 SENSOR = sts.Sensor()
 sense = sts.sense  # compiles itself: one equilibrium serves every resolution

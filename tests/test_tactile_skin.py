@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import erf
+from tactile_surfaces import SHAPES, SMALL, bumpy, normals_of, some_pixels
 
 from sts_jax import tactile
 
-SMALL = [(64, 64), (97, 53), (200, 200)]
-SHAPES = [*SMALL, (480, 640), (1232, 1640)]
 WINDOW = np.array([-0.08, -0.07, 0.16, 0.14])  # m
 LEDS = tactile.Leds(
     positions=jnp.array([[-0.09, 0.01, -0.004], [0.085, -0.02, -0.02], [0.01, -0.02, -0.06], [0.0, 0.1, 0.0]]),
@@ -26,19 +25,6 @@ SKIN = tactile.Skin(shadow_steps=12, shadow_reach=0.03, penumbra=0.08)
 def strict_ranks():
     with jax.numpy_rank_promotion("raise"):
         yield
-
-
-def bumpy(shape):
-    rng = np.random.default_rng(0)
-    x, y = np.meshgrid(np.linspace(-0.075, 0.075, shape[1]), np.linspace(-0.075, 0.075, shape[0]))
-    z = -0.002 * np.exp(-((x - 0.01) ** 2 + y**2) / 0.015**2) + 2e-4 * np.sin(300 * x) * np.cos(200 * y)
-    return np.stack([x, y, z], -1) + 1e-5 * rng.normal(size=(*shape, 3))
-
-
-def normals_of(points):
-    """Of a grid of points, around which it goes on as it ends."""
-    planes = jnp.moveaxis(jnp.asarray(points), -1, 0)
-    return tactile.surface_normals(tuple(jnp.pad(plane, 1, mode="edge") for plane in planes))
 
 
 def places(shape):
@@ -57,38 +43,10 @@ def pressed(shape):
     return np.maximum(np.maximum(ball, box), np.maximum(ridge, 0))
 
 
-def some(shape, number=200):
-    rng = np.random.default_rng(1)
-    inner = [(rng.integers(shape[0]), rng.integers(shape[1])) for _ in range(number)]
-    return [*inner, (0, 0), (0, shape[1] - 1), (shape[0] - 1, 0), (shape[0] - 1, shape[1] - 1)]
-
-
 def some_normals(shape):
     normals = np.random.default_rng(2).normal(size=(*shape, 3))
     normals[..., 2] = -np.abs(normals[..., 2])
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_normals_are_the_axis_of_least_covariance(shape):
-    points = bumpy(shape)
-    got = np.asarray(jax.jit(normals_of)(jnp.asarray(points, jnp.float32)))
-    for i, j in some(shape):
-        rows = np.clip([i - 1, i, i + 1], 0, shape[0] - 1)
-        columns = np.clip([j - 1, j, j + 1], 0, shape[1] - 1)
-        around = points[np.ix_(rows, columns)].reshape(-1, 3)
-        normal = np.linalg.eigh(np.cov(around.T, bias=True))[1][:, 0]
-        normal *= -np.sign(normal[2])
-        np.testing.assert_allclose(got[i, j], normal, atol=2e-3)
-
-
-def test_normals_of_several_grids_side_by_side_are_those_of_each():
-    grids = [np.moveaxis(bumpy((9, 7)), -1, 0), np.moveaxis(bumpy((9, 7))[::-1], -1, 0)]
-    several = tactile.surface_normals(tuple(jnp.asarray(np.stack(planes, -1)) for planes in zip(*grids, strict=True)))
-    assert several.shape == (7, 5, 2, 3)
-    for k, grid in enumerate(grids):
-        alone = tactile.surface_normals(tuple(jnp.asarray(grid)))
-        np.testing.assert_allclose(several[:, :, k], alone, atol=1e-6)
 
 
 def reflected_light(constants, lights, normal, point, shares):
@@ -117,7 +75,7 @@ def test_phong_is_the_papers_equation(shape, lights):
     inputs = [jnp.asarray(v, jnp.float32) for v in (normals, points, shares)]
     whole = np.asarray(jax.jit(tactile.phong)(constants, lights, *inputs[:2]))
     shaded = np.asarray(jax.jit(tactile.phong)(constants, lights, *inputs))
-    for i, j in some(shape):
+    for i, j in some_pixels(shape):
         inside = normals[i, j], points[i, j]
         np.testing.assert_allclose(whole[i, j], reflected_light(constants, lights, *inside, np.ones(4)), rtol=2e-5)
         np.testing.assert_allclose(
@@ -192,7 +150,7 @@ def test_coupling_is_a_weighted_mean_over_the_image(shape, length):
     pitch = WINDOW[2:] / [shape[1], shape[0]]
     got = np.asarray(jax.jit(tactile.couple)(jnp.asarray(depth, jnp.float32), length, jnp.asarray(pitch, jnp.float32)))
     y, x = np.arange(shape[0]) * pitch[1], np.arange(shape[1]) * pitch[0]
-    for i, j in some(shape, 60):
+    for i, j in some_pixels(shape, 60):
         weights = np.exp(-((x[None] - x[j]) ** 2 + (y[:, None] - y[i]) ** 2) / (2 * length**2))
         assert got[i, j] == pytest.approx(np.sum(weights * depth) / np.sum(weights), rel=1e-4, abs=1e-9)
 
@@ -267,7 +225,7 @@ def test_shadows_are_what_stands_in_the_way(shape, lights):
     assert got.shape == (4, *shape)
     assert got.min() == 0
     assert got.max() == 1
-    for i, j in some(shape, 60):
+    for i, j in some_pixels(shape, 60):
         np.testing.assert_allclose(got[:, i, j], list(arriving(SKIN, lights, depth, i, j)), atol=5e-3)
 
 

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sts_jax._ranges import POSITIVE
+
 Scalar = float | Array
 
 
@@ -19,10 +21,14 @@ Scalar = float | Array
 class Camera:
     """A pinhole on the sensor's z axis, looking out through the gel along +z."""
 
-    distance: Scalar = 0.1  # m, from the pinhole to the gel's outer face (paper's code: bottom of the block)
-    fov: Scalar = 2 * math.atan(0.75)  # rad, vertical field of view (paper's code): the pad is as high as the image
-    aspect: Scalar = 4 / 3  # width / height of the native view (device: 1640x1232, paper's code: 640x480)
-    near: Scalar = 0.02  # m, a face with a corner nearer to the pinhole than this is not drawn
+    # m, from the pinhole to the gel's outer face (paper's code: bottom of the block)
+    distance: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
+    # rad, vertical field of view (paper's code): the pad is as high as the image
+    fov: Scalar = dataclasses.field(default=2 * math.atan(0.75), metadata=POSITIVE | {"below": math.pi})
+    # width / height of the native view (device: 1640x1232, paper's code: 640x480)
+    aspect: Scalar = dataclasses.field(default=4 / 3, metadata=POSITIVE)
+    # m, a face with a corner nearer to the pinhole than this is not drawn
+    near: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:

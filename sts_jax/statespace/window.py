@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sts_jax._sampling import bilinear_batch
 from sts_jax.statespace import poses
 
 THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (a shadow differs by less)
@@ -81,15 +82,5 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
     """Bilinear interpolation at some columns and rows, whole numbers at pixel centres. Zero outside of the image."""
-    side, channels = images.shape[1], images.shape[-1]
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    # The four neighbours of a place lie side by side, and one lookup finds them.
-    corners = [framed[:, down : down + side + 1, right : right + side + 1] for down in (0, 1) for right in (0, 1)]
-    table = jnp.concatenate(corners, axis=-1).reshape(len(images), (side + 1) ** 2, 4 * channels)
-    places = jnp.clip(places + 1, 0, side + 1)
-    corner = jnp.minimum(jnp.floor(places), side).astype(jnp.int32)
-    index = corner[..., 1] * (side + 1) + corner[..., 0]
-    found = jnp.take_along_axis(table, index[..., None], axis=1).reshape(*index.shape, 4, channels)
-    right, down = places[..., 0] - corner[..., 0], places[..., 1] - corner[..., 1]
-    weights = jnp.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=-1)
-    return jnp.sum(weights[..., None] * found, axis=-2)
+    return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax._tiles import TILE, where_active
+from sts_jax.rendering.tiles import TILE, where_active
 
 SHAPES = [(8, 8), (17, 33), (64, 64), (131, 53), (5, 40), (TILE - 1, 40)]
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax._loop import looped
+from sts_jax.rendering.loop import looped
 
 
 def plain(x, n, p):

@@ -5,8 +5,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import geometry
 from sts_jax.optics.camera import Camera, full_window, rays, to_pixels
-from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
 from sts_jax.optics.shading import to_srgb
+from sts_jax.optics.zbuffer import barycentrics, pixel_centres, rasterise
 
 _SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # light from above and from below, linear
 _LAMP = (0.45, 0.43, 0.40)  # light of a lamp over the viewer's left shoulder, linear
