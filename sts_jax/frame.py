@@ -65,23 +65,23 @@ def sense(
     The images are also empty, and `balanced` is False, if the pose or the wrench is not finite, the squared length of
     the quaternion is zero or overflows, or a traced body has a vertex, normal or colour that is not finite.
 
-    It compiles itself once for each resolution and size class of bodies (faces and texture), and works inside other
-    compiled functions, `vmap` and `grad`.
+    The function is compiled once for each resolution and size class of bodies (faces and texture). It also works inside
+    other compiled functions, `vmap` and `grad`.
 
     An invalid sensor (`Sensor.check`) raises an error. Traced constants, such as those of a jitted function's argument,
-    have no values to check. If they are invalid, the images are those of an empty sensor with the default constants in
-    their place, never NaN, and `balanced` is False.
+    have no values to check. If they are invalid, the images are those of an empty sensor with the default constants and
+    never contain NaN, and `balanced` is False.
 
     Args:
         sensor: constants of the sensor.
         body: the object.
         pose: mesh frame in the sensor frame: position (m), quaternion.
-        wrench: of the pad on the object: force (N) and moment about the sensor's origin (N m), sensor frame.
+        wrench: force (N) and moment about the sensor's origin (N m) of the pad on the object, sensor frame.
         resolution: (height, width), pixels. Another aspect ratio than the camera's shows the largest centred part.
         crop: show a window of the image's aspect ratio around the object.
-        moving_edges: for fitting poses. Adds the effect of the imprint's moving edges to the derivative of the tactile
-            image by the pose, accurate on average over a few pixels (`with_moving_edges`). The default derivative is
-            that of each pixel and ignores them. The images are the same.
+        moving_edges: add the effect of the imprint's moving edges to the derivative of the tactile image by the pose,
+            for fitting poses. It is accurate on average over a few pixels (`rendering.edges`). By default, the
+            derivative is that of each pixel and ignores this effect. The images are the same.
 
     Returns:
         Frame.
@@ -140,7 +140,7 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         Image, sRGB in [0, 1], which equals `frame.visual` at 0 and `frame.tactile` at 1.
 
     Raises:
-        TypeError: `frame` is no `Frame`, or `light` is no number.
+        TypeError: `frame` is not a `Frame`, or `light` is not a number.
         ValueError: `light` is outside [0, 1] or has an axis, or `Sensor.check` raises an error. Traced values are
             not checked. If the constants of a traced sensor are invalid, the default exposure is used.
     """
@@ -148,18 +148,13 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     sensor, _ = sensor.guard()
     if not isinstance(frame, Frame):
         raise TypeError(f"frame is a {type(frame).__name__}, but it must be the Frame that sense returns")
-    if not isinstance(light, jax.core.Tracer) and np.asarray(light).dtype.kind not in "iuf":
-        raise TypeError(f"light is {light!r}, but it must be one number from 0 (visual) to 1 (tactile)")
-    if jnp.ndim(light):
-        raise ValueError(f"light has the shape {jnp.shape(light)}, but it must be one number. For several use jax.vmap")
-    if not isinstance(light, jax.core.Tracer) and not 0 <= np.asarray(light) <= 1:
-        raise ValueError(f"light is {light}, but it must be a share of the LEDs' power, from 0 (visual) to 1 (tactile)")
+    _check_light(light)
     light = jnp.asarray(light, jnp.float32)
     light = jnp.where(light >= 0, jnp.where(light <= 1, light, 1), 0)
     bright = light * sensor.room.exposure
     share = bright / (1 - light + bright)
     mixed = optics.to_srgb((1 - share) * optics.to_linear(frame.visual) + share * optics.to_linear(frame.tactile))
-    # The conversion to linear light and back rounds. At 0 and 1 the difference to the stream is added back.
+    # The conversion to linear light and back rounds. At 0 and 1, the difference from the stream is added back.
     ends = jnp.where(share == 0, frame.visual - mixed, jnp.where(share == 1, frame.tactile - mixed, 0))
     return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)
 
@@ -177,29 +172,16 @@ def touch(
 
     Returns:
         Image in [0, 1], equal to `Frame.tactile` of this imprint, except that `sense` samples small images more finely
-        (`Sensor.fine_below`). If traced constants or a traced window are invalid, it shows flat skin in the whole view,
-        with default constants in the place of invalid ones.
+        (`Sensor.fine_below`). If traced constants or a traced window are invalid, it shows flat skin in the whole view
+        with the default constants.
 
     Raises:
-        TypeError: `imprint` is no array.
+        TypeError: `imprint` is not an array.
         ValueError: the imprint is not an image or has whole numbers, the window has no area or is not finite, or
             `Sensor.check` raises an error. Traced values are not checked.
     """
     _check_sensor(sensor)
-    try:
-        imprint = jnp.asarray(imprint)
-    except (TypeError, ValueError):
-        raise TypeError(f"imprint is {imprint!r}, but it must be an array (height, width) in metres") from None
-    if not jnp.issubdtype(imprint.dtype, jnp.floating):
-        raise ValueError(
-            f"imprint has the type {imprint.dtype}, but it must be floating-point, in metres (0.0005 is half a "
-            "millimetre). Multiply a depth image of whole numbers by the metres of one unit first"
-        )
-    imprint = jnp.asarray(imprint, float)
-    if imprint.ndim != 2 or 0 in imprint.shape:
-        raise ValueError(
-            f"imprint has the shape {imprint.shape}, but it must be (height, width). For several use jax.vmap"
-        )
+    imprint = _imprint_in_metres(imprint)
     sensor, sound = sensor.guard()
     rows, columns = imprint.shape
     full = optics.full_window(sensor.camera, (rows, columns))
@@ -232,11 +214,41 @@ def _check_kinds(sensor: Any, body: Any) -> None:
 def _numbers(name: str, value: Any, wanted: str) -> Array:
     """The value as a floating-point array. A named tuple, such as a whole `Placement`, raises an error."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
-        raise TypeError(f"{name} is a {type(value).__name__}, but must be an array of shape {wanted}. Unpack it with *")
+        raise TypeError(
+            f"{name} is a {type(value).__name__}, but it must be an array of shape {wanted}. Unpack it with *"
+        )
     try:
         return jnp.asarray(value, float)
     except (TypeError, ValueError):
         raise TypeError(f"{name} is {value!r}, but it must be an array of shape {wanted}") from None
+
+
+def _imprint_in_metres(imprint: Any) -> Float[Array, "h w"]:
+    """The imprint as an image. Whole numbers raise an error, because they cannot be metres."""
+    try:
+        imprint = jnp.asarray(imprint)
+    except (TypeError, ValueError):
+        raise TypeError(f"imprint is {imprint!r}, but it must be an array (height, width) in metres") from None
+    if not jnp.issubdtype(imprint.dtype, jnp.floating):
+        raise ValueError(
+            f"imprint has the type {imprint.dtype}, but it must be floating-point, in metres (0.0005 is half a "
+            "millimetre). Multiply a depth image of whole numbers by the metres of one unit first"
+        )
+    if imprint.ndim != 2 or 0 in imprint.shape:
+        raise ValueError(
+            f"imprint has the shape {imprint.shape}, but it must be (height, width). For several use jax.vmap"
+        )
+    return jnp.asarray(imprint, float)
+
+
+def _check_light(light: Any) -> None:
+    known = not isinstance(light, jax.core.Tracer)
+    if known and np.asarray(light).dtype.kind not in "iuf":
+        raise TypeError(f"light is {light!r}, but it must be one number from 0 (visual) to 1 (tactile)")
+    if jnp.ndim(light):
+        raise ValueError(f"light has the shape {jnp.shape(light)}, but it must be one number. For several use jax.vmap")
+    if known and not 0 <= np.asarray(light) <= 1:
+        raise ValueError(f"light is {light}, but it must be a share of the LEDs' power, from 0 (visual) to 1 (tactile)")
 
 
 def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:

@@ -53,14 +53,14 @@ def object_window(
 ) -> Float[Array, "4"]:
     """The window around an object with the aspect ratio of an image, as in the paper (supplement, "Training Details").
 
-    It is the smallest one that contains the bounding box of the projected points, as far as that is in the full window,
-    and it lies in the full window. Points nearer than `near` do not count. With nothing in view it is the full window.
+    It is the smallest one that lies in the full window and contains the visible part of the bounding box of the
+    projected points. Points nearer than `near` do not count. If nothing is in view, it is the full window.
 
     Args:
         camera: the pinhole.
         points: points of the object, sensor frame (m).
         resolution: (height, width) of the image, pixels.
-        smallest: least length of the shorter side (m).
+        smallest: minimum length of the shorter side (m).
 
     Returns:
         Window (m).
@@ -92,8 +92,8 @@ def to_pixels(
         points: sensor frame (m).
 
     Returns:
-        Columns and rows (pixels), and depth along the optical axis (m). Points nearer than `camera.near` are
-        projected from there.
+        Columns and rows (pixels), and depth along the optical axis (m). Points nearer than `camera.near` are projected
+        as if they were at this depth.
     """
     depth = points[:, 2] + camera.distance
     on_face = camera.distance * points[:, :2] / jnp.maximum(depth, camera.near)[:, None]

@@ -61,8 +61,8 @@ class Room:
 
 
 _SKY_CELLS = 30  # approximate number of cells along each side of the grid of `hidden_sky`
-_SLICES = 4  # slices of an object, to find the sky that it hides
-_LOWEST = 0.0015  # m, least height of a slice
+_SLICES = 4  # slices of an object in `hidden_sky`
+_LOWEST = 0.0015  # m, minimum height of a slice
 
 
 def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -145,7 +145,7 @@ def hidden_sky(
 
 
 def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
-    """Share of the sky that a strip, one cell wide at a height of 1, hides from the middle of each cell."""
+    """Share of the sky that a strip, one cell wide at a height of 1, hides from the centre of each cell."""
     index = jnp.arange(number, dtype=jnp.float32)
     away = (index[None, :] - index[:, None] - 0.5) * pitch
     edge = away + pitch
@@ -184,7 +184,7 @@ def housing(
         distance: of the pinhole from that plane (m).
 
     Returns:
-        1 on the pad.
+        Relative values, 1 on the pad.
     """
     beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
     below = distance * (1 - 1 / jnp.maximum(beyond, 1))
@@ -199,8 +199,8 @@ def empty_view(
     Args:
         room: its constants.
         square_radius: squared distance from the pad's centre on the gel's face, in units of half the pad's side.
-        walls: from `housing`. The square is nearly linear light.
-        hidden: from `hidden_sky`.
+        walls: sRGB values relative to the pad, from `housing`. Their squares approximate linear light.
+        hidden: share of the sky, from `hidden_sky`.
 
     Returns:
         Linear light.
@@ -229,8 +229,8 @@ def shade(
         albedo: linear, in [0, 1].
         normals: unit.
         heights: over the gel's face (m).
-        empty: from `empty_view`.
-        hidden: from `hidden_sky`, at the points of the skin in front of the samples.
+        empty: view without the object, from `empty_view`.
+        hidden: share of the sky, from `hidden_sky`, at the points of the skin in front of the samples.
 
     Returns:
         Linear light.
@@ -242,7 +242,7 @@ def shade(
     heights = jnp.maximum(heights, 0)
     lit = 1 - room.crease * hidden * jnp.exp(-heights / room.crease_height)
     through = jnp.exp(-heights / room.haze)
-    # `empty` is the sky's light less the hidden part of the scattered light.
+    # `empty` is the sky's light without the hidden part of the scattered light.
     veil = room.milk * (1 - hidden) / jnp.maximum(1 - room.milk * hidden, 1e-3)
     channels = []
     for k in range(3):

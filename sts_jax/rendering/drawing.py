@@ -35,6 +35,7 @@ class _Samples(NamedTuple):
     seen: Float[Array, "4"]  # m, the window of the samples
     pitch: Float[Array, "2"]  # m, between samples
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]]  # x / depth and y / depth of the rays
+    places: tuple[Float[Array, "1 b"], Float[Array, "a 1"]]  # m, x and y where the rays cross the gel's face
     on_pad: Bool[Array, "a b"]  # whether the ray passes through the pad
     walls: Float[Array, "a b"]  # brightness relative to the pad
     corners: Corners  # with 1 / depth (1/m) as their value
@@ -122,17 +123,17 @@ def _sample(
     keep = resting.present & (far > camera.near)
     winner = optics.rasterise(pixels, -inverse, body.faces, keep, body.two_sided, shape)
     slopes = lines(optics.rays(camera, seen, shape))
-    on_pad, walls = _pad_and_walls(sensor, *(slope * camera.distance for slope in slopes))
+    x, y = (slope * camera.distance for slope in slopes)
+    on_pad, walls = _pad_and_walls(sensor, x, y)
     corners = Corners(pixels[:, 0], pixels[:, 1], inverse, body.faces)
-    return _Samples(seen, pitch, slopes, on_pad, walls, corners, winner)
+    return _Samples(seen, pitch, slopes, (x, y), on_pad, walls, corners, winner)
 
 
 def _see(
     sensor: Sensor, body: Body, resting: Resting, samples: _Samples
 ) -> tuple[Float[Array, "a b"], list[Float[Array, "a b"]]]:
     """The visual stream: depth (m), and the view through the skin in linear light, channel by channel."""
-    size, winner = sensor.gel.size, samples.winner
-    x, y = (slope * sensor.camera.distance for slope in samples.slopes)  # where the rays cross the gel's face
+    size, winner, (x, y) = sensor.gel.size, samples.winner, samples.places
     hidden = optics.hidden_sky(resting.heights, size, _cpu_reductions.maximum(resting.points[:, 2]), x[0], y[:, 0])
     square_radius = (x * 2 / size[0]) ** 2 + (y * 2 / size[1]) ** 2
     empty = planes(optics.empty_view(sensor.room, square_radius, samples.walls, hidden))

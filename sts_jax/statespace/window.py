@@ -1,4 +1,4 @@
-"""The part of an image that differs from the empty sensor's: found in the image alone, turned upright and magnified."""
+"""Windows around the part of an image that differs from the empty sensor's, turned upright and magnified."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from sts_jax.statespace import poses
 
 THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (a shadow differs by less)
 MARGIN = 1.1  # side of the window over the larger extent of the silhouette
-SMALLEST = 0.08  # side of the smallest window, of the image's
+SMALLEST = 0.08  # side of the smallest window over that of the image
 
 
 class Window(NamedTuple):
@@ -22,19 +22,19 @@ class Window(NamedTuple):
 
 
 def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """1 where an image shows something, else 0.
+    """1 where an image shows an object, else 0.
 
     Args:
-        change: images less that of the empty sensor.
+        change: images minus that of the empty sensor.
     """
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """The window around everything that an image shows, or the whole image if it shows nothing.
+    """The window around the pixels that show an object, or the whole image if none does.
 
     Args:
-        change: square images less that of the empty sensor.
+        change: square images minus that of the empty sensor.
     """
     size = change.shape[1]
     weight = shows(change)
@@ -65,12 +65,15 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """The windows at another resolution, each pixel the mean of four interpolated values, zero outside of the image.
+    """Cut the windows out of images, at another resolution.
 
     Args:
-        images: square ones.
-        window: of each.
-        side: pixels of the result.
+        images: square images.
+        window: the window of each image.
+        side: side of the result, pixels.
+
+    Returns:
+        Cut images. Each pixel is the mean of four interpolated values, which are zero outside of the image.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5

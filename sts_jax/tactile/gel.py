@@ -71,7 +71,7 @@ def cell_area(gel: Gel) -> Float[Array, ""]:
 
 
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
-    """The imprint of an object that stays in its pose, `p = k max(0, -h)`.
+    """Pressure of an object that stays in its pose, `p = k max(0, -h)`.
 
     Args:
         gel: constants of the gel.
@@ -87,13 +87,13 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
     """Depth and two tilts at which the springs balance Fz, Mx and My.
 
-    With the object moved by `h' = h - d + a y - b x`, the pressure is `p = k max(0, -h')`, and
+    The motion of the object changes its heights to `h' = h - d + a y - b x`. The pressure is `p = k max(0, -h')`, and
 
         Fz = sum p A,   Mx = sum y p A,   My = -sum x p A
 
     are the conditions for a minimum of `E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b`, which is convex and
     piecewise quadratic. Projected Newton steps with a line search find it, starting at the largest depth below first
-    touch. Beyond `max_depth` the springs meet a hard bottom, which carries the rest of the load and adds nothing to the
+    touch. Beyond `max_depth` the springs meet a hard bottom, which carries the rest of the load and does not count as
     pressure. Derivatives are those of the equilibrium (implicit function theorem: one more Newton step, undamped).
 
     Args:
@@ -103,15 +103,15 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
             friction and ignored.
 
     Returns:
-        Equilibrium. With `Fz <= 0` there is no motion and no pressure. If no equilibrium exists (first touch farther
-        off than `max_depth`, centre of pressure that the footprint cannot carry, a limit reached), the result is within
-        the limits, and `balanced` is False.
+        Equilibrium. With `Fz <= 0` there is no motion and no pressure. If no equilibrium exists, the result is within
+        the limits, and `balanced` is False. Reasons are a first touch farther away than `max_depth`, a centre of
+        pressure outside of the footprint, and a limit that is reached.
     """
     force = wrench[2]
     pressed = force > 0
     safe_force = jnp.where(pressed, force, 1)
     load = jnp.where(pressed, force, 0) / (gel.stiffness * cell_area(gel))  # sum of the springs' compressions (m)
-    # Tilts are about the centre of pressure, in metres of height at a distance of `_LEVER` from it.
+    # Tilts are about the centre of pressure, in metres of height at the distance `_LEVER` from it.
     half_x, half_y = gel.size[0] / 2, gel.size[1] / 2
     wanted_x, wanted_y = -wrench[4] / safe_force, wrench[3] / safe_force
     on_pad = (jnp.abs(wanted_x) <= half_x) & (jnp.abs(wanted_y) <= half_y)
@@ -137,7 +137,7 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     beyond = jnp.where(pressed & reach, jnp.maximum(deepest - gel.max_depth, 0), 0)
     length = jnp.where(pressed & reach, jnp.clip(length - beyond, 0, gel.max_depth), 0)
 
-    # moments count as forces at a lever of 1 cm
+    # Moments count as forces at a lever of 1 cm.
     residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
     balanced = ~pressed | (reach & on_pad & jnp.all(residual <= gel.tolerance * load))
     return Equilibrium(
@@ -167,7 +167,7 @@ def _newton(
     bound: Float[Array, "3"],
     limit: Scalar,
 ) -> Float[Array, "3"]:
-    """The plane `u0 + u1 y + u2 x` whose springs to `height` have the moments `target`, or the nearest ones."""
+    """The plane `u0 + u1 y + u2 x` whose springs to `height` have the moments `target`, or moments near them."""
     near_bound = 0.9999 * bound
 
     def pushed(length: Array) -> Array:
@@ -232,7 +232,7 @@ def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> 
 
 def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"], degree: int) -> Float[Array, "k k"]:
     """`sum value y^i x^j` at [i, j]."""
-    # One sum along columns per power, because products of such narrow matrices are several times slower on a CPU.
+    # One sum along columns per power: products of such narrow matrices are several times slower on a CPU.
     rows = [jnp.sum(value, axis=0), *(y**power @ value for power in range(1, degree + 1))]
     return jnp.stack(rows) @ jnp.stack([x**power for power in range(degree + 1)], axis=1)
 

@@ -1,6 +1,6 @@
-"""The lit skin: lateral coupling, surface normals, far and near lights, shadows, Phong reflectance, darkening.
+"""The lit skin: lateral coupling, far and near lights, shadows, Phong reflectance, darkening.
 
-Images are float32, (height, width, 3), and not clipped to [0, 1], because a pixel first sums its light.
+Images are float32, (height, width, 3), and not clipped to [0, 1], because a pixel first sums all its light.
 """
 
 import dataclasses
@@ -97,7 +97,7 @@ class Phong:
 
 
 def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
-    """Smooth an imprint by a Gaussian, because real skin does not follow a sharp edge.
+    """Smooth an imprint by a Gaussian. Real skin does not follow a sharp edge.
 
     The weights are `exp(-r^2 / (2 length^2))` at the pixels' distances r, divided by their sum over the image, so that
     a uniform imprint is unchanged, at the border too. Two dense products compute this, exactly for any length.
@@ -132,15 +132,15 @@ def shadows(
 
         share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
 
-    A light in the gel's plane, such as the paper's, has e = 0. It lights flanks only, and only those parts of them that
-    rise above everything on the way to the light. Flat skin and the tops of pressed parts receive none of this light,
-    in shadow or not (L . N = 0). Its shadows are therefore visible only on flanks behind other raised parts. The
-    shadows of a point light would be endless. The penumbra ends them where a raised part appears lower than `penumbra`.
-    A flank that faces away from a light is dark because of its normal, before it is in shadow.
+    A light in the gel's plane, such as the paper's, has e = 0. It lights only flanks, and only the parts of a flank
+    that rise above everything on the way to the light. Flat skin and the tops of pressed parts receive no light from it
+    (L . N = 0), so its shadows are visible only on flanks behind other raised parts. The shadows of a point light in
+    this plane would be endless. With a penumbra, they end where a raised part appears lower than `penumbra`. A flank
+    that faces away from a light is dark because of its normal, whether it is in shadow or not.
 
     Args:
         skin: number of steps, reach and penumbra. Steps are short near the point and longer away from it
-            (`t = reach (k / steps)^2`), so that a part narrower than a step may cast no shadow far away.
+            (`t = reach (k / steps)^2`). A part narrower than a step may therefore cast no shadow far away.
         lights: far or near. Skin behind a near light does not hide it.
         depth: of the skin below the gel's face (m). Skin beyond the image casts no shadow.
         window: part of the gel's face in the image, (left, top, width, height) (m).
@@ -198,16 +198,16 @@ def phong(
 
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
-    with both products clipped at 0. V is the optical axis, as for a distant viewer, so that flat skin under far lights
-    is uniform. For a near light at p_m, L_m points to p_m and the intensity is `(reference / |p_m - x|)^falloff i_m`,
-    where distances below 0.1 mm count as 0.1 mm.
+    Both products are clipped at 0. V is the optical axis, as for a distant viewer, so that flat skin under far lights
+    is uniform. For a near light at p_m, L_m points to p_m and the intensity is `(reference / |p_m - x|)^falloff i_m`.
+    Distances below 0.1 mm count as 0.1 mm.
 
     Args:
         phong: constants of the skin's reflectance.
         lights: far (directions need not be of unit length) or near.
         normals: unit, towards the camera.
         points: of the skin, sensor frame (m). Far lights do not need them.
-        shares: of each light that arrives, from `shadows`. Default: all of it.
+        shares: share of each light that arrives, from `shadows`. Default: 1.
 
     Returns:
         Image, not clipped (paper, equation "phong").
@@ -233,7 +233,7 @@ def phong(
 
 
 def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
-    """Components of a vector divided by its length, and the length, which is at least `_NEAREST`."""
+    """Components of a vector divided by its length, and this length, which is at least `_NEAREST`."""
     square = functools.reduce(operator.add, (p * p for p in parts))
     length = jnp.sqrt(jnp.maximum(square, _NEAREST**2))
     return (*(p / length for p in parts), length)
