@@ -210,7 +210,7 @@ def test_every_range_is_checked(number, limit, part, name):
     sensor = Sensor(lights=tactile.Leds())
     field = getattr(getattr(sensor, part), name)
     wrong = jax.tree.map(lambda x: jnp.full_like(x, number) if isinstance(x, jax.Array) else type(x)(number), field)
-    with pytest.raises(ValueError, match=rf"field {part}\.{name} is .*, but it must be {limit}"):
+    with pytest.raises(ValueError, match=rf"(?s)field {part}\.{name} is .*, but it must be {limit}"):
         with_field(sensor, f"{part}.{name}", wrong).check()
 
 
