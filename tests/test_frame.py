@@ -62,7 +62,7 @@ def at(x, y, z):
 
 
 @pytest.mark.parametrize("resolution", SIZES)
-def test_a_letter_reads_the_right_way_round_in_both_streams(resolution):
+def test_a_letter_is_not_mirrored_in_either_stream(resolution):
     frame = sense(SENSOR, letter(), at(0, 0, -0.0008), resolution=resolution)
     height, width = resolution
     scale = height / 150  # pixels per mm on the gel's face
@@ -82,7 +82,7 @@ def test_a_letter_reads_the_right_way_round_in_both_streams(resolution):
 
 @pytest.mark.parametrize("resolution", SIZES)
 @pytest.mark.parametrize("category", ["spoon", "camera"])
-def test_depth_and_segmentation_are_embrees_of_the_balanced_pose(category, resolution):
+def test_depth_and_segmentation_equal_embrees_for_the_balanced_pose(category, resolution):
     body = objects.make(jax.random.key(4), category)
     pose = jnp.asarray([0.01, -0.01, 0.03, 0.8, 0.6, 0.0, 0.0])
     frame = sense(SENSOR, body, pose, weight(0.0, 0, 0), resolution=resolution)
@@ -95,7 +95,7 @@ def test_depth_and_segmentation_are_embrees_of_the_balanced_pose(category, resol
 
 
 @pytest.mark.parametrize("resolution", SIZES)
-def test_the_balanced_pose_sinks_as_deep_as_its_pressure_says(resolution):
+def test_depth_of_the_balanced_pose_matches_its_pressure(resolution):
     pose = at(0.012, -0.008, 0.0302)
     frame = sense(SENSOR, ball(), pose, weight(1.0, 0.012, -0.008), resolution=resolution)
     assert bool(frame.balanced)
@@ -106,7 +106,7 @@ def test_the_balanced_pose_sinks_as_deep_as_its_pressure_says(resolution):
     assert 0.1 - float(jnp.min(frame.depth)) == pytest.approx(depth, abs=1e-4)  # facets
 
 
-def test_a_tilt_turns_the_pose_as_the_pressure_says():
+def test_tilt_of_the_balanced_pose_matches_its_pressure():
     body = from_trimesh(trimesh.creation.box((0.06, 0.04, 0.03)))
     x, y = 0.004, -0.003
     frame = sense(SENSOR, body, at(0, 0, 0.015), weight(1.5, x, y))
@@ -142,7 +142,7 @@ def test_more_load_never_makes_the_imprint_smaller(body):
 @pytest.mark.parametrize(
     ("resolution", "crop"), [((64, 64), False), ((64, 64), True), ((97, 53), False), ((200, 200), True)]
 )
-def test_an_object_that_has_fallen_off_leaves_empty_images(resolution, crop):
+def test_images_are_empty_after_an_object_has_fallen_off(resolution, crop):
     gone = sense(SENSOR, ball(), at(0.12, 0.0, -0.08), weight(0, 0, 0), resolution=resolution, crop=crop)
     far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), weight(0, 0, 0), resolution=resolution, crop=crop)
     assert not np.any(gone.segmentation)
@@ -156,7 +156,7 @@ def test_an_object_that_has_fallen_off_leaves_empty_images(resolution, crop):
     )
 
 
-def test_a_hovering_object_is_seen_and_not_felt():
+def test_a_hovering_object_is_visible_and_leaves_no_imprint():
     frame = sense(SENSOR, ball(), at(0.01, 0.0, 0.05), weight(0, 0, 0))
     assert np.any(frame.segmentation)
     assert np.ptp(np.asarray(frame.tactile), axis=(0, 1)).max() == 0
@@ -166,7 +166,7 @@ def test_a_hovering_object_is_seen_and_not_felt():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("where", ["position", "quaternion", "wrench"])
-def test_a_value_that_is_not_finite_lowers_the_flag_and_spoils_no_image(bad, where):
+def test_a_non_finite_input_gives_an_unbalanced_frame_with_finite_images(bad, where):
     pose, wrench = at(0, 0, 0.03), weight(1.0, 0, 0)
     if where == "wrench":
         wrench = wrench.at[3].set(bad)
@@ -191,7 +191,7 @@ def test_images_lie_in_0_to_1(resolution):
 
 
 @pytest.mark.slow
-def test_a_crop_shows_what_the_whole_shows():
+def test_a_crop_agrees_with_the_whole_image():
     body = letter()
     pose, wrench = at(0.02, -0.01, 0.0), weight(1.0, 0.02, -0.01)
     crop = sense(SENSOR, body, pose, wrench, resolution=(200, 200), crop=True)
@@ -211,7 +211,7 @@ def test_a_crop_shows_what_the_whole_shows():
     assert seen.mean() > 0.8
 
 
-def test_vmap_is_the_single_frame():
+def test_vmap_agrees_with_single_frames():
     poses = jnp.stack([at(0.01 * k, -0.005 * k, 0.029) for k in range(3)])
     wrenches = jnp.stack([weight(0.3 * k, 0.01 * k, -0.005 * k) for k in range(3)])
     body = ball()
@@ -224,7 +224,7 @@ def test_vmap_is_the_single_frame():
 
 
 @pytest.mark.slow
-def test_one_compilation_serves_all_objects_of_a_class():
+def test_objects_of_one_size_class_share_a_compilation():
     programs = []
     for k, category in enumerate(("bottle", "watch", "fork")):
         body = objects.make(jax.random.key(k), category)
@@ -235,7 +235,7 @@ def test_one_compilation_serves_all_objects_of_a_class():
 
 
 @pytest.mark.slow
-def test_gradients_through_the_load_are_the_finite_differences():
+def test_gradients_by_load_and_stiffness_equal_finite_differences():
     body = ball()
 
     def dark(stiffness, force):
@@ -256,7 +256,7 @@ def test_gradients_through_the_load_are_the_finite_differences():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("crop", [False, True])
-def test_touch_of_an_imprint_is_the_frames(crop):
+def test_touch_equals_the_tactile_image_of_the_same_imprint(crop):
     skin = sts.tactile.Skin(coupling=0.0004, shadow_steps=8)
     sensor = sts.Sensor(lights=sts.tactile.Leds(), skin=skin)
     body = objects.make(jax.random.key(3), "watch")
@@ -271,13 +271,13 @@ def test_touch_of_an_imprint_is_the_frames(crop):
         np.testing.assert_array_equal(sts.touch(sensor, imprint), sts.touch(sensor, imprint, frame.window))
 
 
-def test_touch_has_no_nan_of_an_imprint_that_has():
+def test_touch_of_an_imprint_with_nan_is_finite():
     imprint = jnp.full((20, 30), jnp.nan).at[5:9, 6:12].set(0.1)
     assert np.isfinite(np.asarray(sts.touch(sts.Sensor(), imprint))).all()
 
 
 @pytest.mark.slow
-def test_a_touchs_derivative_is_the_finite_difference_at_upright_walls_too():
+def test_moving_edges_derivative_equals_finite_differences_at_upright_walls():
     # On the average over pixels: what is compared is smoothed, and its differences are a mean over several steps.
     sensor = dataclasses.replace(SENSOR, skin=sts.tactile.Skin(coupling=0.001))
     body, resolution, pitch = letter(), (120, 120), jnp.full(2, 0.15 / 120)
@@ -299,7 +299,7 @@ def test_a_touchs_derivative_is_the_finite_difference_at_upright_walls_too():
         assert float(lengths[0] / lengths[1]) == pytest.approx(1, abs=0.05)
 
 
-def test_one_program_serves_bodies_that_collide_and_hold_otherwise():
+def test_bodies_with_other_hulls_and_contents_share_a_compilation():
     body, other = (sts.objects.make(jax.random.key(0), category) for category in ("bottle", "fork"))
     other = dataclasses.replace(other, hulls=other.hulls[:, :32], interior=other.interior[:8])
     assert body.hulls.shape != other.hulls.shape
@@ -310,7 +310,7 @@ def test_one_program_serves_bodies_that_collide_and_hold_otherwise():
     assert (equilibrium.balance._cache_size(), drawing.draw._cache_size()) == before
 
 
-def test_another_resolution_compiles_the_drawing_alone():
+def test_another_resolution_compiles_only_the_drawing():
     body, pose = sts.objects.make(jax.random.key(0), "bottle"), jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))
     before = equilibrium.balance._cache_size()

@@ -11,7 +11,7 @@ NAMES = [name for name in depth.PROCEDURAL + depth.LOADED + depth.MADE if name !
 @pytest.mark.parametrize(
     "shape", [*depth.SIZES[:2], *(pytest.param(size, marks=pytest.mark.slow) for size in depth.SIZES[2:])]
 )
-def test_depth_is_embrees(shape):
+def test_depth_equals_embrees(shape):
     found = depth.total(list(depth.measure(NAMES, shape, (2, 1, 1)).values()))
     assert found.interior_beyond_10um <= 0.001 * found.interior
     assert found.interior_beyond_100um == 0

@@ -50,14 +50,14 @@ def encode(x):
 @pytest.mark.slow
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
 @pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
-def test_the_streams_are_the_ends_to_the_last_bit(shape, exposure):
+def test_light_0_and_1_return_the_streams_exactly(shape, exposure):
     frame, sensor = noise(shape), with_exposure(exposure)
     for call in (expose, sts.expose):
         assert np.array_equal(call(sensor, frame, 0.0), frame.visual)
         assert np.array_equal(call(sensor, frame, 1.0), frame.tactile)
 
 
-def test_the_streams_of_a_pressed_object_are_the_ends():
+def test_half_light_of_a_pressed_object_lies_between_the_streams():
     body = objects.make(jax.random.key(0), "mouse")
     low = float(jnp.min(body.vertices[:, 2]))
     frame = jax.jit(sts.sense)(SENSOR, body, jnp.array([0.0, 0.0, -low - 3e-4, 1.0, 0.0, 0.0, 0.0]))
@@ -70,7 +70,7 @@ def test_the_streams_of_a_pressed_object_are_the_ends():
 
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
 @pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
-def test_light_adds_up_in_linear_units(shape, exposure):
+def test_light_is_added_in_linear_units(shape, exposure):
     frame = noise(shape)
     rng = np.random.default_rng(1)
     for light in (1e-3, 0.2, 0.5, 0.9):
@@ -84,7 +84,7 @@ def test_light_adds_up_in_linear_units(shape, exposure):
             assert image[i, j, k] == pytest.approx(encode(radiance / grey), abs=2e-6)
 
 
-def test_more_light_is_more_touch_where_that_is_brighter():
+def test_pixels_change_monotonically_with_light():
     frame = noise((64, 64))
     images = np.stack([expose(with_exposure(3.0), frame, light) for light in np.linspace(0, 1, 9)])
     brighter = np.asarray(frame.tactile > frame.visual)
@@ -92,7 +92,7 @@ def test_more_light_is_more_touch_where_that_is_brighter():
     assert np.all(np.diff(images, axis=0)[:, ~brighter] <= 1e-6)
 
 
-def test_gradients_are_the_finite_differences_and_finite_at_the_ends():
+def test_gradients_equal_finite_differences_and_are_finite_at_0_and_1():
     frame = noise((97, 53))
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(97, 53, 3)), jnp.float32)
 
@@ -135,19 +135,19 @@ def test_vmap_over_frames_and_over_lights():
 
 
 @pytest.mark.parametrize("light", [-0.1, 1.1, np.nan, np.float32(2), np.inf])
-def test_a_light_that_is_no_share_is_named(light):
+def test_light_outside_0_to_1_raises_an_error(light):
     with pytest.raises(ValueError, match=r"light is .*from 0 \(visual\) to 1 \(tactile\)"):
         sts.expose(SENSOR, noise((8, 8)), light)
 
 
-def test_several_lights_at_once_are_named():
+def test_an_array_of_lights_raises_an_error():
     several = inspect.unwrap(sts.expose)  # without the tests' own checks of shapes
     for call in (several, jax.jit(several)):
         with pytest.raises(ValueError, match=r"light has the shape \(3,\).*vmap"):
             call(SENSOR, noise((3, 8, 8)), jnp.array([0.0, 0.5, 1.0]))
 
 
-def test_under_jit_it_is_clipped_and_never_nan():
+def test_a_traced_light_is_clipped_and_never_gives_nan():
     frame = noise((64, 64))
     for light, stream in ((-0.5, frame.visual), (np.nan, frame.visual), (1.5, frame.tactile), (np.inf, frame.tactile)):
         assert np.array_equal(expose(SENSOR, frame, light), stream)

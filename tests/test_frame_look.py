@@ -56,7 +56,7 @@ def leaning(body, lift):
 
 @pytest.mark.parametrize("lift", [0.0, 0.045])
 @pytest.mark.parametrize("category", ["webcam", "camera", "mouse", "scissors"])
-def test_what_leans_over_the_skin_hides_as_much_of_the_sky_as_rays_find(category, lift):
+def test_sky_hidden_by_leaning_objects_agrees_with_traced_rays(category, lift):
     body = objects.make(jax.random.key(0), category)
     points = leaning(body, lift)
     x = y = np.linspace(-0.07, 0.07, 15)
@@ -68,7 +68,7 @@ def test_what_leans_over_the_skin_hides_as_much_of_the_sky_as_rays_find(category
     assert np.abs(np.asarray(got) - truth).mean() < 0.07 * (1 if lift == 0 else 0.4)
 
 
-def test_only_what_is_within_reach_enters_the_gels_map_and_everything_the_skys():
+def test_the_gels_height_map_has_faces_within_reach_and_the_skys_has_all():
     # a foot of 2 cm under a roof of 10 cm, 4 cm up
     foot, roof = trimesh.creation.box((0.02, 0.02, 0.04)), trimesh.creation.box((0.1, 0.1, 0.01))
     body = from_trimesh(trimesh.util.concatenate([foot, roof.apply_translation((0, 0, 0.025))]))
@@ -81,7 +81,7 @@ def test_only_what_is_within_reach_enters_the_gels_map_and_everything_the_skys()
     np.testing.assert_allclose(whole, np.where(apart < 10, 0, np.where(apart < 50, 0.04, np.inf)), atol=1e-6)
 
 
-def test_what_is_beyond_reach_presses_nothing_at_the_limits_either():
+def test_faces_beyond_reach_do_not_change_the_equilibrium():
     settle = jax.jit(tactile.settle)
     for category in ("camera", "webcam", "bottle"):
         body = objects.make(jax.random.key(0), category)
@@ -96,7 +96,7 @@ def test_what_is_beyond_reach_presses_nothing_at_the_limits_either():
                 np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
 
 
-def test_the_view_depends_on_no_limit_of_the_gels_equilibrium():
+def test_the_view_is_independent_of_the_gels_limits():
     body = objects.make(jax.random.key(0), "camera")
     pose = jnp.array([0.0, 0, 0.06, 0.9, 0.3, 0.2, 0.2], jnp.float32)
     stiff = dataclasses.replace(SENSOR, gel=dataclasses.replace(SENSOR.gel, max_tilt=0.01, max_depth=0.0001))
@@ -107,7 +107,7 @@ def test_the_view_depends_on_no_limit_of_the_gels_equilibrium():
 
 
 @pytest.mark.slow
-def test_beyond_the_pad_there_is_a_dark_housing_whatever_lies_there():
+def test_the_view_beyond_the_pad_is_a_dark_housing_also_behind_an_object():
     body = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.03)), color=(0.9, 0.9, 0.1))
     gone = sense(SENSOR, body, at(0, 0, -1.0), resolution=(96, 128))
     over = sense(SENSOR, body, at(0.07, 0, 0.015), resolution=(96, 128))
@@ -123,7 +123,7 @@ def test_beyond_the_pad_there_is_a_dark_housing_whatever_lies_there():
         assert np.all(np.diff(inwards) > 0)  # brightest right under the pad's edge
 
 
-def test_objects_stand_out_as_they_did_without_shadow_milk_and_tint():
+def test_shadow_milk_and_tint_hardly_reduce_the_contrast_of_objects():
     plain = with_room(milk=0.0, crease=0.0, haze=0.3, tint=jnp.ones(3))
     empty = np.asarray(sense(SENSOR, objects.make(jax.random.key(0), "fork"), at(0, 0, -1.0)).visual)
     for height, least in ((0.0, 1.0), (0.05, 0.9)):
@@ -142,7 +142,7 @@ def test_objects_stand_out_as_they_did_without_shadow_milk_and_tint():
 
 
 @pytest.mark.slow
-def test_a_public_texture_is_where_rays_find_it():
+def test_the_texture_of_a_public_mesh_agrees_with_traced_rays():
     meshes = public_meshes()
     body = objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
     raw = trimesh.load_scene(meshes / "potion.obj", process=False).to_geometry()

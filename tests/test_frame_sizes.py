@@ -80,7 +80,7 @@ def test_grids_of_1_and_half_a_millimetre_agree(name):
             np.testing.assert_allclose(found[:3], [depth, depth, depth / 2], rtol=0.05)
 
 
-def test_a_point_between_the_cells_is_the_exception():
+def test_a_point_between_cells_presses_less_deeply_on_a_coarse_grid():
     # It presses its full depth on no cell: the deepest spring is a cell's half diagonal short of it, of 2.12 mm a third
     # on 1 mm and a sixth on 0.5 mm cells, 20 % apart. It sinks as deep on both all the same; and the picture, whose
     # pixels are 2.3 mm apart and have the point between them, is not of the grid.
@@ -98,7 +98,7 @@ def imprint(frame):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_images_of_all_sizes_whole_and_cropped_agree(name):
+def test_whole_and_cropped_images_of_all_sizes_agree(name):
     finest = seen(name, SENSOR, 640, crop=True)
     fine = imprint(finest)
     left, top, width, height = finest.window

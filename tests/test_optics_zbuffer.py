@@ -62,7 +62,7 @@ def some_pose(rng):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("name", BODIES)
-def test_depth_is_embrees(name, shape):
+def test_depth_equals_embrees(name, shape):
     body = BODIES[name]
     rng = np.random.default_rng(1)
     for _ in range(2):
@@ -85,7 +85,7 @@ def test_depth_is_embrees(name, shape):
 
 
 @pytest.mark.parametrize("chunk", [64, 2048])
-def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
+def test_faces_of_any_size_equal_a_loop_over_all_faces(chunk):
     rng = np.random.default_rng(3)
     shape = (31, 23)
     centre = rng.uniform(-5, 35, (60, 1, 2))
@@ -135,7 +135,7 @@ def test_a_surface_has_no_cracks(number):
     assert np.all(np.asarray(winner)[inside] >= 0)
 
 
-def test_faces_of_vertices_that_are_not_kept_are_left_out():
+def test_faces_with_a_vertex_that_is_not_kept_are_not_drawn():
     points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]] * 3)
     order = jnp.repeat(jnp.array([3.0, 2.0, 1.0]), 3).at[8].set(1.5)
     faces = jnp.arange(9).reshape(3, 3)
@@ -149,7 +149,7 @@ def test_faces_of_vertices_that_are_not_kept_are_left_out():
     assert nearest(keep.at[jnp.array([7, 3])].set(False)) == 0
 
 
-def test_two_sided_faces_are_seen_from_behind():
+def test_two_sided_faces_are_visible_from_behind():
     points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]])
     faces = jnp.array([[0, 1, 2]])
     for two_sided in (False, True):
@@ -159,7 +159,7 @@ def test_two_sided_faces_are_seen_from_behind():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bumpy", "ring", "bottle"])
-def test_faces_within_an_order_have_an_image_of_their_own(name):
+def test_near_faces_have_an_image_of_their_own(name):
     body = BODIES[name]
     points = geometry.transform(some_pose(np.random.default_rng(7)), body.vertices)
     faces, height = np.asarray(body.faces), np.asarray(points[:, 2])
@@ -180,7 +180,7 @@ def test_faces_within_an_order_have_an_image_of_their_own(name):
     np.testing.assert_array_equal(both[1], alone(faces))
 
 
-def test_vmap_is_the_loop():
+def test_vmap_agrees_with_a_loop():
     body = BODIES["ring"]
     rng = np.random.default_rng(5)
     poses = jnp.stack([some_pose(rng) for _ in range(3)])
@@ -193,7 +193,7 @@ def test_vmap_is_the_loop():
 
 
 @pytest.mark.slow
-def test_depths_gradient_is_the_finite_difference():
+def test_gradient_of_depth_equals_finite_differences():
     body = BODIES["box"]
     pose = jnp.asarray([0.004, -0.003, 0.06, 0.9, 0.3, 0.2, 0.24])
     pose = pose.at[3:].divide(jnp.linalg.norm(pose[3:]))

@@ -57,7 +57,7 @@ def test_a_speck_gets_the_smallest_window():
     np.testing.assert_allclose(found.side, window.SMALLEST)
 
 
-def test_a_picture_and_the_picture_turned_have_the_same_cut():
+def test_an_image_and_the_turned_image_have_the_same_cut():
     change = rectangle((0.4, 0.6), -0.9, (0.5, 0.2))
     change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # nothing symmetric
     turned = np.rot90(change, -1).copy()  # columns to rows: by +90 degrees where rows count downwards
@@ -80,7 +80,7 @@ def test_a_cut_of_a_gradient_is_the_gradient_along_the_window():
     np.testing.assert_allclose(window.cut(jnp.asarray(image), square, 8)[0, ..., 0], expected, atol=1e-5)
 
 
-def test_samples_are_those_of_scipy_and_zero_outside():
+def test_samples_equal_scipys_and_are_zero_outside():
     rng = np.random.default_rng(0)
     images = rng.random((2, 8, 8, 3), np.float32)
     places = rng.uniform(-3, 10, (2, 200, 2)).astype(np.float32)

@@ -23,7 +23,7 @@ def elements(matrix):
 
 
 @pytest.mark.parametrize("gap", [1.0, 0.05])
-def test_smallest_eigenvector_is_lapacks(gap):
+def test_smallest_eigenvector_equals_lapacks(gap):
     rng = np.random.default_rng(0)
     turns, _ = np.linalg.qr(rng.normal(size=(500, 3, 3)))
     low = rng.uniform(-1, 1, 500)
@@ -49,7 +49,7 @@ def test_repeated_eigenvalues_give_a_unit_vector_and_finite_gradients(diagonal):
 
 
 @pytest.mark.parametrize("spread", [(1.0, 1.0, 0.0), (2.0, 1.0, 0.1)])
-def test_gradient_is_the_finite_difference(spread):
+def test_gradient_of_the_eigenvector_equals_finite_differences(spread):
     rng = np.random.default_rng(1)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     matrix = turn @ np.diag(spread) @ turn.T
@@ -68,7 +68,7 @@ def test_gradient_is_the_finite_difference(spread):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_normals_are_the_axis_of_least_covariance(shape):
+def test_normals_equal_the_axis_of_least_covariance(shape):
     points = bumpy(shape)
     got = np.asarray(jax.jit(normals_of)(jnp.asarray(points, jnp.float32)))
     for i, j in some_pixels(shape):
@@ -80,7 +80,7 @@ def test_normals_are_the_axis_of_least_covariance(shape):
         np.testing.assert_allclose(got[i, j], normal, atol=2e-3)
 
 
-def test_normals_of_several_grids_side_by_side_are_those_of_each():
+def test_normals_of_stacked_grids_equal_those_of_each_grid():
     grids = [np.moveaxis(bumpy((9, 7)), -1, 0), np.moveaxis(bumpy((9, 7))[::-1], -1, 0)]
     several = tactile.surface_normals(tuple(jnp.asarray(np.stack(planes, -1)) for planes in zip(*grids, strict=True)))
     assert several.shape == (7, 5, 2, 3)

@@ -69,7 +69,7 @@ def reflected_light(constants, lights, normal, point, shares):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
-def test_phong_is_the_papers_equation(shape, lights):
+def test_phong_equals_the_papers_equation(shape, lights):
     normals, points, constants = some_normals(shape), bumpy(shape), tactile.Phong()
     shares = np.random.default_rng(3).uniform(size=(4, *shape))
     inputs = [jnp.asarray(v, jnp.float32) for v in (normals, points, shares)]
@@ -84,7 +84,7 @@ def test_phong_is_the_papers_equation(shape, lights):
 
 
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
-def test_phong_of_a_list_of_points_is_phong_of_the_image(lights):
+def test_phong_of_listed_points_equals_that_of_the_image(lights):
     shape = (31, 17)
     normals, points = (jnp.asarray(v, jnp.float32) for v in (some_normals(shape), bumpy(shape)))
     image = tactile.phong(tactile.Phong(), lights, normals, points)
@@ -92,7 +92,7 @@ def test_phong_of_a_list_of_points_is_phong_of_the_image(lights):
     np.testing.assert_array_equal(image.reshape(-1, 3), listed)
 
 
-def test_a_light_far_away_is_a_far_light():
+def test_leds_far_away_equal_far_lights():
     lights = tactile.Lights(directions=jnp.array([[-1.0, 0.3, -0.2], [0, 1, 0], [0.2, 0.1, -1], [0.5, -0.5, -0.05]]))
     unit = lights.directions / jnp.linalg.norm(lights.directions, axis=1, keepdims=True)
     leds = tactile.Leds(positions=300 * unit, colors=lights.colors, falloff=2.0, reference=300.0)
@@ -106,7 +106,7 @@ def test_a_light_far_away_is_a_far_light():
     assert float(jnp.mean(far < 0.5)) > 0.05
 
 
-def test_a_near_lights_intensity_falls_off_from_where_its_colour_holds():
+def test_intensity_of_leds_falls_off_from_the_reference_distance():
     flat = jnp.array([[0.0, 0, -1]])
     leds = tactile.Leds(positions=jnp.array([[0.0, 0, -0.05]]), colors=jnp.array([[0.3, 0.2, 0.1]]), reference=0.05)
     constants = tactile.Phong(ambient=0.0, specular=0.0)
@@ -118,7 +118,7 @@ def test_a_near_lights_intensity_falls_off_from_where_its_colour_holds():
         np.testing.assert_allclose(twice, leds.colors / 2**falloff, rtol=1e-5)
 
 
-def test_flat_gel_has_the_originals_colour():
+def test_flat_gel_has_the_colour_of_the_papers_code():
     points = jnp.asarray(bumpy((8, 8)) * [1, 1, 0], jnp.float32)
     image = tactile.phong(tactile.Phong(), tactile.Lights(), normals_of(points), points)
     assert np.array_equal(np.round(np.asarray(image) * 255), np.broadcast_to([178, 178, 204], (8, 8, 3)))
@@ -132,7 +132,7 @@ def test_flat_gel_has_the_originals_colour():
     ],
     ids=["far", "near"],
 )
-def test_a_bump_is_lit_from_the_side_its_flank_faces(lights):
+def test_flanks_are_lit_by_the_light_that_they_face(lights):
     x, y = np.meshgrid(np.arange(-20, 21), np.arange(-20, 21))
     bump = jnp.asarray(np.stack([x, y, -5 * np.exp(-(x**2 + y**2) / 50)], -1), jnp.float32)  # towards the camera
     image = np.asarray(tactile.phong(tactile.Phong(), lights, normals_of(bump), bump))
@@ -145,7 +145,7 @@ def test_a_bump_is_lit_from_the_side_its_flank_faces(lights):
 
 @pytest.mark.parametrize("length", [0.0003, 0.001, 0.004])
 @pytest.mark.parametrize("shape", SHAPES[:4])
-def test_coupling_is_a_weighted_mean_over_the_image(shape, length):
+def test_coupling_equals_a_weighted_mean_over_the_image(shape, length):
     depth = pressed(shape) + 1e-4 * np.random.default_rng(4).uniform(size=shape)
     pitch = WINDOW[2:] / [shape[1], shape[0]]
     got = np.asarray(jax.jit(tactile.couple)(jnp.asarray(depth, jnp.float32), length, jnp.asarray(pitch, jnp.float32)))
@@ -155,7 +155,7 @@ def test_coupling_is_a_weighted_mean_over_the_image(shape, length):
         assert got[i, j] == pytest.approx(np.sum(weights * depth) / np.sum(weights), rel=1e-4, abs=1e-9)
 
 
-def test_a_coupled_edge_is_an_error_function():
+def test_a_coupled_edge_equals_an_error_function():
     shape, length = (40, 300), 0.001
     x = (np.arange(300) - 149.5) * 1e-4
     depth = jnp.asarray(np.tile(np.where(x > 0, 0.002, 0), (40, 1)), jnp.float32)
@@ -166,7 +166,7 @@ def test_a_coupled_edge_is_an_error_function():
 
 
 @pytest.mark.parametrize("shape", SMALL)
-def test_no_coupling_is_no_change(shape):
+def test_zero_coupling_changes_nothing(shape):
     depth = jnp.asarray(pressed(shape), jnp.float32)
     pitch = jnp.asarray(WINDOW[2:] / [shape[1], shape[0]], jnp.float32)
     couple = jax.jit(tactile.couple)
@@ -217,7 +217,7 @@ def arriving(skin, lights, depth, i, j):
     ],
     ids=["plane", "far", "near"],
 )
-def test_shadows_are_what_stands_in_the_way(shape, lights):
+def test_shadows_equal_a_float64_loop(shape, lights):
     depth = pressed(shape)
     got = np.asarray(
         jax.jit(tactile.shadows)(SKIN, lights, jnp.asarray(depth, jnp.float32), jnp.asarray(WINDOW, jnp.float32))
@@ -230,7 +230,7 @@ def test_shadows_are_what_stands_in_the_way(shape, lights):
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_a_shadow_is_as_long_as_its_wall_is_high_over_the_tangent(near):
+def test_length_of_a_shadow_equals_height_over_tangent(near):
     shape, height, tangent = (24, 400), 0.002, 0.2
     x = 1e-4 * (np.arange(shape[1]) + 0.5)
     depth = np.tile(np.where(np.abs(x - 0.01) < 0.001, height, 0), (shape[0], 1))
@@ -247,7 +247,7 @@ def test_a_shadow_is_as_long_as_its_wall_is_high_over_the_tangent(near):
     assert np.all(share[x > 0.0215] == 1)
 
 
-def test_a_light_in_the_gels_plane_is_hidden_from_flanks_behind():
+def test_a_bump_hides_a_light_in_the_gels_plane_from_flanks_behind_it():
     x, y = np.meshgrid(1e-4 * np.arange(-150, 150), 1e-4 * np.arange(-50, 50))
     bump = 0.001 * np.exp(-((x + 0.006) ** 2 + y**2) / 0.002**2)
     second = 0.001 * np.exp(-((x - 0.006) ** 2 + y**2) / 0.002**2)
@@ -272,7 +272,7 @@ def test_a_light_in_the_gels_plane_is_hidden_from_flanks_behind():
     np.testing.assert_allclose(open_both[:, 145:155], shaded_both[:, 145:155], atol=1e-3)  # flat: nothing to hide
 
 
-def test_no_steps_are_no_shadows_and_a_flat_skin_has_none():
+def test_zero_steps_and_flat_skin_give_no_shadows():
     depth, window = jnp.asarray(pressed((20, 30)), jnp.float32), jnp.asarray(WINDOW, jnp.float32)
     for lights in (tactile.Lights(), LEDS):
         assert np.all(np.asarray(tactile.shadows(tactile.Skin(), lights, depth, window)) == 1)
@@ -304,7 +304,7 @@ def parameters(lights, depth):
 @pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
 @pytest.mark.parametrize("depth", [0.002, -0.001], ids=["pressed", "flat"])
-def test_gradients_are_those_of_finite_differences(lights, depth):
+def test_gradients_equal_finite_differences(lights, depth):
     shape = (33, 41)
     with jax.enable_x64(True):
         start = jax.tree.map(lambda v: jnp.asarray(np.asarray(v, np.float64)), parameters(lights, depth))
@@ -358,7 +358,7 @@ def test_gradients_are_finite_in_float32(lights, coupling, depth):
         assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
 
 
-def test_points_a_light_and_a_normal_that_meet_badly_have_finite_gradients():
+def test_gradients_are_finite_for_degenerate_lights_and_normals():
     # Light along the skin, from behind it, and at right angles to the eye: R . V is 0 to the last digits.
     lights = tactile.Lights(directions=jnp.array([[1.0, 0, 0], [0, 0, 1], [1e-22, 0, -1e-25], [1, 0, -1e-30]]))
     normals = jnp.array([[0.0, 0, -1], [0, 0, -1], [1, 0, 0], [0, 0, 0]])
@@ -374,7 +374,7 @@ def test_points_a_light_and_a_normal_that_meet_badly_have_finite_gradients():
             assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
 
 
-def test_deeper_is_darker():
+def test_brightness_decays_exponentially_with_depth():
     depth = jnp.linspace(0, 0.005, 20)[None]
     dark = np.asarray(tactile.darken(tactile.Phong(), depth))[0]
     assert dark[0] == 1
