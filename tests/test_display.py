@@ -1,4 +1,4 @@
-"""What `show` draws and `save` keeps: read back with Pillow and NumPy."""
+"""Figures of `show`, and files of `save` read with Pillow and NumPy."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""Whole frames: orientation, consistency, emptiness, gradients."""
+"""Whole frames: orientation, consistency, empty images, gradients, number of compilations."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from sts_jax.rendering import drawing, equilibrium
 SENSOR = sts.Sensor()
 SIZES = [(64, 64), *(pytest.param(size, marks=pytest.mark.slow) for size in ((97, 53), (200, 200)))]
 FLAT = np.array([178, 178, 204]) / 255
-sense = sts.sense  # compiles itself: one equilibrium serves every resolution
+sense = sts.sense  # compiled: one equilibrium program serves every resolution
 
 
 @pytest.fixture(autouse=True)
@@ -25,14 +25,14 @@ def strict_ranks():
         yield
 
 
-# Sensor frame, mm: (left, right, top, bottom), as a reader looking out through the gel sees an F.
+# The strokes of an F as a reader sees it who looks out through the gel. Sensor frame, mm: (left, right, top, bottom).
 LETTER = [(-12, -6, -15, 15), (-12, 12, -15, -9), (-12, 4, -2, 4)]
 ON_LETTER = [(-9, 10), (-9, -12), (9, -12), (1, 1)]  # (x, y) mm
 OFF_LETTER = [(9, 10), (9, 1), (-3, 10), (9, -4), (-3, -6)]
 
 
 def letter():
-    """A white box with a red F under it, 2 mm proud, its face in z = 0."""
+    """A white box with a raised red F under it. The F is 2 mm high, and its face lies in z = 0."""
     parts = []
     for left, right, top, bottom in LETTER:
         part = trimesh.creation.box((right - left, bottom - top, 2))
@@ -48,7 +48,7 @@ def letter():
 
 
 def ball(radius=0.03):
-    """Of rings that are fine where it touches: few faces, so that it has the letter's programs."""
+    """A ball of rings that are fine where it touches the gel. It has few faces and shares the letter's programs."""
     angle = np.radians([*range(0, 27, 2), 60, 120, 180])
     return from_trimesh(trimesh.creation.revolve(radius * np.stack([np.sin(angle), -np.cos(angle)], -1), sections=32))
 
@@ -100,7 +100,7 @@ def test_depth_of_the_balanced_pose_matches_its_pressure(resolution):
     frame = sense(SENSOR, ball(), pose, weight(1.0, 0.012, -0.008), resolution=resolution)
     assert bool(frame.balanced)
     assert float(jnp.sum(frame.pressure)) * 1e-6 == pytest.approx(1.0, rel=0.005)
-    # the ball of radius R whose centre is at z dips R - z below the face
+    # A ball of radius R with its centre at z reaches R - z below the face.
     depth = 0.03 - float(frame.pose[2])
     assert float(jnp.max(frame.pressure)) == pytest.approx(SENSOR.gel.stiffness * depth, rel=0.03)
     assert 0.1 - float(jnp.min(frame.depth)) == pytest.approx(depth, abs=1e-4)  # facets
@@ -113,7 +113,7 @@ def test_tilt_of_the_balanced_pose_matches_its_pressure():
     assert bool(frame.balanced)
     grid_x, grid_y = sts.tactile.cell_centres(SENSOR.gel)
     inside = (jnp.abs(grid_x) < 0.028) & (jnp.abs(grid_y) < 0.018)
-    # depth of the box's underside below the face, from the pose alone
+    # Depth of the box's underside below the face, from the pose alone.
     mesh = body_mesh(body, frame.pose)
     corners = mesh.vertices[mesh.vertices[:, 2] < 0.01]
     plane = np.linalg.lstsq(np.c_[corners[:, :2], np.ones(4)], corners[:, 2], rcond=None)[0]
@@ -200,12 +200,12 @@ def test_a_crop_agrees_with_the_whole_image():
     np.testing.assert_allclose(crop.pressure, whole.pressure)
     left, top, width, height = np.asarray(crop.window)
     assert width == pytest.approx(height)
-    # pixel of the whole under each pixel of the crop
+    # The pixel of the whole image under each pixel of the crop.
     u = ((left + (np.arange(200) + 0.5) / 200 * width) + 0.075) / 0.15 * 640 - 0.5
     v = ((top + (np.arange(200) + 0.5) / 200 * height) + 0.075) / 0.15 * 640 - 0.5
     under = np.asarray(whole.visual)[np.round(v).astype(int)][:, np.round(u).astype(int)]
     assert np.median(np.abs(under - np.asarray(crop.visual)).max(-1)) < 0.005
-    # 50 mm across, seen from 100 mm and more: the crop is filled to its edge
+    # The plate is 50 mm wide and at least 100 mm away. It fills the crop to its edge.
     seen = np.asarray(crop.segmentation)
     assert seen[:, 1:-1].any(0).all()
     assert seen.mean() > 0.8
@@ -265,7 +265,7 @@ def test_touch_equals_the_tactile_image_of_the_same_imprint(crop):
     frame = sense(sensor, body, pose, resolution=(150, 200), crop=crop)
     imprint = jnp.maximum(sensor.camera.distance - frame.depth, 0)
     drawn = sts.touch(sensor, imprint, frame.window)
-    inner = np.s_[6:-6, 6:-6]  # a frame includes the imprint beyond its border, and its shadow
+    inner = np.s_[6:-6, 6:-6]  # near its border, a frame also shows effects of the imprint beyond it
     np.testing.assert_allclose(np.asarray(drawn)[inner], np.asarray(frame.tactile)[inner], atol=2e-3)
     if not crop:
         np.testing.assert_array_equal(sts.touch(sensor, imprint), sts.touch(sensor, imprint, frame.window))
@@ -278,7 +278,7 @@ def test_touch_of_an_imprint_with_nan_is_finite():
 
 @pytest.mark.slow
 def test_moving_edges_derivative_equals_finite_differences_at_upright_walls():
-    # On the average over pixels: what is compared is smoothed, and its differences are a mean over several steps.
+    # The derivative is accurate on average over pixels. The images are smoothed, and differences averaged over steps.
     sensor = dataclasses.replace(SENSOR, skin=sts.tactile.Skin(coupling=0.001))
     body, resolution, pitch = letter(), (120, 120), jnp.full(2, 0.15 / 120)
 

@@ -1,4 +1,4 @@
-"""The image at any light between the two streams, against a loop in NumPy float64."""
+"""Images at any light between the two streams, against a loop in NumPy float64."""
 
 import dataclasses
 import inspect
@@ -20,7 +20,7 @@ def with_exposure(value):
 
 
 def noise(shape, seed=0):
-    """A frame of random images with black and white in them."""
+    """A frame of random images with black and white pixels."""
     rng = np.random.default_rng(seed)
     images = rng.uniform(size=(2, *shape, 3)).astype(np.float32)
     images[rng.uniform(size=images.shape) < 0.05] = 0
@@ -77,10 +77,10 @@ def test_light_is_added_in_linear_units(shape, exposure):
         image = np.asarray(expose(with_exposure(exposure), frame, light))
         for i, j, k in zip(*(rng.integers(n, size=200) for n in (*shape, 3)), strict=True):
             seen, felt = float(frame.visual[i, j, k]), float(frame.tactile[i, j, k])
-            # seconds of exposure: `exposure` with the LEDs off, 1 at full power
+            # The exposure time is `exposure` with the LEDs off, and 1 at full power.
             outside, leds_on = decode(seen) / exposure, decode(felt)
             radiance = outside + light * (leds_on - outside)
-            grey = 1 / exposure + light * (1 - 1 / exposure)  # of what shows as 1 in both streams
+            grey = 1 / exposure + light * (1 - 1 / exposure)  # of a pixel that is 1 in both streams
             assert image[i, j, k] == pytest.approx(encode(radiance / grey), abs=2e-6)
 
 
@@ -117,7 +117,7 @@ def test_gradients_equal_finite_differences_and_are_finite_at_0_and_1():
     along = jnp.where(inner, weights, 0)
     there, back = value(0.3, 4.0, frame.visual + 0.01 * along), value(0.3, 4.0, frame.visual - 0.01 * along)
     assert float(jnp.sum(by_visual * along)) == pytest.approx(float(there - back) / 0.02, rel=0.01)
-    # at an end the image is the stream itself, so its derivative is 1
+    # At 0 and 1 the image is the stream itself, so its derivative is 1.
     at_end = gradient(0.0, 4.0, frame.visual)[2]
     np.testing.assert_allclose(np.asarray(at_end)[inner], np.asarray(weights / weights.size)[inner], rtol=1e-4)
     assert float(jnp.abs(gradient(0.0, 4.0, frame.visual)[0])) > 0

@@ -1,4 +1,4 @@
-"""What `sense` refuses, and what it does where a sensor that cannot be is traced; meshes with too many faces."""
+"""Invalid inputs of `sense`, `touch` and `expose`: errors for concrete values, finite images for traced ones."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from optics_bodies import from_trimesh
 import sts_jax as sts
 from sts_jax import objects, tactile
 
-# As its users call it: without the tests' own checks of types and shapes.
+# Without the tests' own checks of types and shapes, as users call them.
 sense, touch, expose = (inspect.unwrap(call) for call in (sts.sense, sts.touch, sts.expose))
 SENSOR = sts.Sensor()
 BODY = from_trimesh(trimesh.creation.box((0.05, 0.03, 0.02)))
@@ -198,14 +198,14 @@ def test_an_invalid_traced_sensor_gives_an_unbalanced_frame_with_finite_images(l
             words = f"{jax.tree_util.keystr(path)} is {value}"
             assert all(np.all(np.isfinite(getattr(frame, name))) for name in IMAGES), words
             if possible(sensor):
-                assert np.any(frame.segmentation) or value == 10, words  # from 10 m away it is smaller than a pixel
+                assert np.any(frame.segmentation) or value == 10, words  # at 10 m it is smaller than a pixel
             else:
                 assert not np.any(frame.segmentation), words
                 refused += 1
                 assert not bool(frame.balanced), words
                 np.testing.assert_allclose(frame.visual, empty.visual, atol=1e-6)
                 np.testing.assert_allclose(frame.tactile, empty.tactile, atol=1e-6)
-    assert refused > 3 * len(leaves)  # of six: three are not finite
+    assert refused > 3 * len(leaves)  # three of the six values are not finite
 
 
 @pytest.mark.slow
@@ -257,7 +257,7 @@ def test_an_invalid_window_raises_an_error_and_a_traced_one_shows_flat_skin(bad)
 
 
 def stl_of_a_million(path):
-    """A ball of a thousand rings, without any help of a library that would take its time."""
+    """A ball of a thousand rings, written with NumPy, which is faster than a mesh library."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, 1002), np.linspace(0, 2 * np.pi, 502), indexing="ij")
     points = 0.04 * np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
@@ -278,5 +278,5 @@ def test_a_mesh_of_a_million_faces_raises_an_error_or_is_decimated_with_a_warnin
     with pytest.warns(UserWarning, match=r"ball\.stl: decimated from 1,00\d,\d{3} to [\d,]+ faces"):
         body = objects.load(path, faces=4096)
     assert body.faces.shape == (4096, 3)
-    # From a million to four thousand at once it grows: here by 4 %, of 20,480 faces by less than 0.5 %.
+    # Decimation from a million to four thousand faces enlarges the ball by 4 %. From 20,480 faces it is below 0.5 %.
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), 0.08, rtol=0.05)

@@ -1,4 +1,4 @@
-"""What a picture through the skin looks like: shadow, housing, texture."""
+"""The view through the skin: shadow, housing, texture; and the height maps under an object."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from sts_jax import geometry, objects, optics, tactile
 from sts_jax.rendering.equilibrium import underside
 
 SENSOR = sts.Sensor()
-sense = sts.sense  # compiles itself: one equilibrium serves every resolution
+sense = sts.sense  # compiled: one equilibrium program serves every resolution
 
 
 def with_room(**changes):
@@ -39,7 +39,7 @@ def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
     x = left + (np.arange(width) + 0.5) / width * wide
     y = top + (np.arange(height) + 0.5) / height * tall
     away = np.hypot(x[None, :], y[:, None])
-    # a bystander's wall hides nearly half of the sky; 3 % as shown is some 7 % of the light
+    # The wall of the cylinder hides nearly half of the sky beside it. 3 % in sRGB is about 7 % of the light.
     ring = (away > 0.016) & (away < 0.02) & ~np.asarray(there.segmentation)
     if ring.any():
         assert 0.9 < share[ring].mean() < 0.97
@@ -69,7 +69,7 @@ def test_sky_hidden_by_leaning_objects_agrees_with_traced_rays(category, lift):
 
 
 def test_the_gels_height_map_has_faces_within_reach_and_the_skys_has_all():
-    # a foot of 2 cm under a roof of 10 cm, 4 cm up
+    # A foot 2 cm wide under a roof 10 cm wide, 4 cm above the skin.
     foot, roof = trimesh.creation.box((0.02, 0.02, 0.04)), trimesh.creation.box((0.1, 0.1, 0.01))
     body = from_trimesh(trimesh.util.concatenate([foot, roof.apply_translation((0, 0, 0.025))]))
     near, whole = jax.jit(underside)(
@@ -113,14 +113,14 @@ def test_the_view_beyond_the_pad_is_a_dark_housing_also_behind_an_object():
     over = sense(SENSOR, body, at(0.07, 0, 0.015), resolution=(96, 128))
     beyond = np.abs(0.2 * ((np.arange(128) + 0.5) / 128 - 0.5)) > 0.076
     assert beyond.sum() == 30
-    assert np.asarray(over.segmentation)[:, beyond].any()  # geometry: what no housing hides
+    assert np.asarray(over.segmentation)[:, beyond].any()  # segmentation ignores the housing
     for stream in ("visual", "tactile"):
         image = np.asarray(getattr(gone, stream))
-        # no more than a shadow of what overhangs
+        # The overhanging object casts a faint shadow at most.
         np.testing.assert_allclose(np.asarray(getattr(over, stream))[:, beyond], image[:, beyond], atol=0.04)
         assert image[:, beyond].max() < 0.35 * image[:, 64].max()
         inwards = image[48, :15].mean(-1)
-        assert np.all(np.diff(inwards) > 0)  # brightest right under the pad's edge
+        assert np.all(np.diff(inwards) > 0)  # brightest just below the pad's edge
 
 
 def test_shadow_milk_and_tint_hardly_reduce_the_contrast_of_objects():
@@ -147,7 +147,7 @@ def test_the_texture_of_a_public_mesh_agrees_with_traced_rays():
     body = objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
     raw = trimesh.load_scene(meshes / "potion.obj", process=False).to_geometry()
     sheet = np.asarray(Image.open(meshes / "potion.png").convert("RGB")) / 255
-    # nothing but albedo
+    # Albedo alone.
     bare = with_room(milk=0.0, crease=0.0, haze=1e6, tint=jnp.ones(3), ambient=jnp.ones(3), colors=jnp.zeros((3, 3)))
     turn = np.array([np.cos(0.6), np.sin(0.6), 0.0, 0.0])
     pose = jnp.asarray([0.0, 0.0, 0.05, *turn], jnp.float32)
@@ -176,5 +176,5 @@ def test_the_texture_of_a_public_mesh_agrees_with_traced_rays():
     shown = np.asarray(frame.visual).reshape(-1, 3)[seen]
     assert seen.mean() > 0.2
     error = np.abs(shown - sheet[row, column]).max(-1)
-    assert np.median(error) < 0.02  # between texels, and at seams, they differ
+    assert np.median(error) < 0.02  # they differ between texels and at seams
     assert np.quantile(error, 0.9) < 0.15

@@ -1,4 +1,4 @@
-"""Rotations and poses against SciPy's and against 4x4 matrices; gradients against differences."""
+"""Rotations and poses against SciPy and 4x4 matrices, gradients against finite differences."""
 
 import inspect
 
@@ -82,7 +82,7 @@ def test_quaternion_of_any_matrix_is_the_nearest_rotation():
     quat = geometry.quat_from_matrix(jnp.asarray(matrix, jnp.float32))
     assert np.all(quat[:, 0] >= 0)
     values = np.linalg.svd(matrix, compute_uv=False)
-    clear = values[:, 1] - values[:, 2] > 0.05  # elsewhere two rotations may be equally near
+    clear = values[:, 1] - values[:, 2] > 0.05  # otherwise two rotations may be equally near
     np.testing.assert_allclose(geometry.quat_to_matrix(quat)[clear], (left @ right)[clear], atol=2e-4)
 
 

@@ -1,4 +1,4 @@
-"""The pinhole's geometry, by hand."""
+"""Geometry of the pinhole against values computed by hand."""
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,8 @@ def strict_ranks():
 @pytest.mark.parametrize(
     ("resolution", "window"),
     [
-        ((480, 640), (-0.1, -0.075, 0.2, 0.15)),  # the native aspect shows everything
-        ((64, 64), (-0.075, -0.075, 0.15, 0.15)),  # a square one the pad, edge to edge
+        ((480, 640), (-0.1, -0.075, 0.2, 0.15)),  # the native aspect ratio shows the whole view
+        ((64, 64), (-0.075, -0.075, 0.15, 0.15)),  # a square image shows the pad from edge to edge
         ((100, 50), (-0.0375, -0.075, 0.075, 0.15)),
         ((50, 200), (-0.1, -0.025, 0.2, 0.05)),
     ],

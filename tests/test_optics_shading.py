@@ -1,4 +1,4 @@
-"""Shading against loops in NumPy float64, and the sky that an object hides against rays."""
+"""Shading against loops in NumPy float64, and the hidden sky against traced rays."""
 
 import dataclasses
 
@@ -103,7 +103,7 @@ def test_walls_get_darker_with_depth():
     got = optics.housing(room, on_pad, jnp.asarray(places, jnp.float32), PAD, distance)
     expected = []
     for x, y in places:
-        # the ray (0, 0, -distance) + s (x, y, distance) meets the nearest of the walls |x| = 75 mm, |y| = 75 mm
+        # The ray (0, 0, -distance) + s (x, y, distance) meets the nearest of the walls |x| = 75 mm, |y| = 75 mm.
         s = min(0.075 / abs(x) if x else np.inf, 0.075 / abs(y) if y else np.inf)
         expected.append(1.0 if s > 1 else room.rim * np.exp(-distance * (1 - s) / room.rim_depth))
     np.testing.assert_allclose(got, expected, atol=1e-6)
@@ -140,7 +140,7 @@ def test_hidden_sky_agrees_with_traced_rays(low, high, half_x, half_y):
     x, y = np.linspace(-0.07, 0.07, 29), np.linspace(-0.07, 0.07, 15)
     got = hidden_by(box_heights(low, half_x, half_y), high, x, y)
     truth = rays_hidden(mesh, [(a, b) for b in y for a in x]).reshape(15, 29)
-    # at an edge on the skin it is as soft as the grid is coarse
+    # Beside an edge on the skin, the coarse grid softens the result.
     assert np.abs(got - truth).mean() < 0.07
     assert np.corrcoef(got.ravel(), truth.ravel())[0, 1] > 0.94
     assert got.min() >= 0
@@ -164,7 +164,7 @@ def test_hidden_sky_beside_a_straight_edge_equals_the_closed_form():
     heights = np.where(centres(150)[None, :] < 0, 0.0, np.inf) * np.ones((150, 1))
     x = np.linspace(0.01, 0.07, 25)
     got = hidden_by(heights, 0.04, x, np.zeros(1))[0]
-    ends = 0.075 / np.sqrt(0.075**2 + 0.04**2)  # the pad is not endless, along the edge and away from it
+    ends = 0.075 / np.sqrt(0.075**2 + 0.04**2)  # the pad is finite along the edge and across it
     away = x / np.sqrt(x**2 + 0.04**2)
     back = (x + 0.075) / np.sqrt((x + 0.075) ** 2 + 0.04**2)
     np.testing.assert_allclose(got, 0.5 * (back - away) * ends, atol=0.01)
@@ -182,7 +182,7 @@ def test_hidden_sky_hardly_depends_on_the_grid(cells):
 
 def test_absent_and_distant_objects_hide_no_sky():
     assert not np.any(hidden_by(np.full(CELLS, np.inf), 0.1, centres(30), centres(40)))
-    # nor does what is far above, or lies wholly below
+    # Objects far above the skin or entirely below it hide nothing either.
     assert hidden_by(box_heights(0.5, 0.03, 0.03), 0.6, centres(30), centres(40)).max() < 0.01
     assert not np.any(hidden_by(box_heights(-0.1, 0.03, 0.03), -0.05, centres(30), centres(40)))
 

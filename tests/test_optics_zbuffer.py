@@ -1,4 +1,4 @@
-"""The rasteriser against embree and against every pixel tested with every face."""
+"""The rasteriser against embree and against a loop over all faces and pixels."""
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +74,7 @@ def test_depth_equals_embrees(name, shape):
         error = np.abs(depth[inner] - truth[inner])
         assert np.sum(error > 1e-5) <= 0.001 * error.size
         assert error.max(initial=0) < 1e-4
-        # The silhouette may differ where a pixel's neighbours are not all the same.
+        # The silhouette may differ where the pixels around a pixel differ.
         differs = np.isfinite(depth) != np.isfinite(truth)
         hit = np.isfinite(truth)
         padded = np.pad(hit, 1, mode="edge")
@@ -103,7 +103,7 @@ def test_faces_of_any_size_equal_a_loop_over_all_faces(chunk):
         ]
         w = np.stack([*w, 1 - w[0] - w[1]])
         if area >= 0:
-            continue  # from behind
+            continue  # faces away
         near_edge |= np.abs(w * area).min(0) < 1e-2 * np.abs(triangle - triangle[[1, 2, 0]]).max()
         value = np.tensordot(depth, w, 1)
         closer = np.all(w >= 0, axis=0) & (value < best)
@@ -117,9 +117,9 @@ def test_faces_of_any_size_equal_a_loop_over_all_faces(chunk):
     assert (~near_edge).mean() > 0.5
 
 
-@pytest.mark.parametrize("number", [100, 1500])  # one group of faces, and two that overlap
+@pytest.mark.parametrize("number", [100, 1500])  # one group of faces, and two groups that overlap
 def test_a_surface_has_no_cracks(number):
-    # a fan of slivers that meet in one point: every pixel inside is covered
+    # A fan of slivers that meet in one point covers every pixel inside.
     angles = np.linspace(0, 2 * np.pi, number + 1)[:-1]
     rim = np.stack([32.3 + 29 * np.cos(angles), 31.7 + 29 * np.sin(angles)], -1)
     points = jnp.asarray(np.concatenate([rim, [[32.3, 31.7]]]), jnp.float32)
@@ -188,7 +188,7 @@ def test_vmap_agrees_with_a_loop():
     for pose, winner in zip(poses, batch, strict=True):
         alone = drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]
         assert np.sum(np.asarray(alone) >= 0) > 40
-        # Two programs round differently on some machines: a pixel on the edge between two faces may go to the other.
+        # Two programs round differently on some machines, which can swap the two faces at a pixel on their edge.
         assert np.sum(alone != winner) <= 4
 
 

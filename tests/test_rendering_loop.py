@@ -1,4 +1,4 @@
-"""`looped` against the plain function: values, derivatives, batches, and that a batch is a loop."""
+"""`looped` against the plain function: values, derivatives and batches."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""An image function on the tiles that need it, against the same function on the whole image."""
+"""An image function on active tiles against the same function on the whole image."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ SHAPES = [(8, 8), (17, 33), (64, 64), (131, 53), (5, 40), (TILE - 1, 40)]
 
 
 def blur(params, images):
-    """Every pixel from its 3x3 neighbourhood, twice over."""
+    """Two images, each pixel from its 3x3 neighbourhood."""
     first, second = images
     height, width = (n - 2 for n in first.shape[:2])
     total = sum(first[i : i + height, j : j + width] for i in range(3) for j in range(3))

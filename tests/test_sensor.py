@@ -1,4 +1,4 @@
-"""A sensor's file: whole, readable, refused with a named field; and what no sensor can be."""
+"""The file of a sensor, and the checks of its constants."""
 
 import dataclasses
 import json
@@ -127,10 +127,10 @@ def test_an_invalid_field_in_a_file_raises_an_error_that_names_it(tmp_path, fiel
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("positions", [[0.0, 0, -0.004]]),  # over the pad, in the gel
+        ("positions", [[0.0, 0, -0.004]]),  # in the gel, over the pad
         ("positions", [[0.0, 0, -0.005]]),
         ("positions", [[0.075, 0.075, 0.0]]),  # at its corner
-        ("positions", [[0.1, 0, 0.001]]),  # beside the pad, outside of the sensor
+        ("positions", [[0.1, 0, 0.001]]),  # beside the pad, above the gel's face
         ("positions", [[0.0, 0, 0.1]]),
         ("directions", [[0.0, 0, -1]]),  # unknown to Leds
         ("falloff", -1),
@@ -166,7 +166,7 @@ def test_invalid_leds_in_a_file_raise_an_error_that_names_the_field(tmp_path, fi
 def test_the_right_numbers_in_the_wrong_type_raise_an_error(field, value):
     sensor = Sensor()
     part, name = field.split(".")
-    object.__setattr__(getattr(sensor, part), name, value)  # past the tests' own checks of types
+    object.__setattr__(getattr(sensor, part), name, value)  # bypasses the tests' own checks of types
     with pytest.raises(ValueError, match=f"field {field} is .*must be"):
         sensor.check()
     with pytest.raises(ValueError, match=f"field {field} is .*must be"):

@@ -57,7 +57,7 @@ CASES = {
 
 
 def true_pressure(gel, height, wrench):
-    """Newton's method is not trusted here: BFGS in float64, from another start."""
+    """Pressure and motion by BFGS in float64, from another start than that of the gel's Newton method."""
     x, y = grid(gel)
     area = 0.15 * 0.15 / x.size
     there = np.isfinite(height)
@@ -120,7 +120,7 @@ def test_depth_of_a_ball_equals_the_closed_form(radius, force):
     assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
 
 
-# Heights and wrench are arguments: one program serves all cases.
+# Heights and wrench are arguments, so that one program serves all cases.
 SEVERAL = jax.jit(jax.vmap(lambda height, wrench, load: tactile.settle(GEL, height, wrench * load), (None, None, 0)))
 
 
@@ -138,7 +138,7 @@ def test_more_load_never_makes_the_imprint_smaller(name):
 
 
 def deepest(got, height, gel=GEL):
-    """How far the object lies in the gel at most (m)."""
+    """Largest depth of the object below the gel's face (m)."""
     x, y = grid(gel)
     moved = np.asarray(height, float) - float(got.sink) + float(got.turn[0]) * y - float(got.turn[1]) * x
     return -np.min(moved)
@@ -148,11 +148,11 @@ def deepest(got, height, gel=GEL):
     ("height", "wrench"),
     [
         (lambda x, y: box(x, y) + 0.05, push(0.5, 0.0, 0.01)),  # out of reach
-        (lambda x, y: np.full(x.shape, np.inf), push(0.5, 0.0, 0.01)),  # nothing there
+        (lambda x, y: np.full(x.shape, np.inf), push(0.5, 0.0, 0.01)),  # no object
         (box, push(0.5, 0.05, 0.01)),  # centre of pressure outside the footprint
-        (box, push(0.5, 0.2, 0.01)),  # and off the pad
+        (box, push(0.5, 0.2, 0.01)),  # off the pad
         (box, push(50.0, 0.0, 0.01)),  # deeper than the limit
-        (lambda x, y: box(x, y, tilt=(0.0, 0.3)), push(2.0, 0.0, 0.01)),  # flatter than the limit allows
+        (lambda x, y: box(x, y, tilt=(0.0, 0.3)), push(2.0, 0.0, 0.01)),  # a tilt beyond the limit
     ],
 )
 def test_without_equilibrium_the_result_is_unbalanced_and_within_the_limits(height, wrench):
@@ -192,7 +192,7 @@ def test_grids_of_1_and_half_a_millimetre_agree():
 
 
 def odd_height(rng, x, y):
-    """The underside of one to four things of one random kind: ellipsoids, thin bars, points, plates, wedges, cones."""
+    """The underside of one to four parts of one random kind: ellipsoids, bars, points, plates, wedges or cones."""
     height, kind = np.full(x.shape, np.inf), rng.integers(6)
     for _ in range(rng.integers(1, 5)):
         (cx, cy), turn = rng.uniform(-0.05, 0.05, 2), rng.uniform(0, np.pi)
@@ -213,7 +213,7 @@ def odd_height(rng, x, y):
 
 
 def odd_push(rng, height, x, y):
-    """A load of 0.02 to 50 N, its centre among what is lowest, at a rim of it, or some way off."""
+    """A load of 0.02 to 50 N, with its centre among the lowest cells, at their rim or outside of them."""
     low = height < height.min() + 0.001
     share = rng.dirichlet(np.full(low.sum(), rng.choice([0.05, 1, 10])))
     shift = rng.normal(size=2) * rng.choice([0, 0, 0, 0.002, 0.03])
@@ -221,7 +221,7 @@ def odd_push(rng, height, x, y):
 
 
 def has_equilibrium(gel, height, wrench):
-    """Whether damped Newton steps in float64 come to balance, well within the gel's limits."""
+    """Whether damped Newton steps in float64 find an equilibrium well within the gel's limits."""
     x, y = grid(gel)
     there = np.isfinite(height)
     fz, mx, my = (float(w) for w in wrench[2:5])

@@ -1,4 +1,4 @@
-"""The drawn skin against loops in NumPy float64: coupling, normals, lights, shadows, Phong; and their gradients."""
+"""Coupling, lights, shadows and Phong reflectance against loops in NumPy float64, and their gradients."""
 
 import dataclasses
 
@@ -28,14 +28,14 @@ def strict_ranks():
 
 
 def places(shape):
-    """Of pixel centres on the gel's face, as `WINDOW` shows it (m)."""
+    """x and y of pixel centres on the part of the gel's face in `WINDOW` (m)."""
     x = WINDOW[0] + (np.arange(shape[1]) + 0.5) / shape[1] * WINDOW[2]
     y = WINDOW[1] + (np.arange(shape[0]) + 0.5) / shape[0] * WINDOW[3]
     return np.meshgrid(x, y)
 
 
 def pressed(shape):
-    """Depths of three imprints: a ball's, a box's and a ridge's (m)."""
+    """Depth of the imprints of a ball, a box and a ridge (m)."""
     x, y = places(shape)
     ball = np.sqrt(np.maximum(0.02**2 - (x + 0.03) ** 2 - (y - 0.01) ** 2, 0)) - 0.0185
     box = np.where((np.abs(x - 0.03) < 0.012) & (np.abs(y + 0.02) < 0.02), 0.0012, 0)
@@ -50,7 +50,7 @@ def some_normals(shape):
 
 
 def reflected_light(constants, lights, normal, point, shares):
-    """Phong's equation in float64, one point, one light after the other."""
+    """Phong's equation in float64 at one point, light by light."""
     view = np.array([0.0, 0.0, -1.0])
     near = isinstance(lights, tactile.Leds)
     total = float(constants.ambient) * np.array(constants.ambient_color, np.float64)
@@ -161,7 +161,7 @@ def test_a_coupled_edge_equals_an_error_function():
     depth = jnp.asarray(np.tile(np.where(x > 0, 0.002, 0), (40, 1)), jnp.float32)
     got = tactile.couple(depth, length, jnp.array([1e-4, 2e-4]))
     expected = 0.001 * (1 + erf(x / length / np.sqrt(2)))
-    away = np.abs(x) < 0.015 - 4 * length  # the image's border: what lies beyond counts for nothing
+    away = np.abs(x) < 0.015 - 4 * length  # the weights do not reach beyond the image's border
     np.testing.assert_allclose(got[:, away], np.tile(expected, (shape[0], 1))[:, away], atol=2e-6)
 
 
@@ -180,7 +180,7 @@ def test_zero_coupling_changes_nothing(shape):
 
 
 def bilinear(depth, row, column):
-    """Of an image with nothing around it; row and column in pixels, whole at pixel centres."""
+    """Value of an image with zeros around it. Row and column in pixels, whole numbers at pixel centres."""
     total = 0.0
     for i in (int(np.floor(row)), int(np.floor(row)) + 1):
         for j in (int(np.floor(column)), int(np.floor(column)) + 1):
@@ -255,7 +255,7 @@ def test_a_bump_hides_a_light_in_the_gels_plane_from_flanks_behind_it():
     skin = tactile.Skin(shadow_steps=64, shadow_reach=0.02, penumbra=0.02)
 
     def red(depth):
-        """What the first light, from the left, alone gives."""
+        """Red channel with the first light alone, which comes from the left."""
         depth = jnp.asarray(depth, jnp.float32)
         points = jnp.stack([jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), -depth], -1)
         lights, constants = tactile.Lights(), tactile.Phong(ambient=0.0)
@@ -265,11 +265,11 @@ def test_a_bump_hides_a_light_in_the_gels_plane_from_flanks_behind_it():
 
     open_alone, shaded_alone = red(second)
     open_both, shaded_both = red(bump + second)
-    flank = (50, 196)  # of the second bump, towards the light
+    flank = (50, 196)  # the side of the second bump that faces the light
     assert open_alone[flank] > 0.1
-    assert shaded_alone[flank] == open_alone[flank]  # nothing stands before it
-    assert shaded_both[flank] < 0.2 * open_both[flank]  # the first bump does
-    np.testing.assert_allclose(open_both[:, 145:155], shaded_both[:, 145:155], atol=1e-3)  # flat: nothing to hide
+    assert shaded_alone[flank] == open_alone[flank]  # no shadow on the second bump alone
+    assert shaded_both[flank] < 0.2 * open_both[flank]  # the first bump casts a shadow on it
+    np.testing.assert_allclose(open_both[:, 145:155], shaded_both[:, 145:155], atol=1e-3)  # flat skin is unlit
 
 
 def test_zero_steps_and_flat_skin_give_no_shadows():
@@ -280,7 +280,7 @@ def test_zero_steps_and_flat_skin_give_no_shadows():
 
 
 def drawing(parameters, weights):
-    """A weighted sum of the pixels of a ball's imprint, of all that it can be differentiated by."""
+    """A weighted sum of the pixels of a ball's imprint, as a function of all parameters with a derivative."""
     shape = weights.shape[:2]
     x, y = (jnp.asarray(v, weights.dtype) for v in places(shape))
     window = jnp.asarray(WINDOW, weights.dtype)
@@ -308,7 +308,7 @@ def test_gradients_equal_finite_differences(lights, depth):
     shape = (33, 41)
     with jax.enable_x64(True):
         start = jax.tree.map(lambda v: jnp.asarray(np.asarray(v, np.float64)), parameters(lights, depth))
-        # Off the gel's plane: at it flat skin is at the edge of light, where no derivative is.
+        # Off the gel's plane. With lights in this plane, flat skin is at the edge of light and has no derivative.
         if isinstance(lights, tactile.Lights):
             tilted = start["lights"].directions + jnp.array([[0.05, 0.02, -0.1]])
             start["lights"] = dataclasses.replace(start["lights"], directions=tilted)
@@ -341,9 +341,9 @@ def test_gradients_equal_finite_differences(lights, depth):
     "lights",
     [
         tactile.Lights(),
-        tactile.Lights(directions=jnp.array([[0.0, 0, -1]] * 4)),  # straight under
+        tactile.Lights(directions=jnp.array([[0.0, 0, -1]] * 4)),  # straight below
         LEDS,
-        # on the skin itself, on a pixel's centre, straight under, and in the gel's plane
+        # On the skin at a pixel's centre, almost on it, straight below, and in the gel's plane.
         tactile.Leds(positions=jnp.array([[0.0, 0, 0], [0.0, 0.0, -1e-12], [0, 0, -0.05], [0.1, 0, 0]])),
         tactile.Leds(positions=jnp.array([[0.0, 0, 0]] * 4), falloff=4.0, reference=0.1),
     ],
@@ -359,7 +359,7 @@ def test_gradients_are_finite_in_float32(lights, coupling, depth):
 
 
 def test_gradients_are_finite_for_degenerate_lights_and_normals():
-    # Light along the skin, from behind it, and at right angles to the eye: R . V is 0 to the last digits.
+    # Light along the skin, from behind it, and at right angles to the view. R . V is 0 to the last digits.
     lights = tactile.Lights(directions=jnp.array([[1.0, 0, 0], [0, 0, 1], [1e-22, 0, -1e-25], [1, 0, -1e-30]]))
     normals = jnp.array([[0.0, 0, -1], [0, 0, -1], [1, 0, 0], [0, 0, 0]])
 
