@@ -42,7 +42,7 @@ def lit_skin(
     return where_active(_skin, pressed, sensor, (*slopes, imprint, *shares), planes(untouched), ring=1)
 
 
-def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Float[Array, "h w"]]:
+def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Float[Array, "h w *tiles"]]:
     """The lit skin from the rays, the imprint and the lights' shares, which have one more pixel on each side."""
     slope_x, slope_y, imprint, *shares = images
     depth = sensor.camera.distance - imprint
