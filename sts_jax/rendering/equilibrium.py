@@ -34,6 +34,20 @@ def _balance(
     pose: Float[Array, "7"],
     wrench: Float[Array, "6"] | None,
 ) -> Resting:
+    """Let an object sink and tilt until the gel carries its wrench.
+
+    Args:
+        gel: constants of the gel.
+        sound: False for an invalid sensor or body, which gives an object below the pad.
+        vertices: mesh frame (m).
+        faces: vertex indices.
+        two_sided: whether faces are visible from behind too.
+        pose: mesh frame in the sensor frame, before it sinks.
+        wrench: of the pad on the object (N, N m), or None for the imprint of the pose alone.
+
+    Returns:
+        The object in balance.
+    """
     length = geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:])
     finite = sound & jnp.all(jnp.isfinite(pose)) & (length > 0) & jnp.isfinite(length)
     if wrench is not None:
@@ -64,8 +78,6 @@ def _balance(
     )
 
 
-# Args: the gel, a flag that is False for an invalid sensor or body, vertices in the mesh frame (m), faces, whether
-# faces are visible from behind too, the pose, and the wrench or None.
 balance = jax.jit(looped(_balance))
 
 
