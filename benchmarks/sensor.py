@@ -40,7 +40,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
-from sts_jax import frame, geometry, objects, optics, tactile
+from sts_jax import geometry, objects, optics, tactile
+from sts_jax.rendering import drawing, equilibrium
 
 SIZES = {(64, 64): 41, (200, 200): 15, (480, 640): 7}  # image sizes, and how often each is timed
 FACES = (None, 2000, 5000)  # None: as the class generates them
@@ -309,7 +310,7 @@ def compilations(number: int = 100) -> None:
     for body in bodies:
         poses, wrenches = resting(body, 1)
         sts.sense(sts.Sensor(), body, poses[0], wrenches[0])
-    programs: tuple[Any, Any] = (frame._balance, frame._draw)
+    programs: tuple[Any, Any] = (equilibrium.balance, drawing.draw)
     balance, draw = (program._cache_size() for program in programs)
     print(f"{len(bodies)} objects, {len(files)} of them loaded: the balance compiled {balance} times, drawing {draw}")
 

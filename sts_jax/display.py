@@ -3,7 +3,7 @@
 import io
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,44 +52,55 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
         TypeError: `thing` is none of these.
         ValueError: `thing` has leading axes or no image, or an image has another shape or range.
     """
-    panels: list[tuple[str, np.ndarray, str | None]]
-    if isinstance(thing, Frame):
-        _one("Frame", thing.depth, 2)
-        seen = np.where(np.asarray(thing.segmentation), 1e3 * np.asarray(thing.depth), np.nan)
-        panels = [
-            ("visual", np.asarray(thing.visual), None),
-            ("tactile", np.asarray(thing.tactile), None),
-            ("depth (mm)", seen, "viridis_r"),
-            ("pressure (kPa)", np.asarray(thing.pressure) / 1e3, "magma"),
-        ]
-    elif isinstance(thing, Body):
-        _one("Body", thing.vertices, 2)
-        low, high = thing.vertices.min(0), thing.vertices.max(0)
-        middle = (low + high) / 2
-        pose = jnp.array([-middle[0], -middle[1], -low[2], 1, 0, 0, 0])
-        size = Sensor().gel.size
-        panels = [("", np.asarray(outside(thing, pose, jnp.asarray(size), resolution=(400, 400))), None)]
+    panels = _panels(thing)
+    if isinstance(thing, Body):
         title = title or repr(thing)
-    elif isinstance(thing, Prediction):
-        streams = {"visual": thing.visual, "tactile": thing.tactile}
-        panels = [(f"predicted {name}", np.asarray(x), None) for name, x in streams.items() if x is not None]
-        for _, image, _ in panels:
-            _one("Prediction", image, 3)
-        if not panels:
-            raise ValueError("the prediction has no image, because the model predicts the pose alone. Print it instead")
-    else:
-        panels = [("", _image(thing), None)]
     height = _INCH if len(panels) > 1 else 1.5 * _INCH
     figure = NotebookFigure(figsize=(1.15 * height * len(panels), height + 0.4), layout="constrained")
-    for axes, (name, values, colours) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
-        drawn = axes.imshow(values, cmap=colours)
-        if colours is not None:
+    for axes, panel in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+        drawn = axes.imshow(panel.values, cmap=panel.colours)
+        if panel.colours is not None:
             figure.colorbar(drawn, ax=axes, shrink=0.8)
-        axes.set_title(name, fontsize=9)
+        axes.set_title(panel.name, fontsize=9)
         axes.set_axis_off()
     if title:
         figure.suptitle(title, fontsize=9)
     return figure
+
+
+class _Panel(NamedTuple):
+    """One image of a figure."""
+
+    name: str
+    values: np.ndarray  # an RGB image, or numbers to colour
+    colours: str | None = None  # name of the colour map
+
+
+def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
+    if isinstance(thing, Frame):
+        _check_single("Frame", thing.depth, 2)
+        seen = np.where(np.asarray(thing.segmentation), 1e3 * np.asarray(thing.depth), np.nan)
+        return [
+            _Panel("visual", np.asarray(thing.visual)),
+            _Panel("tactile", np.asarray(thing.tactile)),
+            _Panel("depth (mm)", seen, "viridis_r"),
+            _Panel("pressure (kPa)", np.asarray(thing.pressure) / 1e3, "magma"),
+        ]
+    if isinstance(thing, Body):
+        _check_single("Body", thing.vertices, 2)
+        low, high = thing.vertices.min(0), thing.vertices.max(0)
+        middle = (low + high) / 2
+        pose = jnp.array([-middle[0], -middle[1], -low[2], 1, 0, 0, 0])
+        return [_Panel("", np.asarray(outside(thing, pose, jnp.asarray(Sensor().gel.size), resolution=(400, 400))))]
+    if isinstance(thing, Prediction):
+        streams = {"visual": thing.visual, "tactile": thing.tactile}
+        panels = [_Panel(f"predicted {name}", np.asarray(x)) for name, x in streams.items() if x is not None]
+        if not panels:
+            raise ValueError("the prediction has no image, because the model predicts the pose alone. Print it instead")
+        for panel in panels:
+            _check_single("Prediction", panel.values, 3)
+        return panels
+    return [_Panel("", _image(thing))]
 
 
 def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayLike) -> None:
@@ -109,7 +120,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
     path = Path(path)
     if path.suffix.lower() == ".png":
         if isinstance(thing, Frame):
-            _one("Frame", thing.depth, 2)
+            _check_single("Frame", thing.depth, 2)
             image = np.concatenate([np.asarray(thing.visual), np.asarray(thing.tactile)], axis=1)
         elif isinstance(thing, Body | Prediction | Trajectory):
             remedies = ["save it as .npz"] * isinstance(thing, tuple(_KINDS.values()))
@@ -173,7 +184,7 @@ def _built(kind: type, arrays: dict[str, Any]) -> Any:
     return kind(**(fields | nested))
 
 
-def _one(name: str, array: Any, rank: int) -> None:
+def _check_single(name: str, array: Any, rank: int) -> None:
     if np.ndim(array) != rank:
         raise ValueError(
             f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}. Give one item, such as "

@@ -1,4 +1,4 @@
-"""Bodies for the tests of optics, tactile and frame, straight from trimesh's primitives."""
+"""Bodies made of trimesh's primitives, for the tests of optics, tactile and frame."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ __all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
-    """A body with flat normals, of the smallest size class where it fits; `colors` are per face."""
+    """A body with flat normals, of the smallest size class that holds it. `colors` are per face."""
     number = len(mesh.faces)
     padded = next(size for size in FACE_CLASSES if size >= number)
     normals = np.repeat(mesh.face_normals[:, None], 3, axis=1)
@@ -42,7 +42,7 @@ def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -
 
 
 def rays_hidden(mesh, places, num=3000):
-    """Share of rays, spread by the cosine, from places of the skin that meet a mesh."""
+    """Share of cosine-distributed rays from places on the skin that hit a mesh."""
     scene = EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, np.float32))
     index = np.arange(num)

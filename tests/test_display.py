@@ -1,4 +1,4 @@
-"""What `show` draws and `save` keeps: read back with Pillow and NumPy."""
+"""Figures of `show`, and files of `save` read with Pillow and NumPy."""
 
 import io
 
@@ -41,7 +41,7 @@ def test_a_png_holds_both_streams_side_by_side(tmp_path):
     np.testing.assert_allclose(got, np.concatenate([FRAME.visual, FRAME.tactile], 1), atol=0.51 / 255)
 
 
-def test_suffixes_may_be_in_capitals(tmp_path):
+def test_suffixes_in_capitals_are_accepted(tmp_path):
     sts.save(tmp_path / "frame.PNG", FRAME)
     with Image.open(tmp_path / "frame.PNG") as picture:
         assert (picture.format, picture.size) == ("PNG", (12, 4))
@@ -50,7 +50,7 @@ def test_suffixes_may_be_in_capitals(tmp_path):
 
 
 @pytest.mark.parametrize("thing", [FRAME, BODY], ids=["frame", "body"])
-def test_an_npz_gives_back_what_was_saved(tmp_path, thing):
+def test_a_loaded_npz_equals_the_saved_object(tmp_path, thing):
     sts.save(tmp_path / "thing.npz", thing)
     same(sts.load(tmp_path / "thing.npz"), thing)
 
@@ -63,7 +63,7 @@ def test_a_trajectory_keeps_its_hidden_values(tmp_path):
     same(sts.load(tmp_path / "falls.npz"), thing)
 
 
-def test_a_damaged_file_is_refused_or_the_damage_is_outside_the_arrays(tmp_path):
+def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(tmp_path):
     path = tmp_path / "frame.npz"
     sts.save(path, FRAME)
     whole = path.read_bytes()
@@ -80,7 +80,7 @@ def test_a_damaged_file_is_refused_or_the_damage_is_outside_the_arrays(tmp_path)
         sts.load(path)
 
 
-def test_a_file_of_another_format_is_refused(tmp_path):
+def test_a_file_of_another_format_raises_an_error(tmp_path):
     np.savez(tmp_path / "x.npz", kind=np.array("Frame"), format=np.array(99))
     with pytest.raises(TornFileError, match="format 99"):
         sts.load(tmp_path / "x.npz")
@@ -104,7 +104,7 @@ def test_a_file_of_another_format_is_refused(tmp_path):
         (np.zeros((4, 5, 3), np.uint8), [""]),
     ],
 )
-def test_a_figure_has_the_panels_of_what_it_shows(thing, panels):
+def test_a_figure_has_the_panels_of_its_object(thing, panels):
     figure = sts.show(thing, title="title")
     titles = [axes.get_title() for axes in figure.axes if axes.images and axes.get_label() != "<colorbar>"]
     assert titles == panels
@@ -116,7 +116,7 @@ def test_a_figure_has_the_panels_of_what_it_shows(thing, panels):
     np.testing.assert_allclose(first, np.asarray(expected) / (255 if np.asarray(expected).dtype == np.uint8 else 1))
 
 
-def test_a_body_is_seen_from_outside():
+def test_a_body_is_drawn_from_outside():
     picture = sts.show(BODY).axes[0].images[0].get_array()
     assert picture.shape == (400, 400, 3)
     assert picture[:20].min() == 1  # white around it
@@ -141,7 +141,7 @@ def test_a_body_is_seen_from_outside():
         ("a.png", jax.tree.map(lambda x: x[None], FRAME), ValueError, r"leading axes \(1,\)"),
     ],
 )
-def test_what_cannot_be_saved_is_named(tmp_path, path, thing, error, message):
+def test_an_object_that_cannot_be_saved_raises_an_error(tmp_path, path, thing, error, message):
     with pytest.raises(error, match=message):
         sts.save(tmp_path / path, thing)
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Whole frames: orientation, consistency, emptiness, gradients."""
+"""Whole frames: orientation, consistency, empty images, gradients, number of compilations."""
 
 import dataclasses
 
@@ -10,13 +10,13 @@ import trimesh
 from optics_bodies import body_mesh, embree, from_trimesh, interior
 
 import sts_jax as sts
-from sts_jax import frame as frame_module
 from sts_jax import objects, tactile
+from sts_jax.rendering import drawing, equilibrium
 
 SENSOR = sts.Sensor()
 SIZES = [(64, 64), *(pytest.param(size, marks=pytest.mark.slow) for size in ((97, 53), (200, 200)))]
 FLAT = np.array([178, 178, 204]) / 255
-sense = sts.sense  # compiles itself: one equilibrium serves every resolution
+sense = sts.sense  # compiled: one equilibrium program serves every resolution
 
 
 @pytest.fixture(autouse=True)
@@ -25,14 +25,14 @@ def strict_ranks():
         yield
 
 
-# Sensor frame, mm: (left, right, top, bottom), as a reader looking out through the gel sees an F.
+# The strokes of an F as a reader sees it who looks out through the gel. Sensor frame, mm: (left, right, top, bottom).
 LETTER = [(-12, -6, -15, 15), (-12, 12, -15, -9), (-12, 4, -2, 4)]
 ON_LETTER = [(-9, 10), (-9, -12), (9, -12), (1, 1)]  # (x, y) mm
 OFF_LETTER = [(9, 10), (9, 1), (-3, 10), (9, -4), (-3, -6)]
 
 
 def letter():
-    """A white box with a red F under it, 2 mm proud, its face in z = 0."""
+    """A white box with a raised red F under it. The F is 2 mm high, and its face lies in z = 0."""
     parts = []
     for left, right, top, bottom in LETTER:
         part = trimesh.creation.box((right - left, bottom - top, 2))
@@ -48,7 +48,7 @@ def letter():
 
 
 def ball(radius=0.03):
-    """Of rings that are fine where it touches: few faces, so that it has the letter's programs."""
+    """A ball of rings that are fine where it touches the gel. It has few faces and shares the letter's programs."""
     angle = np.radians([*range(0, 27, 2), 60, 120, 180])
     return from_trimesh(trimesh.creation.revolve(radius * np.stack([np.sin(angle), -np.cos(angle)], -1), sections=32))
 
@@ -62,7 +62,7 @@ def at(x, y, z):
 
 
 @pytest.mark.parametrize("resolution", SIZES)
-def test_a_letter_reads_the_right_way_round_in_both_streams(resolution):
+def test_a_letter_is_not_mirrored_in_either_stream(resolution):
     frame = sense(SENSOR, letter(), at(0, 0, -0.0008), resolution=resolution)
     height, width = resolution
     scale = height / 150  # pixels per mm on the gel's face
@@ -82,7 +82,7 @@ def test_a_letter_reads_the_right_way_round_in_both_streams(resolution):
 
 @pytest.mark.parametrize("resolution", SIZES)
 @pytest.mark.parametrize("category", ["spoon", "camera"])
-def test_depth_and_segmentation_are_embrees_of_the_balanced_pose(category, resolution):
+def test_depth_and_segmentation_equal_embrees_for_the_balanced_pose(category, resolution):
     body = objects.make(jax.random.key(4), category)
     pose = jnp.asarray([0.01, -0.01, 0.03, 0.8, 0.6, 0.0, 0.0])
     frame = sense(SENSOR, body, pose, weight(0.0, 0, 0), resolution=resolution)
@@ -95,25 +95,25 @@ def test_depth_and_segmentation_are_embrees_of_the_balanced_pose(category, resol
 
 
 @pytest.mark.parametrize("resolution", SIZES)
-def test_the_balanced_pose_sinks_as_deep_as_its_pressure_says(resolution):
+def test_depth_of_the_balanced_pose_matches_its_pressure(resolution):
     pose = at(0.012, -0.008, 0.0302)
     frame = sense(SENSOR, ball(), pose, weight(1.0, 0.012, -0.008), resolution=resolution)
     assert bool(frame.balanced)
     assert float(jnp.sum(frame.pressure)) * 1e-6 == pytest.approx(1.0, rel=0.005)
-    # the ball of radius R whose centre is at z dips R - z below the face
+    # A ball of radius R with its centre at z reaches R - z below the face.
     depth = 0.03 - float(frame.pose[2])
     assert float(jnp.max(frame.pressure)) == pytest.approx(SENSOR.gel.stiffness * depth, rel=0.03)
     assert 0.1 - float(jnp.min(frame.depth)) == pytest.approx(depth, abs=1e-4)  # facets
 
 
-def test_a_tilt_turns_the_pose_as_the_pressure_says():
+def test_tilt_of_the_balanced_pose_matches_its_pressure():
     body = from_trimesh(trimesh.creation.box((0.06, 0.04, 0.03)))
     x, y = 0.004, -0.003
     frame = sense(SENSOR, body, at(0, 0, 0.015), weight(1.5, x, y))
     assert bool(frame.balanced)
     grid_x, grid_y = sts.tactile.cell_centres(SENSOR.gel)
     inside = (jnp.abs(grid_x) < 0.028) & (jnp.abs(grid_y) < 0.018)
-    # depth of the box's underside below the face, from the pose alone
+    # Depth of the box's underside below the face, from the pose alone.
     mesh = body_mesh(body, frame.pose)
     corners = mesh.vertices[mesh.vertices[:, 2] < 0.01]
     plane = np.linalg.lstsq(np.c_[corners[:, :2], np.ones(4)], corners[:, 2], rcond=None)[0]
@@ -142,7 +142,7 @@ def test_more_load_never_makes_the_imprint_smaller(body):
 @pytest.mark.parametrize(
     ("resolution", "crop"), [((64, 64), False), ((64, 64), True), ((97, 53), False), ((200, 200), True)]
 )
-def test_an_object_that_has_fallen_off_leaves_empty_images(resolution, crop):
+def test_images_are_empty_after_an_object_has_fallen_off(resolution, crop):
     gone = sense(SENSOR, ball(), at(0.12, 0.0, -0.08), weight(0, 0, 0), resolution=resolution, crop=crop)
     far = sense(SENSOR, ball(), at(5.0, 0.0, 0.1), weight(0, 0, 0), resolution=resolution, crop=crop)
     assert not np.any(gone.segmentation)
@@ -156,7 +156,7 @@ def test_an_object_that_has_fallen_off_leaves_empty_images(resolution, crop):
     )
 
 
-def test_a_hovering_object_is_seen_and_not_felt():
+def test_a_hovering_object_is_visible_and_leaves_no_imprint():
     frame = sense(SENSOR, ball(), at(0.01, 0.0, 0.05), weight(0, 0, 0))
     assert np.any(frame.segmentation)
     assert np.ptp(np.asarray(frame.tactile), axis=(0, 1)).max() == 0
@@ -166,7 +166,7 @@ def test_a_hovering_object_is_seen_and_not_felt():
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 @pytest.mark.parametrize("where", ["position", "quaternion", "wrench"])
-def test_a_value_that_is_not_finite_lowers_the_flag_and_spoils_no_image(bad, where):
+def test_a_non_finite_input_gives_an_unbalanced_frame_with_finite_images(bad, where):
     pose, wrench = at(0, 0, 0.03), weight(1.0, 0, 0)
     if where == "wrench":
         wrench = wrench.at[3].set(bad)
@@ -191,7 +191,7 @@ def test_images_lie_in_0_to_1(resolution):
 
 
 @pytest.mark.slow
-def test_a_crop_shows_what_the_whole_shows():
+def test_a_crop_agrees_with_the_whole_image():
     body = letter()
     pose, wrench = at(0.02, -0.01, 0.0), weight(1.0, 0.02, -0.01)
     crop = sense(SENSOR, body, pose, wrench, resolution=(200, 200), crop=True)
@@ -200,18 +200,18 @@ def test_a_crop_shows_what_the_whole_shows():
     np.testing.assert_allclose(crop.pressure, whole.pressure)
     left, top, width, height = np.asarray(crop.window)
     assert width == pytest.approx(height)
-    # pixel of the whole under each pixel of the crop
+    # The pixel of the whole image under each pixel of the crop.
     u = ((left + (np.arange(200) + 0.5) / 200 * width) + 0.075) / 0.15 * 640 - 0.5
     v = ((top + (np.arange(200) + 0.5) / 200 * height) + 0.075) / 0.15 * 640 - 0.5
     under = np.asarray(whole.visual)[np.round(v).astype(int)][:, np.round(u).astype(int)]
     assert np.median(np.abs(under - np.asarray(crop.visual)).max(-1)) < 0.005
-    # 50 mm across, seen from 100 mm and more: the crop is filled to its edge
+    # The plate is 50 mm wide and at least 100 mm away. It fills the crop to its edge.
     seen = np.asarray(crop.segmentation)
     assert seen[:, 1:-1].any(0).all()
     assert seen.mean() > 0.8
 
 
-def test_vmap_is_the_single_frame():
+def test_vmap_agrees_with_single_frames():
     poses = jnp.stack([at(0.01 * k, -0.005 * k, 0.029) for k in range(3)])
     wrenches = jnp.stack([weight(0.3 * k, 0.01 * k, -0.005 * k) for k in range(3)])
     body = ball()
@@ -224,18 +224,18 @@ def test_vmap_is_the_single_frame():
 
 
 @pytest.mark.slow
-def test_one_compilation_serves_all_objects_of_a_class():
+def test_objects_of_one_size_class_share_a_compilation():
     programs = []
     for k, category in enumerate(("bottle", "watch", "fork")):
         body = objects.make(jax.random.key(k), category)
         assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
         sense(SENSOR, body, at(0, 0, 0.05), weight(0, 0, 0))
-        programs.append((frame_module._balance._cache_size(), frame_module._draw._cache_size()))
+        programs.append((equilibrium.balance._cache_size(), drawing.draw._cache_size()))
     assert programs[0] == programs[1] == programs[2]
 
 
 @pytest.mark.slow
-def test_gradients_through_the_load_are_the_finite_differences():
+def test_gradients_by_load_and_stiffness_equal_finite_differences():
     body = ball()
 
     def dark(stiffness, force):
@@ -256,7 +256,7 @@ def test_gradients_through_the_load_are_the_finite_differences():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("crop", [False, True])
-def test_touch_of_an_imprint_is_the_frames(crop):
+def test_touch_equals_the_tactile_image_of_the_same_imprint(crop):
     skin = sts.tactile.Skin(coupling=0.0004, shadow_steps=8)
     sensor = sts.Sensor(lights=sts.tactile.Leds(), skin=skin)
     body = objects.make(jax.random.key(3), "watch")
@@ -265,20 +265,20 @@ def test_touch_of_an_imprint_is_the_frames(crop):
     frame = sense(sensor, body, pose, resolution=(150, 200), crop=crop)
     imprint = jnp.maximum(sensor.camera.distance - frame.depth, 0)
     drawn = sts.touch(sensor, imprint, frame.window)
-    inner = np.s_[6:-6, 6:-6]  # a frame includes the imprint beyond its border, and its shadow
+    inner = np.s_[6:-6, 6:-6]  # near its border, a frame also shows effects of the imprint beyond it
     np.testing.assert_allclose(np.asarray(drawn)[inner], np.asarray(frame.tactile)[inner], atol=2e-3)
     if not crop:
         np.testing.assert_array_equal(sts.touch(sensor, imprint), sts.touch(sensor, imprint, frame.window))
 
 
-def test_touch_has_no_nan_of_an_imprint_that_has():
+def test_touch_of_an_imprint_with_nan_is_finite():
     imprint = jnp.full((20, 30), jnp.nan).at[5:9, 6:12].set(0.1)
     assert np.isfinite(np.asarray(sts.touch(sts.Sensor(), imprint))).all()
 
 
 @pytest.mark.slow
-def test_a_touchs_derivative_is_the_finite_difference_at_upright_walls_too():
-    # On the average over pixels: what is compared is smoothed, and its differences are a mean over several steps.
+def test_moving_edges_derivative_equals_finite_differences_at_upright_walls():
+    # The derivative is accurate on average over pixels. The images are smoothed, and differences averaged over steps.
     sensor = dataclasses.replace(SENSOR, skin=sts.tactile.Skin(coupling=0.001))
     body, resolution, pitch = letter(), (120, 120), jnp.full(2, 0.15 / 120)
 
@@ -299,20 +299,20 @@ def test_a_touchs_derivative_is_the_finite_difference_at_upright_walls_too():
         assert float(lengths[0] / lengths[1]) == pytest.approx(1, abs=0.05)
 
 
-def test_one_program_serves_bodies_that_collide_and_hold_otherwise():
+def test_bodies_with_other_hulls_and_contents_share_a_compilation():
     body, other = (sts.objects.make(jax.random.key(0), category) for category in ("bottle", "fork"))
     other = dataclasses.replace(other, hulls=other.hulls[:, :32], interior=other.interior[:8])
     assert body.hulls.shape != other.hulls.shape
     pose = jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))
-    before = frame_module._balance._cache_size(), frame_module._draw._cache_size()
+    before = equilibrium.balance._cache_size(), drawing.draw._cache_size()
     sts.sense(dataclasses.replace(SENSOR, phong=tactile.Phong(ambient=0.7)), other, pose, resolution=(24, 24))
-    assert (frame_module._balance._cache_size(), frame_module._draw._cache_size()) == before
+    assert (equilibrium.balance._cache_size(), drawing.draw._cache_size()) == before
 
 
-def test_another_resolution_compiles_the_drawing_alone():
+def test_another_resolution_compiles_only_the_drawing():
     body, pose = sts.objects.make(jax.random.key(0), "bottle"), jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))
-    before = frame_module._balance._cache_size()
+    before = equilibrium.balance._cache_size()
     sts.sense(SENSOR, body, pose, resolution=(2, 3))
-    assert frame_module._balance._cache_size() == before
+    assert equilibrium.balance._cache_size() == before

@@ -1,4 +1,4 @@
-"""The image at any light between the two streams, against a loop in NumPy float64."""
+"""Images at any light between the two streams, against a loop in NumPy float64."""
 
 import dataclasses
 import inspect
@@ -20,7 +20,7 @@ def with_exposure(value):
 
 
 def noise(shape, seed=0):
-    """A frame of random images with black and white in them."""
+    """A frame of random images with black and white pixels."""
     rng = np.random.default_rng(seed)
     images = rng.uniform(size=(2, *shape, 3)).astype(np.float32)
     images[rng.uniform(size=images.shape) < 0.05] = 0
@@ -50,14 +50,14 @@ def encode(x):
 @pytest.mark.slow
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
 @pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
-def test_the_streams_are_the_ends_to_the_last_bit(shape, exposure):
+def test_light_0_and_1_return_the_streams_exactly(shape, exposure):
     frame, sensor = noise(shape), with_exposure(exposure)
     for call in (expose, sts.expose):
         assert np.array_equal(call(sensor, frame, 0.0), frame.visual)
         assert np.array_equal(call(sensor, frame, 1.0), frame.tactile)
 
 
-def test_the_streams_of_a_pressed_object_are_the_ends():
+def test_half_light_of_a_pressed_object_lies_between_the_streams():
     body = objects.make(jax.random.key(0), "mouse")
     low = float(jnp.min(body.vertices[:, 2]))
     frame = jax.jit(sts.sense)(SENSOR, body, jnp.array([0.0, 0.0, -low - 3e-4, 1.0, 0.0, 0.0, 0.0]))
@@ -70,21 +70,21 @@ def test_the_streams_of_a_pressed_object_are_the_ends():
 
 @pytest.mark.parametrize("exposure", [1.0, 6.0])
 @pytest.mark.parametrize("shape", [(64, 64), (97, 53), (200, 200), (1232, 1640)])
-def test_light_adds_up_in_linear_units(shape, exposure):
+def test_light_is_added_in_linear_units(shape, exposure):
     frame = noise(shape)
     rng = np.random.default_rng(1)
     for light in (1e-3, 0.2, 0.5, 0.9):
         image = np.asarray(expose(with_exposure(exposure), frame, light))
         for i, j, k in zip(*(rng.integers(n, size=200) for n in (*shape, 3)), strict=True):
             seen, felt = float(frame.visual[i, j, k]), float(frame.tactile[i, j, k])
-            # seconds of exposure: `exposure` with the LEDs off, 1 at full power
+            # The exposure time is `exposure` with the LEDs off, and 1 at full power.
             outside, leds_on = decode(seen) / exposure, decode(felt)
             radiance = outside + light * (leds_on - outside)
-            grey = 1 / exposure + light * (1 - 1 / exposure)  # of what shows as 1 in both streams
+            grey = 1 / exposure + light * (1 - 1 / exposure)  # of a pixel that is 1 in both streams
             assert image[i, j, k] == pytest.approx(encode(radiance / grey), abs=2e-6)
 
 
-def test_more_light_is_more_touch_where_that_is_brighter():
+def test_pixels_change_monotonically_with_light():
     frame = noise((64, 64))
     images = np.stack([expose(with_exposure(3.0), frame, light) for light in np.linspace(0, 1, 9)])
     brighter = np.asarray(frame.tactile > frame.visual)
@@ -92,7 +92,7 @@ def test_more_light_is_more_touch_where_that_is_brighter():
     assert np.all(np.diff(images, axis=0)[:, ~brighter] <= 1e-6)
 
 
-def test_gradients_are_the_finite_differences_and_finite_at_the_ends():
+def test_gradients_equal_finite_differences_and_are_finite_at_0_and_1():
     frame = noise((97, 53))
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(97, 53, 3)), jnp.float32)
 
@@ -117,7 +117,7 @@ def test_gradients_are_the_finite_differences_and_finite_at_the_ends():
     along = jnp.where(inner, weights, 0)
     there, back = value(0.3, 4.0, frame.visual + 0.01 * along), value(0.3, 4.0, frame.visual - 0.01 * along)
     assert float(jnp.sum(by_visual * along)) == pytest.approx(float(there - back) / 0.02, rel=0.01)
-    # at an end the image is the stream itself, so its derivative is 1
+    # At 0 and 1 the image is the stream itself, so its derivative is 1.
     at_end = gradient(0.0, 4.0, frame.visual)[2]
     np.testing.assert_allclose(np.asarray(at_end)[inner], np.asarray(weights / weights.size)[inner], rtol=1e-4)
     assert float(jnp.abs(gradient(0.0, 4.0, frame.visual)[0])) > 0
@@ -135,19 +135,19 @@ def test_vmap_over_frames_and_over_lights():
 
 
 @pytest.mark.parametrize("light", [-0.1, 1.1, np.nan, np.float32(2), np.inf])
-def test_a_light_that_is_no_share_is_named(light):
+def test_light_outside_0_to_1_raises_an_error(light):
     with pytest.raises(ValueError, match=r"light is .*from 0 \(visual\) to 1 \(tactile\)"):
         sts.expose(SENSOR, noise((8, 8)), light)
 
 
-def test_several_lights_at_once_are_named():
+def test_an_array_of_lights_raises_an_error():
     several = inspect.unwrap(sts.expose)  # without the tests' own checks of shapes
     for call in (several, jax.jit(several)):
         with pytest.raises(ValueError, match=r"light has the shape \(3,\).*vmap"):
             call(SENSOR, noise((3, 8, 8)), jnp.array([0.0, 0.5, 1.0]))
 
 
-def test_under_jit_it_is_clipped_and_never_nan():
+def test_a_traced_light_is_clipped_and_never_gives_nan():
     frame = noise((64, 64))
     for light, stream in ((-0.5, frame.visual), (np.nan, frame.visual), (1.5, frame.tactile), (np.inf, frame.tactile)):
         assert np.array_equal(expose(SENSOR, frame, light), stream)

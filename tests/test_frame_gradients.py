@@ -1,8 +1,8 @@
 """Derivatives of whole frames by pose, wrench and every constant, against finite differences in float64.
 
-A pixel has a derivative where the differences forward and backward agree. Where they do not, another face comes to be
-seen, the skin begins to be touched, or a light or a value meets its limit, all within the step: such pixels are left
-out, and there are few of them.
+A pixel has a derivative where the forward and the backward difference agree. They differ where, within the step,
+another face becomes visible, the skin is touched, or a light or a value reaches its limit. These pixels are left out,
+and there are few of them.
 """
 
 import dataclasses
@@ -21,22 +21,22 @@ from sts_jax import optics, tactile
 pytestmark = pytest.mark.slow
 
 SHAPE = (40, 40)
-STEP = 1e-5  # of what a parameter is moved by to be seen
-RELATIVE = 3e-3  # the gel's implicit derivative is damped by as much: `_newton` adds 1e-5 to its matrix
-FLOOR = 1e-6  # of a value, which is about 1, per such a move
-SETTLED = 1e-4  # the same by a pose, much of which the gel takes back
-# What a pose and a wrench are moved by: m, quaternion, N, N m.
+STEP = 1e-5  # length of a step, over a visible change of the parameter
+RELATIVE = 3e-3  # the gel's implicit derivative is damped by about this share: `_newton` adds 1e-5 to its matrix
+FLOOR = 1e-6  # error of a value, which is about 1, per visible change
+SETTLED = 1e-4  # error for a change of the pose, most of which the gel compensates
+# Visible changes of a pose and of a wrench: m, quaternion, N, N m.
 UNITS = np.array([1e-3] * 3 + [0.05] * 4), np.array([0.1] * 3 + [1e-3] * 3)
 
-# Off the gel's plane: in it flat skin is at the edge of light, where no derivative is.
+# Off the gel's plane. With lights in this plane, flat skin is at the edge of light and has no derivative.
 FAR = tactile.Lights(directions=jnp.array([[-1.0, 0.1, -0.2], [1, 0, -0.1], [0.2, -1, -0.1], [0.1, 1, -0.3]]))
-COLORS = 0.05 + 0.3 * FAR.colors  # inside their range, as the room's tint
+COLORS = 0.05 + 0.3 * FAR.colors  # inside of their range, like the tint below
 FAR = dataclasses.replace(FAR, colors=COLORS)
 NEAR = tactile.Leds(colors=COLORS, falloff=1.5)
-GEL = tactile.Gel(size=(0.13, 0.12))  # the housing's walls are seen
+GEL = tactile.Gel(size=(0.13, 0.12))  # the housing's walls are visible
 ROOM = optics.Room(tint=jnp.array([0.8, 0.85, 0.95]))
 SKIN = tactile.Skin(coupling=0.001, shadow_steps=6, shadow_reach=0.02, penumbra=0.3)
-DIM = tactile.Phong(ambient=0.5)  # nothing reaches 1, where pixels end
+DIM = tactile.Phong(ambient=0.5)  # no pixel reaches 1, where it would be clipped
 SENSORS = {
     name: sts.Sensor(gel=GEL, lights=lights, skin=SKIN, phong=DIM, room=ROOM)
     for name, lights in (("far", FAR), ("near", NEAR))
@@ -49,7 +49,7 @@ def strict_ranks():
         yield
 
 
-# Of one class: what is compiled for the one serves the other.
+# Both have one size class and share a program.
 BALL = from_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=0.025))
 BOX = from_trimesh(trimesh.creation.box((0.05, 0.04, 0.02)).subdivide().subdivide().subdivide().subdivide())
 
@@ -63,7 +63,7 @@ def weight(force, x, y):
 
 
 def seen(sensor, body, pose, wrench, crop):
-    """All that a frame says that can have a derivative."""
+    """All values of a frame that can have a derivative."""
     frame = sts.sense(sensor, body, pose, wrench, resolution=SHAPE, crop=crop)
     x, y = tactile.cell_centres(sensor.gel)
     force = frame.pressure * tactile.cell_area(sensor.gel)
@@ -78,7 +78,7 @@ def seen(sensor, body, pose, wrench, crop):
 
 @functools.partial(jax.jit, static_argnames="crop")
 def pushed(point, body, tangent, crop):
-    """The frame's values, and their derivatives along a tangent of (sensor, pose, wrench)."""
+    """Values of the frame, and their derivatives along a tangent of (sensor, pose, wrench)."""
     return jax.jvp(lambda sensor, pose, wrench: seen(sensor, body, pose, wrench, crop), point, tangent)
 
 
@@ -89,7 +89,7 @@ def weights(like):
 
 @jax.jit
 def slopes(sensor, pose, wrench, body):
-    """Gradient of a weighted sum of all values, in reverse."""
+    """Gradient of a weighted sum of all values, by reverse-mode differentiation."""
 
     def total(*point):
         values = seen(point[0], body, *point[1:], False)
@@ -107,7 +107,7 @@ def double(tree):
 
 
 def directions(point):
-    """Each leaf's name and a tangent along it alone, as long as what it is moved by to be seen."""
+    """Name of each leaf, and a tangent along this leaf alone, as long as a visible change of it."""
     leaves, structure = jax.tree.flatten(point)
     names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(point)]
     for index, (name, leaf) in enumerate(zip(names, leaves, strict=True)):
@@ -124,7 +124,7 @@ def directions(point):
 
 
 def compare(point, body, crop):
-    """Of every leaf and stream: the derivative, the difference, and where there is one."""
+    """For every leaf and stream: derivative, finite difference, and a mask of the values that have a derivative."""
     with jax.enable_x64(True):
         point, body = double(point), double(body)
         for name, tangent in directions(point):
@@ -140,14 +140,14 @@ def compare(point, body, crop):
                 yield name, stream, np.asarray(slope), numeric, defined
 
 
-# What changes nothing within its limits, or takes no part.
+# Leaves that change nothing within their limits, or that are not used.
 STILL = {f"[0].{leaf}[0]" for leaf in ("camera.aspect", "camera.near", "gel.thickness", "gel.max_depth")}
 STILL |= {"[0].gel.max_tilt[0]", "[0].gel.tolerance[0]", "[0].room.exposure[0]", "[2][0]", "[2][1]", "[2][5]"}
-# Sensor, body, pose, wrench, crop, and what more does nothing there.
+# Sensor, body, pose, wrench, crop, and further leaves that change nothing there.
 POINTS = {
-    # a contact's edge runs through tiles of the image, and off the directions of grids and pixels
+    # The edge of the contact runs through tiles of the image, and not along the grids.
     "ball": ("far", BALL, at(0.0031, -0.0022, 0.0249, (1, 0.1, 0.05, 0.2)), weight(0.5, 0.003, -0.002), False, set()),
-    # a face that lies flat on the gel: the imprint is the same all over it
+    # A face lies flat on the gel, so the imprint is uniform.
     "flat box": (
         "far",
         BOX,
@@ -169,7 +169,7 @@ POINTS = {
 
 
 @pytest.mark.parametrize("name", POINTS)
-def test_derivatives_are_the_differences(name):
+def test_derivatives_equal_finite_differences(name):
     sensor, body, pose, wrench, crop, more = POINTS[name]
     leaves, moving = set(), set()
     for leaf, stream, slope, numeric, defined in compare((SENSORS[sensor], pose, wrench), body, crop):
@@ -202,11 +202,11 @@ FINITE = {
 }
 
 
-def test_gradients_by_all_leaves_are_finite_everywhere():
+def test_gradients_by_all_leaves_are_finite():
     sensor = SENSORS["far"]
-    # The paper's lights, in the gel's plane, too.
+    # Also the paper's lights, which lie in the gel's plane.
     plane = dataclasses.replace(sensor, lights=tactile.Lights())
-    soft = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, stiffness=0.0))  # cannot be
+    soft = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, stiffness=0.0))  # invalid
     for words, (body, pose, wrench) in FINITE.items():
         for given in (sensor, plane, soft):
             found = slopes(given, pose, wrench, body)

@@ -1,4 +1,4 @@
-"""What `sense` refuses, and what it does where a sensor that cannot be is traced; meshes with too many faces."""
+"""Invalid inputs of `sense`, `touch` and `expose`: errors for concrete values, finite images for traced ones."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from optics_bodies import from_trimesh
 import sts_jax as sts
 from sts_jax import objects, tactile
 
-# As its users call it: without the tests' own checks of types and shapes.
+# Without the tests' own checks of types and shapes, as users call them.
 sense, touch, expose = (inspect.unwrap(call) for call in (sts.sense, sts.touch, sts.expose))
 SENSOR = sts.Sensor()
 BODY = from_trimesh(trimesh.creation.box((0.05, 0.03, 0.02)))
@@ -26,7 +26,7 @@ IMAGES = ("visual", "tactile", "pressure", "window", "pose")
 @pytest.mark.parametrize(
     "resolution", [(0, 64), (64, -1), (64.0, 64), (64,), (64, 64, 3), 64, "64x64", None, (float("nan"), 64)]
 )
-def test_a_resolution_that_cannot_be_is_named(resolution):
+def test_an_invalid_resolution_raises_an_error(resolution):
     draw = functools.partial(sense, resolution=resolution)
     for call in (draw, jax.jit(draw)):
         with pytest.raises(ValueError, match=r"resolution is .*whole numbers of pixels"):
@@ -34,21 +34,21 @@ def test_a_resolution_that_cannot_be_is_named(resolution):
 
 
 @pytest.mark.parametrize("shape", [(), (6,), (8,), (1, 7), (3, 7)])
-def test_a_pose_of_another_shape_is_named(shape):
+def test_a_pose_of_another_shape_raises_an_error(shape):
     for call in (sense, jax.jit(sense)):
         with pytest.raises(ValueError, match=r"pose has the shape .*\(7,\).*vmap"):
             call(SENSOR, BODY, jnp.zeros(shape), WRENCH)
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (7,), (2, 6)])
-def test_a_wrench_of_another_shape_is_named(shape):
+def test_a_wrench_of_another_shape_raises_an_error(shape):
     for call in (sense, jax.jit(sense)):
         with pytest.raises(ValueError, match=r"wrench has the shape .*\(6,\).*vmap"):
             call(SENSOR, BODY, POSE, jnp.zeros(shape))
 
 
 @pytest.mark.slow
-def test_lists_and_tuples_of_numbers_are_taken():
+def test_lists_and_tuples_of_numbers_are_accepted():
     frame = sense(SENSOR, BODY, POSE, WRENCH)
     listed = sense(SENSOR, BODY, POSE.tolist(), tuple(WRENCH.tolist()))
     np.testing.assert_array_equal(listed.tactile, frame.tactile)
@@ -57,13 +57,13 @@ def test_lists_and_tuples_of_numbers_are_taken():
 
 
 @pytest.mark.slow
-def test_the_pose_drawn_has_no_negative_w():
+def test_the_quaternion_of_a_frame_has_w_at_least_0():
     for pose in (POSE.at[3].set(-1), POSE.at[3:].set(jnp.array([-0.01, 1, 0, 0]))):
         frame = sense(SENSOR, BODY, pose, WRENCH)
         assert float(frame.pose[3]) >= 0
 
 
-def test_a_body_with_too_many_faces_is_refused():
+def test_a_body_with_too_many_faces_raises_an_error():
     number = objects.FACE_CLASSES[-1] + 1
     many = {name: jnp.zeros((number, *getattr(BODY, name).shape[1:])) for name in ("normals", "colors", "uv")}
     body = dataclasses.replace(BODY, faces=jnp.zeros((number, 3), jnp.int32), **many)
@@ -72,7 +72,7 @@ def test_a_body_with_too_many_faces_is_refused():
             call(SENSOR, body, POSE, WRENCH)
 
 
-def test_what_is_no_sensor_or_body_is_named():
+def test_other_types_than_sensor_and_body_raise_an_error():
     cases = [
         ((SENSOR, "mug.obj"), r"body is 'mug\.obj', but it must be one Body\. objects\.load reads a mesh file"),
         ((SENSOR, [BODY, BODY]), r"body is .*, but it must be one Body\. For several use objects\.stack and jax\.vmap"),
@@ -90,7 +90,7 @@ def test_what_is_no_sensor_or_body_is_named():
             call(None, jnp.zeros((4, 4)), 0.5)
 
 
-def test_what_is_no_array_of_numbers_is_named():
+def test_other_types_than_arrays_of_numbers_raise_an_error():
     cases = [
         (
             lambda: sense(SENSOR, BODY, sts.physics.rest.Placement(POSE, WRENCH)),
@@ -108,7 +108,7 @@ def test_what_is_no_array_of_numbers_is_named():
 
 
 @pytest.mark.parametrize("field", ["vertices", "normals", "colors"])
-def test_a_known_body_with_a_value_that_is_not_finite_is_an_error(field):
+def test_a_concrete_body_with_a_non_finite_value_raises_an_error(field):
     bad = dataclasses.replace(BODY, **{field: getattr(BODY, field).at[7, 1].set(jnp.nan)})
     for call in (sense, jax.jit(functools.partial(sense, SENSOR, bad))):
         with pytest.raises(ValueError, match=rf"{field} has \d values that are not finite.*repair the mesh"):
@@ -116,7 +116,7 @@ def test_a_known_body_with_a_value_that_is_not_finite_is_an_error(field):
 
 
 @pytest.mark.slow
-def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_sensor():
+def test_an_invalid_traced_body_or_pose_gives_the_empty_sensor():
     draw = jax.jit(functools.partial(sense, resolution=(16, 16)))
     gone = draw(SENSOR, BODY, POSE.at[2].set(-1), WRENCH)
     fields = {name: getattr(BODY, name).at[7, 1].set(jnp.nan) for name in ("vertices", "normals", "colors")}
@@ -131,7 +131,7 @@ def test_a_body_or_pose_that_the_compiled_program_cannot_draw_gives_the_empty_se
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.bool_, np.int32])
-def test_an_imprint_of_whole_numbers_is_refused(kind):
+def test_an_imprint_of_whole_numbers_raises_an_error(kind):
     imprint = np.ones((5, 6), kind)
     for call in (touch, jax.jit(touch)):
         with pytest.raises(ValueError, match=rf"imprint has the type {np.dtype(kind)}, .* metres"):
@@ -155,7 +155,7 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize(("sensor", "field", "value"), IMPOSSIBLE)
-def test_a_known_sensor_that_cannot_be_is_an_error(sensor, field, value):
+def test_an_invalid_concrete_sensor_raises_an_error(sensor, field, value):
     bad = with_field(sensor, field, value)
     with pytest.raises(ValueError, match=f"field {field}") as checked:
         bad.check()
@@ -184,7 +184,7 @@ def possible(sensor):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
-def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(lights):
+def test_an_invalid_traced_sensor_gives_an_unbalanced_frame_with_finite_images(lights):
     start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
     assert bool(traced(start, POSE).balanced)
     empty = traced(start, POSE.at[2].set(-1))
@@ -198,19 +198,19 @@ def test_a_traced_sensor_that_cannot_be_lowers_the_flag_and_spoils_no_image(ligh
             words = f"{jax.tree_util.keystr(path)} is {value}"
             assert all(np.all(np.isfinite(getattr(frame, name))) for name in IMAGES), words
             if possible(sensor):
-                assert np.any(frame.segmentation) or value == 10, words  # from 10 m away it is smaller than a pixel
+                assert np.any(frame.segmentation) or value == 10, words  # at 10 m it is smaller than a pixel
             else:
                 assert not np.any(frame.segmentation), words
                 refused += 1
                 assert not bool(frame.balanced), words
                 np.testing.assert_allclose(frame.visual, empty.visual, atol=1e-6)
                 np.testing.assert_allclose(frame.tactile, empty.tactile, atol=1e-6)
-    assert refused > 3 * len(leaves)  # of six: three are not finite
+    assert refused > 3 * len(leaves)  # three of the six values are not finite
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), tactile.Leds()], ids=["far", "near"])
-def test_touch_and_light_between_have_no_nan_of_a_traced_sensor_that_cannot_be(lights):
+def test_touch_and_expose_are_finite_for_an_invalid_traced_sensor(lights):
     start = dataclasses.replace(SENSOR, lights=lights, skin=tactile.Skin(coupling=0.001, shadow_steps=4))
     frame = traced(start, POSE)
     imprint = jnp.zeros((24, 32)).at[8:14, 10:20].set(5e-4)
@@ -231,7 +231,7 @@ def test_touch_and_light_between_have_no_nan_of_a_traced_sensor_that_cannot_be(l
 
 
 @pytest.mark.slow
-def test_leds_that_fall_off_steeply_have_no_nan():
+def test_steep_falloff_of_leds_gives_finite_images():
     steep = dataclasses.replace(SENSOR, lights=tactile.Leds(falloff=50.0))
     imprint = jnp.zeros((60, 80)).at[3:14, 1:20].set(5e-4)
     assert np.all(np.isfinite(touch(steep, imprint)))
@@ -239,14 +239,14 @@ def test_leds_that_fall_off_steeply_have_no_nan():
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (5, 6, 3), (0, 4)])
-def test_an_imprint_that_is_no_image_is_named(shape):
+def test_an_imprint_of_another_shape_raises_an_error(shape):
     for call in (touch, jax.jit(touch)):
         with pytest.raises(ValueError, match=r"imprint has the shape .*\(height, width\).*vmap"):
             call(SENSOR, jnp.zeros(shape))
 
 
 @pytest.mark.parametrize("bad", [(0, 0, 0, 0.1), (0, 0, 0.1, -0.1), (np.nan, 0, 0.1, 0.1), (0, 0, np.inf, 0.1)])
-def test_a_window_that_cannot_be_is_named_and_traced_is_the_whole_view_of_a_flat_skin(bad):
+def test_an_invalid_window_raises_an_error_and_a_traced_one_shows_flat_skin(bad):
     imprint = jnp.zeros((24, 32)).at[8:14, 10:20].set(5e-4)
     bad = jnp.array(bad, jnp.float32)
     with pytest.raises(ValueError, match=r"window is .*finite left, top, width, height"):
@@ -257,7 +257,7 @@ def test_a_window_that_cannot_be_is_named_and_traced_is_the_whole_view_of_a_flat
 
 
 def stl_of_a_million(path):
-    """A ball of a thousand rings, without any help of a library that would take its time."""
+    """A ball of a thousand rings, written with NumPy, which is faster than a mesh library."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, 1002), np.linspace(0, 2 * np.pi, 502), indexing="ij")
     points = 0.04 * np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
     a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
@@ -269,7 +269,7 @@ def stl_of_a_million(path):
 
 
 @pytest.mark.slow
-def test_a_mesh_of_a_million_faces_is_refused_or_decimated_with_a_line(tmp_path):
+def test_a_mesh_of_a_million_faces_raises_an_error_or_is_decimated_with_a_warning(tmp_path):
     path = tmp_path / "ball.stl"
     number = stl_of_a_million(path)
     assert number > 1_000_000
@@ -278,5 +278,5 @@ def test_a_mesh_of_a_million_faces_is_refused_or_decimated_with_a_line(tmp_path)
     with pytest.warns(UserWarning, match=r"ball\.stl: decimated from 1,00\d,\d{3} to [\d,]+ faces"):
         body = objects.load(path, faces=4096)
     assert body.faces.shape == (4096, 3)
-    # From a million to four thousand at once it grows: here by 4 %, of 20,480 faces by less than 0.5 %.
+    # Decimation from a million to four thousand faces enlarges the ball by 4 %. From 20,480 faces it is below 0.5 %.
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0), 0.08, rtol=0.05)

@@ -1,4 +1,4 @@
-"""Sink, pressure and drawn imprint of objects at rest within 5 %, whatever the image's size, its crop and the grid."""
+"""Depth, pressure and imprint of objects at rest agree within 5 % for all image sizes, crops and grids."""
 
 import dataclasses
 import functools
@@ -23,19 +23,19 @@ RADIUS = 0.03  # m
 FORCE = 0.5  # N, on the sphere
 SIZES = (64, 200, 640)  # as in test_frame.py: one program each
 NAMES = ("sphere", "bottle", "scissors", "box")
-sense = sts.sense  # compiles itself: one equilibrium serves every resolution
+sense = sts.sense  # compiled: one equilibrium program serves every resolution
 
 
 @functools.cache
 def rest(name):
-    """An object, its pose in first touch, off the middle and off the cells' directions, and what carries it."""
-    if name == "sphere":  # of rings that are fine where it touches
+    """An object, its pose at first touch, off the centre and turned against the grid, and the wrench on it."""
+    if name == "sphere":  # of rings that are fine where it touches the gel
         angle = np.radians([*range(0, 27, 2), 60, 120, 180])
         profile = RADIUS * np.stack([np.sin(angle), -np.cos(angle)], -1)
         body = from_trimesh(trimesh.creation.revolve(profile, sections=32))
         x, y = 0.0113, -0.0071
         return body, np.array([x, y, RADIUS, 1, 0, 0, 0]), np.array([0, 0, FORCE, FORCE * y, -FORCE * x, 0])
-    if name == "cone":  # on its point, between four cells of either grid
+    if name == "cone":  # standing on its point, between four cells of both grids
         mesh = trimesh.creation.cone(0.02, 0.02, sections=64)
         mesh.apply_transform(np.diag([1, -1, -1, 1]))
         mesh.apply_translation((0, 0, 0.02))
@@ -56,12 +56,12 @@ def seen(name, sensor, size, crop=False):
 
 
 def heights(name, frame):
-    """Of the object's vertices in the balanced pose (m)."""
+    """Heights of the object's vertices in the balanced pose (m)."""
     return np.asarray(geometry.transform(jnp.asarray(frame.pose), rest(name)[0].vertices))[:, 2]
 
 
 def figures(name, sensor):
-    """Sink, deepest and mean spring (m) and contact area (m^2), and the frame."""
+    """Motion, deepest and mean compression (m) and contact area (m^2), and the frame."""
     frame = seen(name, sensor, 64)
     lengths = frame.pressure / sensor.gel.stiffness
     area = np.sum(lengths > 0) * float(tactile.cell_area(sensor.gel))
@@ -80,10 +80,10 @@ def test_grids_of_1_and_half_a_millimetre_agree(name):
             np.testing.assert_allclose(found[:3], [depth, depth, depth / 2], rtol=0.05)
 
 
-def test_a_point_between_the_cells_is_the_exception():
-    # It presses its full depth on no cell: the deepest spring is a cell's half diagonal short of it, of 2.12 mm a third
-    # on 1 mm and a sixth on 0.5 mm cells, 20 % apart. It sinks as deep on both all the same; and the picture, whose
-    # pixels are 2.3 mm apart and have the point between them, is not of the grid.
+def test_a_point_between_cells_presses_less_deeply_on_a_coarse_grid():
+    # No cell is compressed by the full depth of 2.12 mm. The deepest one is half a cell's diagonal away from the point,
+    # which costs a third of the depth on cells of 1 mm and a sixth on cells of 0.5 mm. The object sinks equally deep on
+    # both grids. The image does not depend on the grid. Its pixels are 2.3 mm apart, with the point between them.
     (coarse, one), (fine, _) = (figures("cone", sensor) for sensor in (SENSOR, FINE))
     depth = (3 * 0.02 / (np.pi * SENSOR.gel.stiffness)) ** (1 / 3)
     np.testing.assert_allclose([coarse[0], fine[0]], depth, rtol=0.005)
@@ -93,12 +93,12 @@ def test_a_point_between_the_cells_is_the_exception():
 
 
 def imprint(frame):
-    """Depth of the drawn imprint (m), 0 where there is none."""
+    """Depth of the drawn imprint (m), 0 outside of it."""
     return np.clip(np.nan_to_num(SENSOR.camera.distance - frame.depth, neginf=0), 0, None)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_images_of_all_sizes_whole_and_cropped_agree(name):
+def test_whole_and_cropped_images_of_all_sizes_agree(name):
     finest = seen(name, SENSOR, 640, crop=True)
     fine = imprint(finest)
     left, top, width, height = finest.window
@@ -110,10 +110,10 @@ def test_images_of_all_sizes_whole_and_cropped_agree(name):
             depth, middles = imprint(frame), (np.arange(size) + 0.5) / size
             volume = depth.sum() * np.prod(frame.window[2:] / size)
             assert volume == pytest.approx(fine.sum() * width * height / 640**2, rel=0.05)
-            # A sample of few has its deepest somewhere beside the ridge of the blades.
+            # At few pixels, the deepest one lies beside the ridge of the blades.
             sharp = name == "scissors" and size == 64 and not crop
             assert depth.max() / fine.max() == pytest.approx(0.928 if sharp else 1, abs=0.01 if sharp else 0.05)
-            # At each pixel as deep as one of the finest image's four around its place, or between them.
+            # Each pixel is as deep as the four pixels of the finest image around its place, or between them.
             x = (frame.window[0] + middles * frame.window[2] - left) / width * 640 - 0.5
             y = (frame.window[1] + middles * frame.window[3] - top) / height * 640 - 0.5
             rows, columns = ((v >= 0) & (v < 639) for v in (y, x))

@@ -1,4 +1,4 @@
-"""Rotations and poses against SciPy's and against 4x4 matrices; gradients against differences."""
+"""Rotations and poses against SciPy and 4x4 matrices, gradients against finite differences."""
 
 import inspect
 
@@ -33,7 +33,7 @@ def poses(num, seed=0):
     return jnp.concatenate([jnp.asarray(places, jnp.float32), quats], -1), matrices
 
 
-def test_quaternions_are_scipys():
+def test_quaternions_agree_with_scipy():
     turns, quats = rotations(200)
     others, more = rotations(200, seed=1)
     np.testing.assert_allclose(geometry.quat_to_matrix(quats), turns.as_matrix(), atol=1e-6)
@@ -46,7 +46,7 @@ def test_quaternions_are_scipys():
     np.testing.assert_allclose(geometry.quat_canonical(-quats)[4:], quats[4:], atol=1e-6)
 
 
-def test_rotation_vectors_go_there_and_back():
+def test_rotation_vectors_survive_a_round_trip():
     turns, quats = rotations(200)
     vectors = np.concatenate([turns.as_rotvec()[4:], 1e-5 * turns.as_rotvec()[4:]]).astype(np.float32)
     expected = Rotation.from_rotvec(vectors)
@@ -56,7 +56,7 @@ def test_rotation_vectors_go_there_and_back():
     np.testing.assert_allclose(geometry.norm(geometry.quat_to_rotvec(quats)), turns.magnitude(), atol=1e-6)
 
 
-def test_matrices_go_there_and_back():
+def test_matrices_survive_a_round_trip():
     turns, _ = rotations(200)
     got = geometry.quat_from_matrix(jnp.asarray(turns.as_matrix(), jnp.float32))
     assert np.all(got[:, 0] >= 0)
@@ -74,7 +74,7 @@ def test_poses_compose_as_matrices_do():
     np.testing.assert_allclose(geometry.pose_to_matrix(geometry.pose_inverse(left)), np.linalg.inv(a), atol=5e-6)
 
 
-def test_any_matrix_gives_the_nearest_rotation_by_singular_values():
+def test_quaternion_of_any_matrix_is_the_nearest_rotation():
     rng = np.random.default_rng(2)
     matrix = rng.normal(size=(500, 3, 3))
     left, _, right = np.linalg.svd(matrix)
@@ -82,7 +82,7 @@ def test_any_matrix_gives_the_nearest_rotation_by_singular_values():
     quat = geometry.quat_from_matrix(jnp.asarray(matrix, jnp.float32))
     assert np.all(quat[:, 0] >= 0)
     values = np.linalg.svd(matrix, compute_uv=False)
-    clear = values[:, 1] - values[:, 2] > 0.05  # elsewhere two rotations may be equally near
+    clear = values[:, 1] - values[:, 2] > 0.05  # otherwise two rotations may be equally near
     np.testing.assert_allclose(geometry.quat_to_matrix(quat)[clear], (left @ right)[clear], atol=2e-4)
 
 
@@ -95,7 +95,7 @@ def test_transform_rotates_then_shifts():
 
 
 @pytest.mark.parametrize("vector", [(0.0, 0.0, 0.0), (1e-4, 0.0, -2e-4), (0.3, -1.2, 0.5), (0.0, 3.0, 0.0)])
-def test_the_gradient_through_a_matrix_and_back_is_that_of_differences(vector):
+def test_the_gradient_of_a_round_trip_through_a_matrix_is_the_identity(vector):
     def round_trip(v):
         quat = geometry.quat_from_matrix(geometry.quat_to_matrix(geometry.quat_from_rotvec(v)))
         return geometry.quat_to_rotvec(quat)
@@ -130,10 +130,10 @@ def test_the_gradient_through_a_matrix_and_back_is_that_of_differences(vector):
         ("pose_inverse", ("upright",), r"pose is 'upright', but it must be an array of \(..., 7\) numbers"),
     ],
 )
-def test_an_array_of_another_shape_is_named(name, given, message):
+def test_an_array_of_another_shape_raises_an_error(name, given, message):
     with pytest.raises(ValueError, match=message):
         inspect.unwrap(getattr(geometry, name))(*given)
 
 
-def test_lists_of_numbers_are_taken():
+def test_lists_of_numbers_are_accepted():
     np.testing.assert_allclose(inspect.unwrap(geometry.transform)([1, 2, 3, 0, 0, 0, 1], [1, 0, 0]), [0, 2, 3])

@@ -1,4 +1,4 @@
-"""The pinhole's geometry, by hand."""
+"""Geometry of the pinhole against values computed by hand."""
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +19,8 @@ def strict_ranks():
 @pytest.mark.parametrize(
     ("resolution", "window"),
     [
-        ((480, 640), (-0.1, -0.075, 0.2, 0.15)),  # the native aspect shows everything
-        ((64, 64), (-0.075, -0.075, 0.15, 0.15)),  # a square one the pad, edge to edge
+        ((480, 640), (-0.1, -0.075, 0.2, 0.15)),  # the native aspect ratio shows the whole view
+        ((64, 64), (-0.075, -0.075, 0.15, 0.15)),  # a square image shows the pad from edge to edge
         ((100, 50), (-0.0375, -0.075, 0.075, 0.15)),
         ((50, 200), (-0.1, -0.025, 0.2, 0.05)),
     ],
@@ -29,7 +29,7 @@ def test_an_image_shows_the_largest_centred_part(resolution, window):
     np.testing.assert_allclose(optics.full_window(CAMERA, resolution), window, atol=1e-6)
 
 
-def test_points_land_where_a_pinhole_puts_them():
+def test_projection_equals_that_of_a_pinhole():
     window = optics.full_window(CAMERA, (64, 64))
     points = jnp.array([[0.0, 0, 0], [-0.075, -0.075, 0], [0.03, 0.0, 0.0], [0.03, 0.06, 0.1]])
     pixels, depth = optics.to_pixels(CAMERA, window, (64, 64), points)
@@ -69,7 +69,7 @@ def test_a_crop_stays_in_the_view_and_has_the_images_aspect():
 
 
 @pytest.mark.parametrize("points", [[[0.0, 0.0, -0.2]], [[0.3, 0.0, 0.0]], [[0.0, -0.5, 0.1], [0.1, -0.6, 0.1]]])
-def test_out_of_view_a_crop_is_the_full_view(points):
+def test_a_crop_of_points_out_of_view_is_the_full_view(points):
     np.testing.assert_allclose(window_of(points), [-0.075, -0.075, 0.15, 0.15], atol=1e-6)
 
 

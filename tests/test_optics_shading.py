@@ -1,4 +1,4 @@
-"""Shading against loops in NumPy float64, and the sky that an object hides against rays."""
+"""Shading against loops in NumPy float64, and the hidden sky against traced rays."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ def strict_ranks():
         yield
 
 
-def test_srgb_is_the_standards():
+def test_srgb_conversion_equals_the_standard():
     values = np.linspace(0, 1, 257)
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(optics.to_linear(jnp.asarray(values)), linear, atol=1e-6)
@@ -53,7 +53,7 @@ def samples(shape, seed=0):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_shading_is_lamberts_law_behind_a_milky_skin(shape):
+def test_shading_equals_lamberts_law_behind_a_milky_skin(shape):
     room = optics.Room()
     albedo, normals, heights, empty, hidden = samples(shape)
     arrays = [jnp.asarray(a, jnp.float32) for a in (albedo, normals, heights, empty, hidden)]
@@ -72,7 +72,7 @@ def test_shading_is_lamberts_law_behind_a_milky_skin(shape):
         np.testing.assert_allclose(got[i, j], expected, atol=1e-5)
 
 
-def test_a_list_of_samples_is_shaded_as_an_image_is():
+def test_shading_of_listed_samples_equals_that_of_an_image():
     room = optics.Room()
     arrays = [jnp.asarray(a, jnp.float32) for a in samples((20, 30))]
     image = optics.shade(room, *arrays)
@@ -84,7 +84,7 @@ def test_a_list_of_samples_is_shaded_as_an_image_is():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_empty_view_is_the_originals_colour_less_vignette_walls_and_shadow(shape):
+def test_the_empty_view_has_the_papers_colour_with_vignette_walls_and_shadow(shape):
     room = optics.Room()
     rng = np.random.default_rng(0)
     radius, walls, hidden = rng.uniform(0, 2.8, shape), rng.uniform(size=shape), rng.uniform(size=shape)
@@ -96,14 +96,14 @@ def test_the_empty_view_is_the_originals_colour_less_vignette_walls_and_shadow(s
     assert np.array_equal(np.round(np.asarray(optics.to_srgb(middle)) * 255), [178, 178, 204])
 
 
-def test_walls_are_dark_and_darker_below():
+def test_walls_get_darker_with_depth():
     room, distance = optics.Room(), 0.1
     places = np.array([[0.0, 0.0], [0.074, -0.074], [0.076, 0.0], [0.0, -0.09], [-0.1, 0.02], [0.09, 0.1]])
     on_pad = jnp.array([True, True, False, False, False, False])
     got = optics.housing(room, on_pad, jnp.asarray(places, jnp.float32), PAD, distance)
     expected = []
     for x, y in places:
-        # the ray (0, 0, -distance) + s (x, y, distance) meets the nearest of the walls |x| = 75 mm, |y| = 75 mm
+        # The ray (0, 0, -distance) + s (x, y, distance) meets the nearest of the walls |x| = 75 mm, |y| = 75 mm.
         s = min(0.075 / abs(x) if x else np.inf, 0.075 / abs(y) if y else np.inf)
         expected.append(1.0 if s > 1 else room.rim * np.exp(-distance * (1 - s) / room.rim_depth))
     np.testing.assert_allclose(got, expected, atol=1e-6)
@@ -134,20 +134,20 @@ def hidden_by(heights, top, x, y):
         (0.06, 0.1, 0.05, 0.03),
     ],
 )
-def test_hidden_sky_is_about_what_rays_find(low, high, half_x, half_y):
+def test_hidden_sky_agrees_with_traced_rays(low, high, half_x, half_y):
     mesh = trimesh.creation.box((2 * half_x, 2 * half_y, high - low))
     mesh.apply_translation((0, 0, (low + high) / 2))
     x, y = np.linspace(-0.07, 0.07, 29), np.linspace(-0.07, 0.07, 15)
     got = hidden_by(box_heights(low, half_x, half_y), high, x, y)
     truth = rays_hidden(mesh, [(a, b) for b in y for a in x]).reshape(15, 29)
-    # at an edge on the skin it is as soft as the grid is coarse
+    # Beside an edge on the skin, the coarse grid softens the result.
     assert np.abs(got - truth).mean() < 0.07
     assert np.corrcoef(got.ravel(), truth.ravel())[0, 1] > 0.94
     assert got.min() >= 0
     assert got.max() <= 1 + 1e-6
 
 
-def test_under_a_ball_it_is_what_rays_find():
+def test_hidden_sky_under_a_ball_agrees_with_traced_rays():
     x, y = np.meshgrid(centres(150), centres(150))
     square = x**2 + y**2
     heights = np.where(square < 0.02**2, 0.02 - np.sqrt(np.maximum(0.02**2 - square, 0)), np.inf)
@@ -160,11 +160,11 @@ def test_under_a_ball_it_is_what_rays_find():
     assert np.abs(got - truth).max() < 0.1
 
 
-def test_beside_a_straight_edge_it_is_the_closed_form():
+def test_hidden_sky_beside_a_straight_edge_equals_the_closed_form():
     heights = np.where(centres(150)[None, :] < 0, 0.0, np.inf) * np.ones((150, 1))
     x = np.linspace(0.01, 0.07, 25)
     got = hidden_by(heights, 0.04, x, np.zeros(1))[0]
-    ends = 0.075 / np.sqrt(0.075**2 + 0.04**2)  # the pad is not endless, along the edge and away from it
+    ends = 0.075 / np.sqrt(0.075**2 + 0.04**2)  # the pad is finite along the edge and across it
     away = x / np.sqrt(x**2 + 0.04**2)
     back = (x + 0.075) / np.sqrt((x + 0.075) ** 2 + 0.04**2)
     np.testing.assert_allclose(got, 0.5 * (back - away) * ends, atol=0.01)
@@ -180,15 +180,15 @@ def test_hidden_sky_hardly_depends_on_the_grid(cells):
     assert np.abs(got - fine).mean() < 0.03
 
 
-def test_nothing_hides_nothing():
+def test_absent_and_distant_objects_hide_no_sky():
     assert not np.any(hidden_by(np.full(CELLS, np.inf), 0.1, centres(30), centres(40)))
-    # nor does what is far above, or lies wholly below
+    # Objects far above the skin or entirely below it hide nothing either.
     assert hidden_by(box_heights(0.5, 0.03, 0.03), 0.6, centres(30), centres(40)).max() < 0.01
     assert not np.any(hidden_by(box_heights(-0.1, 0.03, 0.03), -0.05, centres(30), centres(40)))
 
 
 @pytest.mark.slow
-def test_gradients_are_finite_and_the_finite_differences():
+def test_gradients_are_finite_and_equal_finite_differences():
     room = optics.Room()
     x, y = jnp.linspace(-0.07, 0.07, 15), jnp.linspace(-0.07, 0.07, 15)
     heights = jnp.asarray(box_heights(0.01, 0.02, 0.03), jnp.float32)

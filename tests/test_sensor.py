@@ -1,4 +1,4 @@
-"""A sensor's file: whole, readable, refused with a named field; and what no sensor can be."""
+"""The file of a sensor, and the checks of its constants."""
 
 import dataclasses
 import json
@@ -11,7 +11,7 @@ import pytest
 from sts_jax import Sensor, tactile
 
 
-def test_the_defaults_are_the_papers():
+def test_the_defaults_equal_the_papers_values():
     sensor = Sensor()
     assert sensor.gel.size == (0.15, 0.15)
     assert sensor.gel.thickness == 0.005
@@ -34,7 +34,7 @@ LEDS = tactile.Leds(
 
 
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["Lights", "Leds"])
-def test_saved_and_loaded_are_equal(tmp_path, lights):
+def test_a_loaded_sensor_equals_the_saved_one(tmp_path, lights):
     sensor = Sensor()
     gel = dataclasses.replace(sensor.gel, stiffness=5e5, cells=(100, 120))
     skin = tactile.Skin(coupling=0.0003, shadow_steps=12, shadow_reach=0.01, penumbra=0.3)
@@ -113,7 +113,7 @@ def change(values, path, value):
         ("fine_below", -1),
     ],
 )
-def test_a_bad_field_is_named(tmp_path, field, value):
+def test_an_invalid_field_in_a_file_raises_an_error_that_names_it(tmp_path, field, value):
     path = tmp_path / "sensor.json"
     Sensor().save(path)
     values = json.loads(path.read_text())
@@ -127,10 +127,10 @@ def test_a_bad_field_is_named(tmp_path, field, value):
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("positions", [[0.0, 0, -0.004]]),  # over the pad, in the gel
+        ("positions", [[0.0, 0, -0.004]]),  # in the gel, over the pad
         ("positions", [[0.0, 0, -0.005]]),
         ("positions", [[0.075, 0.075, 0.0]]),  # at its corner
-        ("positions", [[0.1, 0, 0.001]]),  # beside the pad, outside of the sensor
+        ("positions", [[0.1, 0, 0.001]]),  # beside the pad, above the gel's face
         ("positions", [[0.0, 0, 0.1]]),
         ("directions", [[0.0, 0, -1]]),  # unknown to Leds
         ("falloff", -1),
@@ -139,7 +139,7 @@ def test_a_bad_field_is_named(tmp_path, field, value):
         ("reference", None),
     ],
 )
-def test_a_bad_led_is_named(tmp_path, field, value):
+def test_invalid_leds_in_a_file_raise_an_error_that_names_the_field(tmp_path, field, value):
     path = tmp_path / "sensor.json"
     dataclasses.replace(Sensor(), lights=tactile.Leds(colors=jnp.ones((1, 3)), positions=LEDS.positions[:1])).save(path)
     Sensor.load(path)
@@ -163,10 +163,10 @@ def test_a_bad_led_is_named(tmp_path, field, value):
         ("phong.ambient_color", jnp.array([0.8, 0.8, 1.0])),
     ],
 )
-def test_the_right_numbers_in_the_wrong_kind_are_named(field, value):
+def test_the_right_numbers_in_the_wrong_type_raise_an_error(field, value):
     sensor = Sensor()
     part, name = field.split(".")
-    object.__setattr__(getattr(sensor, part), name, value)  # past the tests' own checks of types
+    object.__setattr__(getattr(sensor, part), name, value)  # bypasses the tests' own checks of types
     with pytest.raises(ValueError, match=f"field {field} is .*must be"):
         sensor.check()
     with pytest.raises(ValueError, match=f"field {field} is .*must be"):
@@ -174,7 +174,7 @@ def test_the_right_numbers_in_the_wrong_kind_are_named(field, value):
 
 
 @pytest.mark.parametrize("position", [[0.0, 0, -0.0051], [0.0751, 0, -0.001], [0, -0.2, 0], [0, 0, -0.15]])
-def test_leds_before_the_gel_beside_it_and_behind_the_pinhole_can_be(position):
+def test_leds_in_front_of_the_gel_beside_it_and_behind_the_pinhole_are_valid(position):
     leds = tactile.Leds(positions=jnp.array([position]), colors=jnp.ones((1, 3)))
     dataclasses.replace(Sensor(), lights=leds).check()
 
@@ -182,6 +182,36 @@ def test_leds_before_the_gel_beside_it_and_behind_the_pinhole_can_be(position):
 def with_field(sensor, field, value):
     room, name = field.split(".")
     return dataclasses.replace(sensor, **{room: dataclasses.replace(getattr(sensor, room), **{name: value})})
+
+
+# A number outside of a range, the limit, and the fields with this limit.
+RANGES = [
+    (0, "> 0", "camera", ("distance", "fov", "aspect", "near")),
+    (0, "> 0", "gel", ("size", "thickness", "stiffness", "max_depth", "max_tilt", "tolerance", "cells")),
+    (0, "> 0", "lights", ("reference",)),
+    (0, "> 0", "phong", ("shininess", "darkening")),
+    (0, "> 0", "skin", ("shadow_reach", "penumbra")),
+    (0, "> 0", "room", ("haze", "crease_height", "rim_depth", "exposure")),
+    (-1, ">= 0", "lights", ("colors", "falloff")),
+    (-1, ">= 0", "phong", ("ambient", "diffuse", "specular", "ambient_color")),
+    (-1, ">= 0", "skin", ("coupling", "shadow_steps")),
+    (-1, ">= 0", "room", ("ambient", "colors", "background", "vignette", "rim", "milk", "tint", "crease")),
+    (2, "<= 1", "room", ("background", "vignette", "milk", "tint", "crease")),
+    (4, r"< 3\.1416", "camera", ("fov",)),
+    (1, r"< 0\.3", "gel", ("max_tilt",)),
+]
+
+
+@pytest.mark.parametrize(
+    ("number", "limit", "part", "name"),
+    [(number, limit, part, name) for number, limit, part, names in RANGES for name in names],
+)
+def test_every_range_is_checked(number, limit, part, name):
+    sensor = Sensor(lights=tactile.Leds())
+    field = getattr(getattr(sensor, part), name)
+    wrong = jax.tree.map(lambda x: jnp.full_like(x, number) if isinstance(x, jax.Array) else type(x)(number), field)
+    with pytest.raises(ValueError, match=rf"(?s)field {part}\.{name} is .*, but it must be {limit}"):
+        with_field(sensor, f"{part}.{name}", wrong).check()
 
 
 @pytest.mark.parametrize(
@@ -196,7 +226,7 @@ def with_field(sensor, field, value):
         ("skin.coupling", -1e-3, ">= 0"),
     ],
 )
-def test_a_check_names_field_value_and_remedy(field, value, says):
+def test_the_error_of_a_check_names_field_value_and_limit(field, value, says):
     sensor = with_field(Sensor(), field, value)
     with pytest.raises(ValueError, match=says) as error:
         sensor.check()
@@ -204,13 +234,13 @@ def test_a_check_names_field_value_and_remedy(field, value, says):
     assert str(value) in str(error.value) or not isinstance(value, float)
 
 
-def test_what_cannot_be_is_not_written(tmp_path):
+def test_an_invalid_sensor_is_not_written(tmp_path):
     with pytest.raises(ValueError, match=r"field phong\.darkening"):
         with_field(Sensor(), "phong.darkening", 0.0).save(tmp_path / "sensor.json")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_torn_or_missing_file_is_named(tmp_path):
+def test_a_damaged_or_missing_file_raises_an_error_that_names_it(tmp_path):
     path = tmp_path / "sensor.json"
     with pytest.raises(FileNotFoundError, match=r"sensor\.json"):
         Sensor.load(path)
@@ -222,7 +252,7 @@ def test_a_torn_or_missing_file_is_named(tmp_path):
             Sensor.load(path)
 
 
-def test_a_path_that_cannot_be_read_or_written_is_named(tmp_path):
+def test_an_unusable_path_raises_an_error_that_names_it(tmp_path):
     with pytest.raises(OSError, match=r"cannot be read as JSON .*directory"):
         Sensor.load(tmp_path)
     with pytest.raises(OSError, match=rf"cannot write {tmp_path}.*directory"):

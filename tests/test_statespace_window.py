@@ -1,4 +1,4 @@
-"""Windows and interpolation: against drawn rectangles, SciPy and turned pictures."""
+"""Windows and interpolation against drawn rectangles, SciPy and turned images."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ SIZE = 64
 
 
 def rectangle(centre, angle, extent, size=SIZE):
-    """A picture `(size, size, 3)` of a turned rectangle; lengths are shares of the side, the angle in radians."""
+    """An image `(size, size, 3)` of a turned rectangle. Lengths are shares of the side, the angle is in radians."""
     place = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(place - centre[0], place - centre[1])
     along, across = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
@@ -28,7 +28,7 @@ def test_a_window_follows_a_rectangle(angle):
     found = window.locate(jnp.asarray(rectangle(centre, angle, extent)[None]))
     np.testing.assert_allclose(found.centre[0], centre, atol=0.01)
     line = np.array([np.cos(angle), np.sin(angle)])
-    assert abs(np.dot(found.angle[0], line)) > np.cos(0.03)  # either way along the line
+    assert abs(np.dot(found.angle[0], line)) > np.cos(0.03)  # in either direction along the line
     np.testing.assert_allclose(found.side[0], window.MARGIN * extent[0], atol=2.5 / SIZE)
 
 
@@ -57,10 +57,10 @@ def test_a_speck_gets_the_smallest_window():
     np.testing.assert_allclose(found.side, window.SMALLEST)
 
 
-def test_a_picture_and_the_picture_turned_have_the_same_cut():
+def test_an_image_and_the_turned_image_have_the_same_cut():
     change = rectangle((0.4, 0.6), -0.9, (0.5, 0.2))
-    change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # nothing symmetric
-    turned = np.rot90(change, -1).copy()  # columns to rows: by +90 degrees where rows count downwards
+    change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # breaks all symmetries
+    turned = np.rot90(change, -1).copy()  # turns columns into rows, by +90 degrees because rows count downwards
     both = jnp.stack([change, turned])
     found = window.locate(both)
     np.testing.assert_allclose(found.angle[1], [-found.angle[0, 1], found.angle[0, 0]], atol=1e-4)
@@ -80,7 +80,7 @@ def test_a_cut_of_a_gradient_is_the_gradient_along_the_window():
     np.testing.assert_allclose(window.cut(jnp.asarray(image), square, 8)[0, ..., 0], expected, atol=1e-5)
 
 
-def test_samples_are_those_of_scipy_and_zero_outside():
+def test_samples_equal_scipys_and_are_zero_outside():
     rng = np.random.default_rng(0)
     images = rng.random((2, 8, 8, 3), np.float32)
     places = rng.uniform(-3, 10, (2, 200, 2)).astype(np.float32)
@@ -97,7 +97,7 @@ def test_samples_are_those_of_scipy_and_zero_outside():
 
 @pytest.mark.parametrize("category", ["camera", "scissors"])
 def test_an_image_shows_the_object_and_not_its_shadow(category):
-    """Against the renderer's own mask, of an object at rest."""
+    """The truth is the segmentation of an object at rest."""
     sensor, body = sts.Sensor(), objects.make(jax.random.key(0), category)
     pose, wrench = physics.place(body, sensor)
     resting = sts.sense(sensor, body, pose, wrench, resolution=(SIZE, SIZE))

@@ -57,7 +57,7 @@ CASES = {
 
 
 def true_pressure(gel, height, wrench):
-    """Newton's method is not trusted here: BFGS in float64, from another start."""
+    """Pressure and motion by BFGS in float64, from another start than that of the gel's Newton method."""
     x, y = grid(gel)
     area = 0.15 * 0.15 / x.size
     there = np.isfinite(height)
@@ -83,7 +83,7 @@ def true_pressure(gel, height, wrench):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_equilibrium_is_the_float64_solvers(name):
+def test_equilibrium_equals_that_of_a_float64_solver(name):
     make, wrench = CASES[name]
     height = make(*grid())
     got = settle(GEL, jnp.asarray(height, jnp.float32), wrench)
@@ -95,7 +95,7 @@ def test_equilibrium_is_the_float64_solvers(name):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_pressure_adds_up_to_the_wrench(name):
+def test_pressure_balances_the_wrench(name):
     make, wrench = CASES[name]
     x, y = grid()
     pressure = np.asarray(settle(GEL, jnp.asarray(make(x, y), jnp.float32), wrench).pressure, float)
@@ -109,7 +109,7 @@ def test_pressure_adds_up_to_the_wrench(name):
 
 @pytest.mark.parametrize("radius", [0.02, 0.04])
 @pytest.mark.parametrize("force", [0.2, 1.0])
-def test_a_ball_sinks_as_the_springs_closed_form_says(radius, force):
+def test_depth_of_a_ball_equals_the_closed_form(radius, force):
     # F = k * volume of the cap, pi d^2 (3 R - d) / 3
     x, y = grid()
     got = settle(GEL, jnp.asarray(ball(x, y, radius), jnp.float32), push(force, 0.01, -0.02))
@@ -120,7 +120,7 @@ def test_a_ball_sinks_as_the_springs_closed_form_says(radius, force):
     assert imprint.sum() * 1e-6 == pytest.approx(np.pi * (2 * radius * depth - depth**2), rel=0.05)
 
 
-# Heights and wrench are arguments: one program serves all cases.
+# Heights and wrench are arguments, so that one program serves all cases.
 SEVERAL = jax.jit(jax.vmap(lambda height, wrench, load: tactile.settle(GEL, height, wrench * load), (None, None, 0)))
 
 
@@ -138,7 +138,7 @@ def test_more_load_never_makes_the_imprint_smaller(name):
 
 
 def deepest(got, height, gel=GEL):
-    """How far the object lies in the gel at most (m)."""
+    """Largest depth of the object below the gel's face (m)."""
     x, y = grid(gel)
     moved = np.asarray(height, float) - float(got.sink) + float(got.turn[0]) * y - float(got.turn[1]) * x
     return -np.min(moved)
@@ -148,14 +148,14 @@ def deepest(got, height, gel=GEL):
     ("height", "wrench"),
     [
         (lambda x, y: box(x, y) + 0.05, push(0.5, 0.0, 0.01)),  # out of reach
-        (lambda x, y: np.full(x.shape, np.inf), push(0.5, 0.0, 0.01)),  # nothing there
+        (lambda x, y: np.full(x.shape, np.inf), push(0.5, 0.0, 0.01)),  # no object
         (box, push(0.5, 0.05, 0.01)),  # centre of pressure outside the footprint
-        (box, push(0.5, 0.2, 0.01)),  # and off the pad
+        (box, push(0.5, 0.2, 0.01)),  # off the pad
         (box, push(50.0, 0.0, 0.01)),  # deeper than the limit
-        (lambda x, y: box(x, y, tilt=(0.0, 0.3)), push(2.0, 0.0, 0.01)),  # flatter than the limit allows
+        (lambda x, y: box(x, y, tilt=(0.0, 0.3)), push(2.0, 0.0, 0.01)),  # a tilt beyond the limit
     ],
 )
-def test_without_equilibrium_the_limits_hold_and_the_flag_falls(height, wrench):
+def test_without_equilibrium_the_result_is_unbalanced_and_within_the_limits(height, wrench):
     got = settle(GEL, jnp.asarray(height(*grid()), jnp.float32), wrench)
     assert not bool(got.balanced)
     assert deepest(got, height(*grid())) <= GEL.max_depth * 1.001
@@ -165,7 +165,7 @@ def test_without_equilibrium_the_limits_hold_and_the_flag_falls(height, wrench):
 
 
 @pytest.mark.parametrize("force", [1.0, 10.0, 200.0])
-def test_a_tip_that_carries_too_little_goes_no_deeper_than_the_limit(force):
+def test_an_overloaded_tip_sinks_to_the_limit(force):
     x, y = grid()
     tip = np.where((abs(x) < 1e-3) & (abs(y) < 1e-3), 0.0, 0.02)
     got = settle(GEL, jnp.asarray(tip, jnp.float32), push(force, 0.0, 0.0))
@@ -175,7 +175,7 @@ def test_a_tip_that_carries_too_little_goes_no_deeper_than_the_limit(force):
 
 
 @pytest.mark.parametrize("force", [0.0, -1.0])
-def test_nothing_is_pressed_without_a_push(force):
+def test_without_force_there_is_no_motion_and_no_pressure(force):
     got = settle(GEL, jnp.asarray(box(*grid()) - 0.0012, jnp.float32), push(force, 0.0, 0.0))
     assert bool(got.balanced)
     assert float(got.sink) == 0
@@ -192,7 +192,7 @@ def test_grids_of_1_and_half_a_millimetre_agree():
 
 
 def odd_height(rng, x, y):
-    """The underside of one to four things of one random kind: ellipsoids, thin bars, points, plates, wedges, cones."""
+    """The underside of one to four parts of one random kind: ellipsoids, bars, points, plates, wedges or cones."""
     height, kind = np.full(x.shape, np.inf), rng.integers(6)
     for _ in range(rng.integers(1, 5)):
         (cx, cy), turn = rng.uniform(-0.05, 0.05, 2), rng.uniform(0, np.pi)
@@ -213,7 +213,7 @@ def odd_height(rng, x, y):
 
 
 def odd_push(rng, height, x, y):
-    """A load of 0.02 to 50 N, its centre among what is lowest, at a rim of it, or some way off."""
+    """A load of 0.02 to 50 N, with its centre among the lowest cells, at their rim or outside of them."""
     low = height < height.min() + 0.001
     share = rng.dirichlet(np.full(low.sum(), rng.choice([0.05, 1, 10])))
     shift = rng.normal(size=2) * rng.choice([0, 0, 0, 0.002, 0.03])
@@ -221,7 +221,7 @@ def odd_push(rng, height, x, y):
 
 
 def has_equilibrium(gel, height, wrench):
-    """Whether damped Newton steps in float64 come to balance, well within the gel's limits."""
+    """Whether damped Newton steps in float64 find an equilibrium well within the gel's limits."""
     x, y = grid(gel)
     there = np.isfinite(height)
     fz, mx, my = (float(w) for w in wrench[2:5])
@@ -249,7 +249,7 @@ def has_equilibrium(gel, height, wrench):
     return False
 
 
-def test_odd_things_under_any_load_are_balanced_or_flagged():
+def test_random_undersides_under_random_loads_are_balanced_or_flagged():
     rng = np.random.default_rng(11)
     x, y = grid()
     area = float(tactile.cell_area(GEL))
@@ -289,7 +289,7 @@ def measured(height, wrench, stiffness, lift):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ball", "box pushed off its middle", "box pushed near its edge"])
-def test_gradients_are_the_finite_differences(name):
+def test_gradients_equal_finite_differences(name):
     make, wrench = CASES[name]
     height = jnp.asarray(make(*grid()), jnp.float32)
     arguments = (wrench, jnp.float32(2e6), jnp.float32(0))
@@ -301,7 +301,7 @@ def test_gradients_are_the_finite_differences(name):
         assert float(jnp.sum(gradient[k] * change[k])) == pytest.approx(float(numeric), rel=0.05, abs=1e-8)
 
 
-def test_gradients_stay_finite_where_nothing_balances():
+def test_gradients_are_finite_without_equilibrium():
     x, y = grid()
     total = jax.jit(jax.grad(lambda h, w: jnp.sum(tactile.settle(GEL, h, w).pressure), argnums=(0, 1)))
     for height, wrench in [
@@ -312,7 +312,7 @@ def test_gradients_stay_finite_where_nothing_balances():
         assert all(jnp.all(jnp.isfinite(g)) for g in total(jnp.asarray(height, jnp.float32), wrench))
 
 
-def test_the_pose_alone_indents_by_its_own_depth():
+def test_indentation_by_the_pose_alone_has_its_depth():
     x, y = grid()
     height = ball(x, y, gap=-0.001)
     got = tactile.indent(GEL, jnp.asarray(height, jnp.float32))

@@ -1,4 +1,4 @@
-"""The drawn skin against loops in NumPy float64: coupling, normals, lights, shadows, Phong; and their gradients."""
+"""Coupling, lights, shadows and Phong reflectance against loops in NumPy float64, and their gradients."""
 
 import dataclasses
 
@@ -7,11 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import erf
+from tactile_surfaces import SHAPES, SMALL, bumpy, normals_of, some_pixels
 
 from sts_jax import tactile
 
-SMALL = [(64, 64), (97, 53), (200, 200)]
-SHAPES = [*SMALL, (480, 640), (1232, 1640)]
 WINDOW = np.array([-0.08, -0.07, 0.16, 0.14])  # m
 LEDS = tactile.Leds(
     positions=jnp.array([[-0.09, 0.01, -0.004], [0.085, -0.02, -0.02], [0.01, -0.02, -0.06], [0.0, 0.1, 0.0]]),
@@ -28,39 +27,20 @@ def strict_ranks():
         yield
 
 
-def bumpy(shape):
-    rng = np.random.default_rng(0)
-    x, y = np.meshgrid(np.linspace(-0.075, 0.075, shape[1]), np.linspace(-0.075, 0.075, shape[0]))
-    z = -0.002 * np.exp(-((x - 0.01) ** 2 + y**2) / 0.015**2) + 2e-4 * np.sin(300 * x) * np.cos(200 * y)
-    return np.stack([x, y, z], -1) + 1e-5 * rng.normal(size=(*shape, 3))
-
-
-def normals_of(points):
-    """Of a grid of points, around which it goes on as it ends."""
-    planes = jnp.moveaxis(jnp.asarray(points), -1, 0)
-    return tactile.surface_normals(tuple(jnp.pad(plane, 1, mode="edge") for plane in planes))
-
-
 def places(shape):
-    """Of pixel centres on the gel's face, as `WINDOW` shows it (m)."""
+    """x and y of pixel centres on the part of the gel's face in `WINDOW` (m)."""
     x = WINDOW[0] + (np.arange(shape[1]) + 0.5) / shape[1] * WINDOW[2]
     y = WINDOW[1] + (np.arange(shape[0]) + 0.5) / shape[0] * WINDOW[3]
     return np.meshgrid(x, y)
 
 
 def pressed(shape):
-    """Depths of three imprints: a ball's, a box's and a ridge's (m)."""
+    """Depth of the imprints of a ball, a box and a ridge (m)."""
     x, y = places(shape)
     ball = np.sqrt(np.maximum(0.02**2 - (x + 0.03) ** 2 - (y - 0.01) ** 2, 0)) - 0.0185
     box = np.where((np.abs(x - 0.03) < 0.012) & (np.abs(y + 0.02) < 0.02), 0.0012, 0)
     ridge = 0.002 - np.abs(x + y - 0.05) / 4
     return np.maximum(np.maximum(ball, box), np.maximum(ridge, 0))
-
-
-def some(shape, number=200):
-    rng = np.random.default_rng(1)
-    inner = [(rng.integers(shape[0]), rng.integers(shape[1])) for _ in range(number)]
-    return [*inner, (0, 0), (0, shape[1] - 1), (shape[0] - 1, 0), (shape[0] - 1, shape[1] - 1)]
 
 
 def some_normals(shape):
@@ -69,30 +49,8 @@ def some_normals(shape):
     return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_normals_are_the_axis_of_least_covariance(shape):
-    points = bumpy(shape)
-    got = np.asarray(jax.jit(normals_of)(jnp.asarray(points, jnp.float32)))
-    for i, j in some(shape):
-        rows = np.clip([i - 1, i, i + 1], 0, shape[0] - 1)
-        columns = np.clip([j - 1, j, j + 1], 0, shape[1] - 1)
-        around = points[np.ix_(rows, columns)].reshape(-1, 3)
-        normal = np.linalg.eigh(np.cov(around.T, bias=True))[1][:, 0]
-        normal *= -np.sign(normal[2])
-        np.testing.assert_allclose(got[i, j], normal, atol=2e-3)
-
-
-def test_normals_of_several_grids_side_by_side_are_those_of_each():
-    grids = [np.moveaxis(bumpy((9, 7)), -1, 0), np.moveaxis(bumpy((9, 7))[::-1], -1, 0)]
-    several = tactile.surface_normals(tuple(jnp.asarray(np.stack(planes, -1)) for planes in zip(*grids, strict=True)))
-    assert several.shape == (7, 5, 2, 3)
-    for k, grid in enumerate(grids):
-        alone = tactile.surface_normals(tuple(jnp.asarray(grid)))
-        np.testing.assert_allclose(several[:, :, k], alone, atol=1e-6)
-
-
 def reflected_light(constants, lights, normal, point, shares):
-    """Phong's equation in float64, one point, one light after the other."""
+    """Phong's equation in float64 at one point, light by light."""
     view = np.array([0.0, 0.0, -1.0])
     near = isinstance(lights, tactile.Leds)
     total = float(constants.ambient) * np.array(constants.ambient_color, np.float64)
@@ -111,13 +69,13 @@ def reflected_light(constants, lights, normal, point, shares):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
-def test_phong_is_the_papers_equation(shape, lights):
+def test_phong_equals_the_papers_equation(shape, lights):
     normals, points, constants = some_normals(shape), bumpy(shape), tactile.Phong()
     shares = np.random.default_rng(3).uniform(size=(4, *shape))
     inputs = [jnp.asarray(v, jnp.float32) for v in (normals, points, shares)]
     whole = np.asarray(jax.jit(tactile.phong)(constants, lights, *inputs[:2]))
     shaded = np.asarray(jax.jit(tactile.phong)(constants, lights, *inputs))
-    for i, j in some(shape):
+    for i, j in some_pixels(shape):
         inside = normals[i, j], points[i, j]
         np.testing.assert_allclose(whole[i, j], reflected_light(constants, lights, *inside, np.ones(4)), rtol=2e-5)
         np.testing.assert_allclose(
@@ -126,7 +84,7 @@ def test_phong_is_the_papers_equation(shape, lights):
 
 
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
-def test_phong_of_a_list_of_points_is_phong_of_the_image(lights):
+def test_phong_of_listed_points_equals_that_of_the_image(lights):
     shape = (31, 17)
     normals, points = (jnp.asarray(v, jnp.float32) for v in (some_normals(shape), bumpy(shape)))
     image = tactile.phong(tactile.Phong(), lights, normals, points)
@@ -134,7 +92,7 @@ def test_phong_of_a_list_of_points_is_phong_of_the_image(lights):
     np.testing.assert_array_equal(image.reshape(-1, 3), listed)
 
 
-def test_a_light_far_away_is_a_far_light():
+def test_leds_far_away_equal_far_lights():
     lights = tactile.Lights(directions=jnp.array([[-1.0, 0.3, -0.2], [0, 1, 0], [0.2, 0.1, -1], [0.5, -0.5, -0.05]]))
     unit = lights.directions / jnp.linalg.norm(lights.directions, axis=1, keepdims=True)
     leds = tactile.Leds(positions=300 * unit, colors=lights.colors, falloff=2.0, reference=300.0)
@@ -148,7 +106,7 @@ def test_a_light_far_away_is_a_far_light():
     assert float(jnp.mean(far < 0.5)) > 0.05
 
 
-def test_a_near_lights_intensity_falls_off_from_where_its_colour_holds():
+def test_intensity_of_leds_falls_off_from_the_reference_distance():
     flat = jnp.array([[0.0, 0, -1]])
     leds = tactile.Leds(positions=jnp.array([[0.0, 0, -0.05]]), colors=jnp.array([[0.3, 0.2, 0.1]]), reference=0.05)
     constants = tactile.Phong(ambient=0.0, specular=0.0)
@@ -160,7 +118,7 @@ def test_a_near_lights_intensity_falls_off_from_where_its_colour_holds():
         np.testing.assert_allclose(twice, leds.colors / 2**falloff, rtol=1e-5)
 
 
-def test_flat_gel_has_the_originals_colour():
+def test_flat_gel_has_the_colour_of_the_papers_code():
     points = jnp.asarray(bumpy((8, 8)) * [1, 1, 0], jnp.float32)
     image = tactile.phong(tactile.Phong(), tactile.Lights(), normals_of(points), points)
     assert np.array_equal(np.round(np.asarray(image) * 255), np.broadcast_to([178, 178, 204], (8, 8, 3)))
@@ -174,7 +132,7 @@ def test_flat_gel_has_the_originals_colour():
     ],
     ids=["far", "near"],
 )
-def test_a_bump_is_lit_from_the_side_its_flank_faces(lights):
+def test_flanks_are_lit_by_the_light_that_they_face(lights):
     x, y = np.meshgrid(np.arange(-20, 21), np.arange(-20, 21))
     bump = jnp.asarray(np.stack([x, y, -5 * np.exp(-(x**2 + y**2) / 50)], -1), jnp.float32)  # towards the camera
     image = np.asarray(tactile.phong(tactile.Phong(), lights, normals_of(bump), bump))
@@ -187,28 +145,28 @@ def test_a_bump_is_lit_from_the_side_its_flank_faces(lights):
 
 @pytest.mark.parametrize("length", [0.0003, 0.001, 0.004])
 @pytest.mark.parametrize("shape", SHAPES[:4])
-def test_coupling_is_a_weighted_mean_over_the_image(shape, length):
+def test_coupling_equals_a_weighted_mean_over_the_image(shape, length):
     depth = pressed(shape) + 1e-4 * np.random.default_rng(4).uniform(size=shape)
     pitch = WINDOW[2:] / [shape[1], shape[0]]
     got = np.asarray(jax.jit(tactile.couple)(jnp.asarray(depth, jnp.float32), length, jnp.asarray(pitch, jnp.float32)))
     y, x = np.arange(shape[0]) * pitch[1], np.arange(shape[1]) * pitch[0]
-    for i, j in some(shape, 60):
+    for i, j in some_pixels(shape, 60):
         weights = np.exp(-((x[None] - x[j]) ** 2 + (y[:, None] - y[i]) ** 2) / (2 * length**2))
         assert got[i, j] == pytest.approx(np.sum(weights * depth) / np.sum(weights), rel=1e-4, abs=1e-9)
 
 
-def test_a_coupled_edge_is_an_error_function():
+def test_a_coupled_edge_equals_an_error_function():
     shape, length = (40, 300), 0.001
     x = (np.arange(300) - 149.5) * 1e-4
     depth = jnp.asarray(np.tile(np.where(x > 0, 0.002, 0), (40, 1)), jnp.float32)
     got = tactile.couple(depth, length, jnp.array([1e-4, 2e-4]))
     expected = 0.001 * (1 + erf(x / length / np.sqrt(2)))
-    away = np.abs(x) < 0.015 - 4 * length  # the image's border: what lies beyond counts for nothing
+    away = np.abs(x) < 0.015 - 4 * length  # the weights do not reach beyond the image's border
     np.testing.assert_allclose(got[:, away], np.tile(expected, (shape[0], 1))[:, away], atol=2e-6)
 
 
 @pytest.mark.parametrize("shape", SMALL)
-def test_no_coupling_is_no_change(shape):
+def test_zero_coupling_changes_nothing(shape):
     depth = jnp.asarray(pressed(shape), jnp.float32)
     pitch = jnp.asarray(WINDOW[2:] / [shape[1], shape[0]], jnp.float32)
     couple = jax.jit(tactile.couple)
@@ -222,7 +180,7 @@ def test_no_coupling_is_no_change(shape):
 
 
 def bilinear(depth, row, column):
-    """Of an image with nothing around it; row and column in pixels, whole at pixel centres."""
+    """Value of an image with zeros around it. Row and column in pixels, whole numbers at pixel centres."""
     total = 0.0
     for i in (int(np.floor(row)), int(np.floor(row)) + 1):
         for j in (int(np.floor(column)), int(np.floor(column)) + 1):
@@ -259,7 +217,7 @@ def arriving(skin, lights, depth, i, j):
     ],
     ids=["plane", "far", "near"],
 )
-def test_shadows_are_what_stands_in_the_way(shape, lights):
+def test_shadows_equal_a_float64_loop(shape, lights):
     depth = pressed(shape)
     got = np.asarray(
         jax.jit(tactile.shadows)(SKIN, lights, jnp.asarray(depth, jnp.float32), jnp.asarray(WINDOW, jnp.float32))
@@ -267,12 +225,12 @@ def test_shadows_are_what_stands_in_the_way(shape, lights):
     assert got.shape == (4, *shape)
     assert got.min() == 0
     assert got.max() == 1
-    for i, j in some(shape, 60):
+    for i, j in some_pixels(shape, 60):
         np.testing.assert_allclose(got[:, i, j], list(arriving(SKIN, lights, depth, i, j)), atol=5e-3)
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_a_shadow_is_as_long_as_its_wall_is_high_over_the_tangent(near):
+def test_length_of_a_shadow_equals_height_over_tangent(near):
     shape, height, tangent = (24, 400), 0.002, 0.2
     x = 1e-4 * (np.arange(shape[1]) + 0.5)
     depth = np.tile(np.where(np.abs(x - 0.01) < 0.001, height, 0), (shape[0], 1))
@@ -289,7 +247,7 @@ def test_a_shadow_is_as_long_as_its_wall_is_high_over_the_tangent(near):
     assert np.all(share[x > 0.0215] == 1)
 
 
-def test_a_light_in_the_gels_plane_is_hidden_from_flanks_behind():
+def test_a_bump_hides_a_light_in_the_gels_plane_from_flanks_behind_it():
     x, y = np.meshgrid(1e-4 * np.arange(-150, 150), 1e-4 * np.arange(-50, 50))
     bump = 0.001 * np.exp(-((x + 0.006) ** 2 + y**2) / 0.002**2)
     second = 0.001 * np.exp(-((x - 0.006) ** 2 + y**2) / 0.002**2)
@@ -297,7 +255,7 @@ def test_a_light_in_the_gels_plane_is_hidden_from_flanks_behind():
     skin = tactile.Skin(shadow_steps=64, shadow_reach=0.02, penumbra=0.02)
 
     def red(depth):
-        """What the first light, from the left, alone gives."""
+        """Red channel with the first light alone, which comes from the left."""
         depth = jnp.asarray(depth, jnp.float32)
         points = jnp.stack([jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32), -depth], -1)
         lights, constants = tactile.Lights(), tactile.Phong(ambient=0.0)
@@ -307,14 +265,14 @@ def test_a_light_in_the_gels_plane_is_hidden_from_flanks_behind():
 
     open_alone, shaded_alone = red(second)
     open_both, shaded_both = red(bump + second)
-    flank = (50, 196)  # of the second bump, towards the light
+    flank = (50, 196)  # the side of the second bump that faces the light
     assert open_alone[flank] > 0.1
-    assert shaded_alone[flank] == open_alone[flank]  # nothing stands before it
-    assert shaded_both[flank] < 0.2 * open_both[flank]  # the first bump does
-    np.testing.assert_allclose(open_both[:, 145:155], shaded_both[:, 145:155], atol=1e-3)  # flat: nothing to hide
+    assert shaded_alone[flank] == open_alone[flank]  # no shadow on the second bump alone
+    assert shaded_both[flank] < 0.2 * open_both[flank]  # the first bump casts a shadow on it
+    np.testing.assert_allclose(open_both[:, 145:155], shaded_both[:, 145:155], atol=1e-3)  # flat skin is unlit
 
 
-def test_no_steps_are_no_shadows_and_a_flat_skin_has_none():
+def test_zero_steps_and_flat_skin_give_no_shadows():
     depth, window = jnp.asarray(pressed((20, 30)), jnp.float32), jnp.asarray(WINDOW, jnp.float32)
     for lights in (tactile.Lights(), LEDS):
         assert np.all(np.asarray(tactile.shadows(tactile.Skin(), lights, depth, window)) == 1)
@@ -322,7 +280,7 @@ def test_no_steps_are_no_shadows_and_a_flat_skin_has_none():
 
 
 def drawing(parameters, weights):
-    """A weighted sum of the pixels of a ball's imprint, of all that it can be differentiated by."""
+    """A weighted sum of the pixels of a ball's imprint, as a function of all parameters with a derivative."""
     shape = weights.shape[:2]
     x, y = (jnp.asarray(v, weights.dtype) for v in places(shape))
     window = jnp.asarray(WINDOW, weights.dtype)
@@ -346,11 +304,11 @@ def parameters(lights, depth):
 @pytest.mark.slow
 @pytest.mark.parametrize("lights", [tactile.Lights(), LEDS], ids=["far", "near"])
 @pytest.mark.parametrize("depth", [0.002, -0.001], ids=["pressed", "flat"])
-def test_gradients_are_those_of_finite_differences(lights, depth):
+def test_gradients_equal_finite_differences(lights, depth):
     shape = (33, 41)
     with jax.enable_x64(True):
         start = jax.tree.map(lambda v: jnp.asarray(np.asarray(v, np.float64)), parameters(lights, depth))
-        # Off the gel's plane: at it flat skin is at the edge of light, where no derivative is.
+        # Off the gel's plane. With lights in this plane, flat skin is at the edge of light and has no derivative.
         if isinstance(lights, tactile.Lights):
             tilted = start["lights"].directions + jnp.array([[0.05, 0.02, -0.1]])
             start["lights"] = dataclasses.replace(start["lights"], directions=tilted)
@@ -383,9 +341,9 @@ def test_gradients_are_those_of_finite_differences(lights, depth):
     "lights",
     [
         tactile.Lights(),
-        tactile.Lights(directions=jnp.array([[0.0, 0, -1]] * 4)),  # straight under
+        tactile.Lights(directions=jnp.array([[0.0, 0, -1]] * 4)),  # straight below
         LEDS,
-        # on the skin itself, on a pixel's centre, straight under, and in the gel's plane
+        # On the skin at a pixel's centre, almost on it, straight below, and in the gel's plane.
         tactile.Leds(positions=jnp.array([[0.0, 0, 0], [0.0, 0.0, -1e-12], [0, 0, -0.05], [0.1, 0, 0]])),
         tactile.Leds(positions=jnp.array([[0.0, 0, 0]] * 4), falloff=4.0, reference=0.1),
     ],
@@ -400,8 +358,8 @@ def test_gradients_are_finite_in_float32(lights, coupling, depth):
         assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
 
 
-def test_points_a_light_and_a_normal_that_meet_badly_have_finite_gradients():
-    # Light along the skin, from behind it, and at right angles to the eye: R . V is 0 to the last digits.
+def test_gradients_are_finite_for_degenerate_lights_and_normals():
+    # Light along the skin, from behind it, and at right angles to the view. R . V is 0 to the last digits.
     lights = tactile.Lights(directions=jnp.array([[1.0, 0, 0], [0, 0, 1], [1e-22, 0, -1e-25], [1, 0, -1e-30]]))
     normals = jnp.array([[0.0, 0, -1], [0, 0, -1], [1, 0, 0], [0, 0, 0]])
 
@@ -416,7 +374,7 @@ def test_points_a_light_and_a_normal_that_meet_badly_have_finite_gradients():
             assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
 
 
-def test_deeper_is_darker():
+def test_brightness_decays_exponentially_with_depth():
     depth = jnp.linspace(0, 0.005, 20)[None]
     dark = np.asarray(tactile.darken(tactile.Phong(), depth))[0]
     assert dark[0] == 1

@@ -1,8 +1,7 @@
-"""Vision: the camera, the rasteriser (on plain arrays) and the light above the skin."""
+"""Vision: the camera, the rasteriser (on plain arrays), the view through the skin and views from outside."""
 
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
-from sts_jax.optics.photograph import photograph
-from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
+from sts_jax.optics.external_view import photograph
 from sts_jax.optics.shading import (
     Room,
     empty_view,
@@ -13,6 +12,7 @@ from sts_jax.optics.shading import (
     to_linear,
     to_srgb,
 )
+from sts_jax.optics.zbuffer import barycentrics, pixel_centres, rasterise
 
 __all__ = [
     "Camera",

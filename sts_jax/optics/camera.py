@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sts_jax._ranges import POSITIVE
+
 Scalar = float | Array
 
 
@@ -19,10 +21,14 @@ Scalar = float | Array
 class Camera:
     """A pinhole on the sensor's z axis, looking out through the gel along +z."""
 
-    distance: Scalar = 0.1  # m, from the pinhole to the gel's outer face (paper's code: bottom of the block)
-    fov: Scalar = 2 * math.atan(0.75)  # rad, vertical field of view (paper's code): the pad is as high as the image
-    aspect: Scalar = 4 / 3  # width / height of the native view (device: 1640x1232, paper's code: 640x480)
-    near: Scalar = 0.02  # m, a face with a corner nearer to the pinhole than this is not drawn
+    # m, from the pinhole to the gel's outer face (paper's code: bottom of the block)
+    distance: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
+    # rad, vertical field of view (paper's code): the pad is as high as the image
+    fov: Scalar = dataclasses.field(default=2 * math.atan(0.75), metadata=POSITIVE | {"below": math.pi})
+    # width / height of the native view (device: 1640x1232, paper's code: 640x480)
+    aspect: Scalar = dataclasses.field(default=4 / 3, metadata=POSITIVE)
+    # m, a face with a corner nearer to the pinhole than this is not drawn
+    near: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:
@@ -47,14 +53,14 @@ def object_window(
 ) -> Float[Array, "4"]:
     """The window around an object with the aspect ratio of an image, as in the paper (supplement, "Training Details").
 
-    It is the smallest one that contains the bounding box of the projected points, as far as that is in the full window,
-    and it lies in the full window. Points nearer than `near` do not count. With nothing in view it is the full window.
+    It is the smallest one that lies in the full window and contains the visible part of the bounding box of the
+    projected points. Points nearer than `near` do not count. If nothing is in view, it is the full window.
 
     Args:
         camera: the pinhole.
         points: points of the object, sensor frame (m).
         resolution: (height, width) of the image, pixels.
-        smallest: least length of the shorter side (m).
+        smallest: minimum length of the shorter side (m).
 
     Returns:
         Window (m).
@@ -86,8 +92,8 @@ def to_pixels(
         points: sensor frame (m).
 
     Returns:
-        Columns and rows (pixels), and depth along the optical axis (m). Points nearer than `camera.near` are
-        projected from there.
+        Columns and rows (pixels), and depth along the optical axis (m). Points nearer than `camera.near` are projected
+        as if they were at this depth.
     """
     depth = points[:, 2] + camera.distance
     on_face = camera.distance * points[:, :2] / jnp.maximum(depth, camera.near)[:, None]

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from sts_jax import _math, geometry
+from sts_jax import _cpu_reductions, geometry
+from sts_jax._ranges import NOT_NEGATIVE, POSITIVE, SHARE
+from sts_jax._sampling import bilinear
 
 Scalar = float | Array
 
@@ -22,31 +24,45 @@ class Room:
     """The light above the sensor, and its way through the skin to the camera. Constants are our choice."""
 
     # light that reaches a surface from all sides, including the light that leaks through and under the object
-    ambient: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.36, 0.36, 0.37]))
+    ambient: Float[Array, "*n 3"] = dataclasses.field(
+        default_factory=lambda: jnp.array([0.36, 0.36, 0.37]), metadata=NOT_NEGATIVE
+    )
     # unit vectors from the object towards a window, a lamp and the table, which reflects light
     directions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[-0.8, -0.5, 0.1], [0.6, 0.3, 0.74], [0.4, -0.5, -0.77]])
     )
+    # linear light of each, on a surface that faces it
     colors: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[0.7, 0.7, 0.68], [0.3, 0.29, 0.27], [0.3, 0.3, 0.31]])
+        default_factory=lambda: jnp.array([[0.7, 0.7, 0.68], [0.3, 0.29, 0.27], [0.3, 0.3, 0.31]]),
+        metadata=NOT_NEGATIVE,
     )
     # sRGB of the empty view (paper's code: (178, 178, 204) / 255)
-    background: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([178.0, 178, 204]) / 255)
-    haze: Scalar = 3.0  # m, height over the skin at which 1/e of an object's own light comes through
-    milk: Scalar = 0.25  # share of the empty view that is scattered by the skin, where no object hides the sky
+    background: Float[Array, "*n 3"] = dataclasses.field(
+        default_factory=lambda: jnp.array([178.0, 178, 204]) / 255, metadata=SHARE
+    )
+    # m, height over the skin at which 1/e of an object's own light comes through
+    haze: Scalar = dataclasses.field(default=3.0, metadata=POSITIVE)
+    # share of the empty view that is scattered by the skin, where no object hides the sky
+    milk: Scalar = dataclasses.field(default=0.25, metadata=SHARE)
     # share of an object's light that skin and gel transmit, close to the background's tint
-    tint: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.8, 0.8, 1.0]))
-    crease: Scalar = 0.4  # share of its light that an object on the skin loses where it hides all of the sky
-    crease_height: Scalar = 0.015  # m, height over the skin at which 1/e of this is lost
-    vignette: Scalar = 0.1  # share of light lost at the pad's edge, as the square of the distance from the centre
-    rim: Scalar = 0.3  # sRGB value of the housing's walls just below the pad's edge, relative to the pad
-    rim_depth: Scalar = 0.03  # m, depth below the skin at which the walls are 1/e as bright
-    exposure: Scalar = 1.0  # exposure time of the visual stream over that of the tactile stream (`expose`)
+    tint: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.8, 0.8, 1.0]), metadata=SHARE)
+    # share of its light that an object on the skin loses where it hides all of the sky
+    crease: Scalar = dataclasses.field(default=0.4, metadata=SHARE)
+    # m, height over the skin at which 1/e of this is lost
+    crease_height: Scalar = dataclasses.field(default=0.015, metadata=POSITIVE)
+    # share of light lost at the pad's edge, as the square of the distance from the centre
+    vignette: Scalar = dataclasses.field(default=0.1, metadata=SHARE)
+    # sRGB value of the housing's walls just below the pad's edge, relative to the pad
+    rim: Scalar = dataclasses.field(default=0.3, metadata=NOT_NEGATIVE)
+    # m, depth below the skin at which the walls are 1/e as bright
+    rim_depth: Scalar = dataclasses.field(default=0.03, metadata=POSITIVE)
+    # exposure time of the visual stream over that of the tactile stream (`expose`)
+    exposure: Scalar = dataclasses.field(default=1.0, metadata=POSITIVE)
 
 
 _SKY_CELLS = 30  # approximate number of cells along each side of the grid of `hidden_sky`
-_SLICES = 4  # slices of an object, to find the sky that it hides
-_LOWEST = 0.0015  # m, least height of a slice
+_SLICES = 4  # slices of an object in `hidden_sky`
+_LOWEST = 0.0015  # m, minimum height of a slice
 
 
 def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -62,7 +78,7 @@ def to_srgb(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 
 def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    """Bilinear look-up. u runs to the right, v = 0 is the top row, and both wrap.
+    """Bilinear look-up in a texture that repeats. u runs to the right, and v = 0 is the top row.
 
     Args:
         texture: any values.
@@ -75,15 +91,7 @@ def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> 
     if size == 1:
         return jnp.broadcast_to(texture[0], (*uv.shape[:-1], 3))
     place = uv * size - 0.5
-    low = jnp.floor(place)
-    part = place - low
-    low = low.astype(jnp.int32) % size
-    high = (low + 1) % size
-    x0, y0, x1, y1 = low[..., 0], low[..., 1], high[..., 0], high[..., 1]
-    px, py = part[..., :1], part[..., 1:]
-    top = texture[y0, x0] * (1 - px) + texture[y0, x1] * px
-    bottom = texture[y1, x0] * (1 - px) + texture[y1, x1] * px
-    return top * (1 - py) + bottom * py
+    return bilinear(texture, place[..., 0], place[..., 1], wrap=True)
 
 
 def hidden_sky(
@@ -125,7 +133,7 @@ def hidden_sky(
     rows, columns = covered.shape
     pitch_y, pitch_x = (s / n * b for s, n, b in zip(size[::-1], heights.shape, blocks, strict=True))
 
-    lowest = jnp.clip(_math.least(jnp.min(heights, axis=0)), _LOWEST, 1)
+    lowest = jnp.clip(_cpu_reductions.minimum(jnp.min(heights, axis=0)), _LOWEST, 1)
     highest = jnp.maximum(top, lowest)
     hidden = jnp.zeros_like(covered)
     for share in (k / (_SLICES - 1) for k in range(_SLICES)):
@@ -137,7 +145,7 @@ def hidden_sky(
 
 
 def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
-    """Share of the sky that a strip, one cell wide at a height of 1, hides from the middle of each cell."""
+    """Share of the sky that a strip, one cell wide at a height of 1, hides from the centre of each cell."""
     index = jnp.arange(number, dtype=jnp.float32)
     away = (index[None, :] - index[:, None] - 0.5) * pitch
     edge = away + pitch
@@ -176,7 +184,7 @@ def housing(
         distance: of the pinhole from that plane (m).
 
     Returns:
-        1 on the pad.
+        Relative values, 1 on the pad.
     """
     beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
     below = distance * (1 - 1 / jnp.maximum(beyond, 1))
@@ -191,8 +199,8 @@ def empty_view(
     Args:
         room: its constants.
         square_radius: squared distance from the pad's centre on the gel's face, in units of half the pad's side.
-        walls: from `housing`. The square is nearly linear light.
-        hidden: from `hidden_sky`.
+        walls: sRGB values relative to the pad, from `housing`. Their squares approximate linear light.
+        hidden: share of the sky, from `hidden_sky`.
 
     Returns:
         Linear light.
@@ -221,8 +229,8 @@ def shade(
         albedo: linear, in [0, 1].
         normals: unit.
         heights: over the gel's face (m).
-        empty: from `empty_view`.
-        hidden: from `hidden_sky`, at the points of the skin in front of the samples.
+        empty: view without the object, from `empty_view`.
+        hidden: share of the sky, from `hidden_sky`, at the points of the skin in front of the samples.
 
     Returns:
         Linear light.
@@ -234,7 +242,7 @@ def shade(
     heights = jnp.maximum(heights, 0)
     lit = 1 - room.crease * hidden * jnp.exp(-heights / room.crease_height)
     through = jnp.exp(-heights / room.haze)
-    # `empty` is the sky's light less the hidden part of the scattered light.
+    # `empty` is the sky's light without the hidden part of the scattered light.
     veil = room.milk * (1 - hidden) / jnp.maximum(1 - room.milk * hidden, 1e-3)
     channels = []
     for k in range(3):

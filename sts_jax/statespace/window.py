@@ -1,15 +1,16 @@
-"""The part of an image that differs from the empty sensor's: found in the image alone, turned upright and magnified."""
+"""Windows around the part of an image that differs from the empty sensor's, turned upright and magnified."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sts_jax._sampling import bilinear_batch
 from sts_jax.statespace import poses
 
 THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (a shadow differs by less)
 MARGIN = 1.1  # side of the window over the larger extent of the silhouette
-SMALLEST = 0.08  # side of the smallest window, of the image's
+SMALLEST = 0.08  # side of the smallest window over that of the image
 
 
 class Window(NamedTuple):
@@ -21,19 +22,19 @@ class Window(NamedTuple):
 
 
 def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """1 where an image shows something, else 0.
+    """1 where an image shows an object, else 0.
 
     Args:
-        change: images less that of the empty sensor.
+        change: images minus that of the empty sensor.
     """
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """The window around everything that an image shows, or the whole image if it shows nothing.
+    """The window around the pixels that show an object, or the whole image if none does.
 
     Args:
-        change: square images less that of the empty sensor.
+        change: square images minus that of the empty sensor.
     """
     size = change.shape[1]
     weight = shows(change)
@@ -64,12 +65,15 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """The windows at another resolution, each pixel the mean of four interpolated values, zero outside of the image.
+    """Cut the windows out of images, at another resolution.
 
     Args:
-        images: square ones.
-        window: of each.
-        side: pixels of the result.
+        images: square images.
+        window: the window of each image.
+        side: side of the result, pixels.
+
+    Returns:
+        Cut images. Each pixel is the mean of four interpolated values, which are zero outside of the image.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5
@@ -81,15 +85,5 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
     """Bilinear interpolation at some columns and rows, whole numbers at pixel centres. Zero outside of the image."""
-    side, channels = images.shape[1], images.shape[-1]
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    # The four neighbours of a place lie side by side, and one lookup finds them.
-    corners = [framed[:, down : down + side + 1, right : right + side + 1] for down in (0, 1) for right in (0, 1)]
-    table = jnp.concatenate(corners, axis=-1).reshape(len(images), (side + 1) ** 2, 4 * channels)
-    places = jnp.clip(places + 1, 0, side + 1)
-    corner = jnp.minimum(jnp.floor(places), side).astype(jnp.int32)
-    index = corner[..., 1] * (side + 1) + corner[..., 0]
-    found = jnp.take_along_axis(table, index[..., None], axis=1).reshape(*index.shape, 4, channels)
-    right, down = places[..., 0] - corner[..., 0], places[..., 1] - corner[..., 1]
-    weights = jnp.stack([(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right], axis=-1)
-    return jnp.sum(weights[..., None] * found, axis=-2)
+    return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)

@@ -1,7 +1,8 @@
 """Touch: the gel's equilibrium and the skin's shape, lights, shadows and reflectance."""
 
 from sts_jax.tactile.gel import Equilibrium, Gel, cell_area, cell_centres, indent, settle
-from sts_jax.tactile.skin import Leds, Lights, Phong, Skin, couple, darken, phong, shadows, surface_normals
+from sts_jax.tactile.normals import surface_normals
+from sts_jax.tactile.skin import Leds, Lights, Phong, Skin, couple, darken, phong, shadows
 
 __all__ = [
     "Equilibrium",

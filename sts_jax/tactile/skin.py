@@ -1,6 +1,6 @@
-"""The lit skin: lateral coupling, surface normals, far and near lights, shadows, Phong reflectance, darkening.
+"""The lit skin: lateral coupling, far and near lights, shadows, Phong reflectance, darkening.
 
-Images are float32, (height, width, 3), and not clipped to [0, 1], because a pixel first sums its light.
+Images are float32, (height, width, 3), and not clipped to [0, 1], because a pixel first sums all its light.
 """
 
 import dataclasses
@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sts_jax import _math, geometry
+from sts_jax import geometry
+from sts_jax._ranges import NOT_NEGATIVE, POSITIVE, STATIC
+from sts_jax._sampling import bilinear, shifted
 
 _NEAREST = 1e-4  # m, least distance between a light and a lit point
 _BRIGHTEST = 60.0  # log of the largest brightness relative to the reference distance, against overflow
 _FAINTEST = 1e-20  # smaller cosines make no highlight, because the gradient of their power would be NaN
-
 
 Scalar = float | Array
 
@@ -32,7 +33,7 @@ class Lights:
     )
     # intensity per channel, diffuse and specular alike (paper, supplement: 1.0 in each light's own channels)
     colors: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+        default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), metadata=NOT_NEGATIVE
     )
 
 
@@ -53,10 +54,13 @@ class Leds:
     )
     # intensity per channel at the reference distance, diffuse and specular alike
     colors: Float[Array, "*n m 3"] = dataclasses.field(
-        default_factory=lambda: jnp.array([[0.7, 0, 0], [0, 0.7, 0], [0, 0, 0.7], [0.7, 0.7, 0.7]])
+        default_factory=lambda: jnp.array([[0.7, 0, 0], [0, 0.7, 0], [0, 0, 0.7], [0.7, 0.7, 0.7]]),
+        metadata=NOT_NEGATIVE,
     )
-    falloff: Scalar = 1.0  # exponent of the fall-off with distance. 2: a point, 1: a long strip, 0: none
-    reference: Scalar = 0.08  # m, distance at which a light has the intensity `colors`
+    # exponent of the fall-off with distance. 2: a point, 1: a long strip, 0: none
+    falloff: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)
+    # m, distance at which a light has the intensity `colors`
+    reference: Scalar = dataclasses.field(default=0.08, metadata=POSITIVE)
 
 
 @jax.tree_util.register_dataclass
@@ -64,11 +68,14 @@ class Leds:
 class Skin:
     """How the skin follows an object that presses on it, and whether its raised parts cast shadows on each other."""
 
-    coupling: Scalar = 0.0  # m, standard deviation of the Gaussian that smooths the imprint, 0 as in the paper
+    # m, standard deviation of the Gaussian that smooths the imprint, 0 as in the paper
+    coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)
     # steps along the way to each light, 0 for no shadows as in the paper
-    shadow_steps: int = dataclasses.field(default=0, metadata={"static": True})
-    shadow_reach: Scalar = 0.02  # m along the gel's face, longest shadow of a raised part. Our choice.
-    penumbra: Scalar = 0.1  # rad, angular height of a light, which is dark where all of it is hidden. Our choice.
+    shadow_steps: int = dataclasses.field(default=0, metadata=NOT_NEGATIVE | STATIC)
+    # m along the gel's face, longest shadow of a raised part. Our choice.
+    shadow_reach: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
+    # rad, angular height of a light, which is dark where all of it is hidden. Our choice.
+    penumbra: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
 
 
 @jax.tree_util.register_dataclass
@@ -76,49 +83,21 @@ class Skin:
 class Phong:
     """Reflectance of the skin's inner side."""
 
-    ambient: Scalar = 0.8  # k_a (paper, supplement "Simulator Details")
-    diffuse: Scalar = 1.0  # k_d (paper, as above)
-    specular: Scalar = 0.5  # k_s (paper, as above)
-    shininess: Scalar = 5.0  # alpha (paper, as above)
-    ambient_color: tuple[Scalar, Scalar, Scalar] = (0.8725, 0.8725, 1.0)  # i_a: a flat gel is (178, 178, 204) / 255
-    darkening: Scalar = 0.001  # m, depth at which the skin is 1/e as bright (paper: a mask, without its shape)
-
-
-def surface_normals(
-    points: tuple[Float[Array, "a b *n"], Float[Array, "a b *n"], Float[Array, "a b *n"]],
-) -> Float[Array, "h w *n 3"]:
-    """Unit normals of a grid of points: the axis of least variance of each point's 3x3 neighbourhood.
-
-    Args:
-        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`. Further axes are
-            further grids.
-
-    Returns:
-        Unit normals towards the camera (z <= 0) (paper, supplement "Simulator Details").
-    """
-    height, width = (n - 2 for n in points[0].shape[:2])
-    # Differences from the middle point, in millimetres, keep the digits of float32.
-    padded = [1e3 * part for part in points]
-    planes = [part[1:-1, 1:-1] for part in padded]
-    near = [
-        [padded[k][i : i + height, j : j + width] - planes[k] for k in range(3)]
-        for i in range(3)
-        for j in range(3)
-        if (i, j) != (1, 1)
-    ]
-    total = [functools.reduce(operator.add, (n[k] for n in near)) for k in range(3)]
-
-    def covariance(i: int, j: int) -> Float[Array, "h w *n"]:
-        return functools.reduce(operator.add, (n[i] * n[j] for n in near)) / 9 - total[i] * total[j] / 81
-
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    normal = _math.smallest_eigenvector(*(covariance(i, j) for i, j in pairs))
-    away = normal[2] > 0
-    return jnp.stack([jnp.where(away, -n, n) for n in normal], axis=-1)
+    # k_a (paper, supplement "Simulator Details")
+    ambient: Scalar = dataclasses.field(default=0.8, metadata=NOT_NEGATIVE)
+    diffuse: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)  # k_d (paper, as above)
+    specular: Scalar = dataclasses.field(default=0.5, metadata=NOT_NEGATIVE)  # k_s (paper, as above)
+    shininess: Scalar = dataclasses.field(default=5.0, metadata=POSITIVE)  # alpha (paper, as above)
+    # i_a, per channel. A flat gel is (178, 178, 204) / 255.
+    ambient_color: tuple[Scalar, Scalar, Scalar] = dataclasses.field(
+        default=(0.8725, 0.8725, 1.0), metadata=NOT_NEGATIVE
+    )
+    # m, depth at which the skin is 1/e as bright (paper: a mask, without its shape)
+    darkening: Scalar = dataclasses.field(default=0.001, metadata=POSITIVE)
 
 
 def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
-    """Smooth an imprint by a Gaussian, because real skin does not follow a sharp edge.
+    """Smooth an imprint by a Gaussian. Real skin does not follow a sharp edge.
 
     The weights are `exp(-r^2 / (2 length^2))` at the pixels' distances r, divided by their sum over the image, so that
     a uniform imprint is unchanged, at the border too. Two dense products compute this, exactly for any length.
@@ -153,15 +132,15 @@ def shadows(
 
         share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
 
-    A light in the gel's plane, such as the paper's, has e = 0. It lights flanks only, and only those parts of them that
-    rise above everything on the way to the light. Flat skin and the tops of pressed parts receive none of this light,
-    in shadow or not (L . N = 0). Its shadows are therefore visible only on flanks behind other raised parts. The
-    shadows of a point light would be endless. The penumbra ends them where a raised part appears lower than `penumbra`.
-    A flank that faces away from a light is dark because of its normal, before it is in shadow.
+    A light in the gel's plane, such as the paper's, has e = 0. It lights only flanks, and only the parts of a flank
+    that rise above everything on the way to the light. Flat skin and the tops of pressed parts receive no light from it
+    (L . N = 0), so its shadows are visible only on flanks behind other raised parts. The shadows of a point light in
+    this plane would be endless. With a penumbra, they end where a raised part appears lower than `penumbra`. A flank
+    that faces away from a light is dark because of its normal, whether it is in shadow or not.
 
     Args:
         skin: number of steps, reach and penumbra. Steps are short near the point and longer away from it
-            (`t = reach (k / steps)^2`), so that a part narrower than a step may cast no shadow far away.
+            (`t = reach (k / steps)^2`). A part narrower than a step may therefore cast no shadow far away.
         lights: far or near. Skin behind a near light does not hide it.
         depth: of the skin below the gel's face (m). Skin beyond the image casts no shadow.
         window: part of the gel's face in the image, (left, top, width, height) (m).
@@ -173,15 +152,22 @@ def shadows(
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     lengths = skin.shadow_reach * (jnp.arange(1, skin.shadow_steps + 1) / max(skin.shadow_steps, 1)) ** 2
     if isinstance(lights, Lights):
-        # The way to a far light is the same everywhere, so the whole image is shifted, with an image's room around it.
+        # The way to a far light is the same everywhere, so the whole image is shifted.
         places = geometry.normalize(lights.directions)
         around = jnp.pad(depth, ((rows + 1, rows + 1), (columns + 1, columns + 1)))
-        look = functools.partial(_moved, around)
+
+        def look(across: Array, down: Array) -> Float[Array, "h w"]:
+            return shifted(around, across, down, (rows, columns))
+
     else:
         places = lights.positions
-        look = functools.partial(_sampled, jnp.pad(depth, 1))
+        padded = jnp.pad(depth, 1)
         x = window[0] + (jnp.arange(columns) + 0.5) * pitch[0]
         x, y = jnp.meshgrid(x, window[1] + (jnp.arange(rows) + 0.5) * pitch[1])
+
+        def look(across: Array, down: Array) -> Float[Array, "h w"]:
+            column, row = jnp.arange(1, columns + 1)[None, :], jnp.arange(1, rows + 1)[:, None]
+            return bilinear(padded, column + across, row + down)
 
     def share(place: Float[Array, "3"]) -> Float[Array, "h w"]:
         if isinstance(lights, Lights):
@@ -201,32 +187,6 @@ def shadows(
     return jnp.stack([share(place) for place in places])
 
 
-def _moved(around: Float[Array, "a b"], across: Float[Array, ""], down: Float[Array, ""]) -> Float[Array, "h w"]:
-    """Bilinear values at an offset in pixels from every pixel of the middle third."""
-    rows, columns = around.shape[0] // 3, around.shape[1] // 3
-    across, down = jnp.clip(across, -columns, columns), jnp.clip(down, -rows, rows)
-    left, top = jnp.floor(across), jnp.floor(down)
-    start = (top.astype(jnp.int32) + rows + 1, left.astype(jnp.int32) + columns + 1)
-    part = jax.lax.dynamic_slice(around, start, (rows + 1, columns + 1))
-    right, low = across - left, down - top
-    part = part[:, :-1] * (1 - right) + part[:, 1:] * right
-    return part[:-1] * (1 - low) + part[1:] * low
-
-
-def _sampled(
-    padded: Float[Array, "a b"], across: Float[Array, "h w"], down: Float[Array, "h w"]
-) -> Float[Array, "h w"]:
-    """Bilinear values at an offset in pixels from each pixel. The padded image has a border of one pixel."""
-    rows, columns = across.shape
-    column = jnp.clip(jnp.arange(1, columns + 1)[None, :] + across, 0, columns + 1)
-    row = jnp.clip(jnp.arange(1, rows + 1)[:, None] + down, 0, rows + 1)
-    left, top = jnp.minimum(jnp.floor(column), columns), jnp.minimum(jnp.floor(row), rows)
-    right, low = column - left, row - top
-    i, j = top.astype(jnp.int32), left.astype(jnp.int32)
-    upper = padded[i, j] * (1 - right) + padded[i, j + 1] * right
-    return upper * (1 - low) + (padded[i + 1, j] * (1 - right) + padded[i + 1, j + 1] * right) * low
-
-
 def phong(
     phong: Phong,
     lights: Lights | Leds,
@@ -238,16 +198,16 @@ def phong(
 
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
-    with both products clipped at 0. V is the optical axis, as for a distant viewer, so that flat skin under far lights
-    is uniform. For a near light at p_m, L_m points to p_m and the intensity is `(reference / |p_m - x|)^falloff i_m`,
-    where distances below 0.1 mm count as 0.1 mm.
+    Both products are clipped at 0. V is the optical axis, as for a distant viewer, so that flat skin under far lights
+    is uniform. For a near light at p_m, L_m points to p_m and the intensity is `(reference / |p_m - x|)^falloff i_m`.
+    Distances below 0.1 mm count as 0.1 mm.
 
     Args:
         phong: constants of the skin's reflectance.
         lights: far (directions need not be of unit length) or near.
         normals: unit, towards the camera.
         points: of the skin, sensor frame (m). Far lights do not need them.
-        shares: of each light that arrives, from `shadows`. Default: all of it.
+        shares: share of each light that arrives, from `shadows`. Default: 1.
 
     Returns:
         Image, not clipped (paper, equation "phong").
@@ -273,7 +233,7 @@ def phong(
 
 
 def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
-    """Components of a vector divided by its length, and the length, which is at least `_NEAREST`."""
+    """Components of a vector divided by its length, and this length, which is at least `_NEAREST`."""
     square = functools.reduce(operator.add, (p * p for p in parts))
     length = jnp.sqrt(jnp.maximum(square, _NEAREST**2))
     return (*(p / length for p in parts), length)

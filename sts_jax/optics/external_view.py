@@ -1,12 +1,12 @@
-"""Pictures of a scene from outside, to look at: any triangles from any viewpoint, with the sensor's rasteriser."""
+"""Pictures of a scene from outside the sensor: any triangles from any viewpoint, with the sensor's rasteriser."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sts_jax import geometry
 from sts_jax.optics.camera import Camera, full_window, rays, to_pixels
-from sts_jax.optics.rasterise import barycentrics, pixel_centres, rasterise
 from sts_jax.optics.shading import to_srgb
+from sts_jax.optics.zbuffer import barycentrics, pixel_centres, rasterise
 
 _SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # light from above and from below, linear
 _LAMP = (0.45, 0.43, 0.40)  # light of a lamp over the viewer's left shoulder, linear
@@ -28,15 +28,15 @@ def photograph(
     """Draw triangles from any viewpoint, z up, by daylight and a lamp, on white.
 
     Args:
-        vertices: World frame (m).
-        faces: Corner indices, counter-clockwise seen from outside.
-        normals: Unit normal at each corner of each face.
-        albedo: Linear colour at each corner of each face.
-        eye: Position of the pinhole (m), not straight above or below the target.
-        target: Point in the middle of the picture (m).
-        fov: Vertical field of view (rad).
+        vertices: world frame (m).
+        faces: corner indices, counter-clockwise seen from outside.
+        normals: unit normal at each corner of each face.
+        albedo: linear colour at each corner of each face.
+        eye: position of the pinhole (m), not straight above or below the target.
+        target: point in the middle of the picture (m).
+        fov: vertical field of view (rad).
         resolution: (height, width), pixels.
-        two_sided: Whether faces are visible from behind too.
+        two_sided: whether faces are visible from behind too.
 
     Returns:
         Image, sRGB in [0, 1].
@@ -46,7 +46,7 @@ def photograph(
     right = geometry.normalize(jnp.cross(forward, jnp.array([0.0, 0.0, 1.0])))
     turn = jnp.stack([right, jnp.cross(forward, right), forward])
     shape = (resolution[0] * _SAMPLES, resolution[1] * _SAMPLES)
-    # The pinhole of `camera` is at z = -distance, so the origin is the point one metre ahead.
+    # The pinhole of a `Camera` is at z = -distance, so the origin is the point one metre ahead.
     camera = Camera(distance=1.0, fov=fov, aspect=resolution[1] / resolution[0], near=0.01)
     window = full_window(camera, shape)
     points = (vertices - eye) @ turn.T - jnp.array([0.0, 0.0, 1.0])

@@ -1,10 +1,10 @@
 """`looped`: a function that `jax.vmap` turns into a loop on a CPU, including its derivatives.
 
 Under `jax.vmap`, a function with a data-dependent loop, such as the rasteriser, runs the whole batch for as many
-iterations as its slowest item needs. On a CPU, one item after the other is several times as fast. JAX has
-`jax.custom_batching.sequential_vmap` for this, but without a reverse-mode derivative. Here the derivative is a linear
-primitive with its own batching rule. It keeps the arguments of the function, not the intermediate values, and
-evaluates the function once more in the backward pass.
+iterations as its slowest item needs. On a CPU, one item after the other is several times as fast.
+`jax.custom_batching.sequential_vmap` has the same purpose, but no reverse-mode derivative. Here the derivative is a
+linear primitive with its own batching rule. It stores the arguments of the function and not the intermediate values,
+and evaluates the function once more in the backward pass.
 """
 
 import functools

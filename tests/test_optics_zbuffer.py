@@ -1,4 +1,4 @@
-"""The rasteriser against embree and against every pixel tested with every face."""
+"""The rasteriser against embree and against a loop over all faces and pixels."""
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +62,7 @@ def some_pose(rng):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("name", BODIES)
-def test_depth_is_embrees(name, shape):
+def test_depth_equals_embrees(name, shape):
     body = BODIES[name]
     rng = np.random.default_rng(1)
     for _ in range(2):
@@ -74,7 +74,7 @@ def test_depth_is_embrees(name, shape):
         error = np.abs(depth[inner] - truth[inner])
         assert np.sum(error > 1e-5) <= 0.001 * error.size
         assert error.max(initial=0) < 1e-4
-        # The silhouette may differ where a pixel's neighbours are not all the same.
+        # The silhouette may differ where the pixels around a pixel differ.
         differs = np.isfinite(depth) != np.isfinite(truth)
         hit = np.isfinite(truth)
         padded = np.pad(hit, 1, mode="edge")
@@ -85,7 +85,7 @@ def test_depth_is_embrees(name, shape):
 
 
 @pytest.mark.parametrize("chunk", [64, 2048])
-def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
+def test_faces_of_any_size_equal_a_loop_over_all_faces(chunk):
     rng = np.random.default_rng(3)
     shape = (31, 23)
     centre = rng.uniform(-5, 35, (60, 1, 2))
@@ -103,7 +103,7 @@ def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
         ]
         w = np.stack([*w, 1 - w[0] - w[1]])
         if area >= 0:
-            continue  # from behind
+            continue  # faces away
         near_edge |= np.abs(w * area).min(0) < 1e-2 * np.abs(triangle - triangle[[1, 2, 0]]).max()
         value = np.tensordot(depth, w, 1)
         closer = np.all(w >= 0, axis=0) & (value < best)
@@ -117,9 +117,9 @@ def test_faces_of_any_size_are_what_a_loop_over_all_finds(chunk):
     assert (~near_edge).mean() > 0.5
 
 
-@pytest.mark.parametrize("number", [100, 1500])  # one group of faces, and two that overlap
+@pytest.mark.parametrize("number", [100, 1500])  # one group of faces, and two groups that overlap
 def test_a_surface_has_no_cracks(number):
-    # a fan of slivers that meet in one point: every pixel inside is covered
+    # A fan of slivers that meet in one point covers every pixel inside.
     angles = np.linspace(0, 2 * np.pi, number + 1)[:-1]
     rim = np.stack([32.3 + 29 * np.cos(angles), 31.7 + 29 * np.sin(angles)], -1)
     points = jnp.asarray(np.concatenate([rim, [[32.3, 31.7]]]), jnp.float32)
@@ -135,7 +135,7 @@ def test_a_surface_has_no_cracks(number):
     assert np.all(np.asarray(winner)[inside] >= 0)
 
 
-def test_faces_of_vertices_that_are_not_kept_are_left_out():
+def test_faces_with_a_vertex_that_is_not_kept_are_not_drawn():
     points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]] * 3)
     order = jnp.repeat(jnp.array([3.0, 2.0, 1.0]), 3).at[8].set(1.5)
     faces = jnp.arange(9).reshape(3, 3)
@@ -149,7 +149,7 @@ def test_faces_of_vertices_that_are_not_kept_are_left_out():
     assert nearest(keep.at[jnp.array([7, 3])].set(False)) == 0
 
 
-def test_two_sided_faces_are_seen_from_behind():
+def test_two_sided_faces_are_visible_from_behind():
     points = jnp.array([[2.0, 2.0], [12.0, 2.0], [2.0, 12.0]])
     faces = jnp.array([[0, 1, 2]])
     for two_sided in (False, True):
@@ -159,7 +159,7 @@ def test_two_sided_faces_are_seen_from_behind():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["bumpy", "ring", "bottle"])
-def test_faces_within_an_order_have_an_image_of_their_own(name):
+def test_near_faces_have_an_image_of_their_own(name):
     body = BODIES[name]
     points = geometry.transform(some_pose(np.random.default_rng(7)), body.vertices)
     faces, height = np.asarray(body.faces), np.asarray(points[:, 2])
@@ -180,7 +180,7 @@ def test_faces_within_an_order_have_an_image_of_their_own(name):
     np.testing.assert_array_equal(both[1], alone(faces))
 
 
-def test_vmap_is_the_loop():
+def test_vmap_agrees_with_a_loop():
     body = BODIES["ring"]
     rng = np.random.default_rng(5)
     poses = jnp.stack([some_pose(rng) for _ in range(3)])
@@ -188,12 +188,12 @@ def test_vmap_is_the_loop():
     for pose, winner in zip(poses, batch, strict=True):
         alone = drawn(body.vertices, body.faces, body.two_sided, pose, (64, 64))[1]
         assert np.sum(np.asarray(alone) >= 0) > 40
-        # Two programs round differently on some machines: a pixel on the edge between two faces may go to the other.
+        # Two programs round differently on some machines, which can swap the two faces at a pixel on their edge.
         assert np.sum(alone != winner) <= 4
 
 
 @pytest.mark.slow
-def test_depths_gradient_is_the_finite_difference():
+def test_gradient_of_depth_equals_finite_differences():
     body = BODIES["box"]
     pose = jnp.asarray([0.004, -0.003, 0.06, 0.9, 0.3, 0.2, 0.24])
     pose = pose.at[3:].divide(jnp.linalg.norm(pose[3:]))

@@ -7,13 +7,13 @@ under `vmap`, the function is called once with the whole image.
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
-from sts_jax import _math
+from sts_jax import _cpu_reductions
 
 TILE = 4  # pixels, side of a tile
 BATCH = 64  # tiles evaluated at a time
@@ -26,18 +26,18 @@ Function = Callable[[Any, Images], Images]
 def where_active(
     function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images, *, ring: int = 0
 ) -> Images:
-    """`jnp.where(active, function(params, images), otherwise)`, at the cost of the tiles with an active pixel.
+    """Evaluate `jnp.where(active, function(params, images), otherwise)` on the tiles with an active pixel.
 
     Derivatives are those of this expression over the whole image.
 
     Args:
         function: `(params, images) -> images'`, from images of any size (a + 2 ring, b + 2 ring) to images (a, b). An
             output pixel must depend only on the input pixels within `ring` of it. A third axis of the images, over
-            tiles, must be preserved. `function` must not close over tracers: pass all values as arguments.
+            tiles, must be preserved. `function` must not close over traced values: pass them as arguments.
         active: pixels where the result is needed.
         params: passed to `function` unchanged.
         images: tree of (h + 2 ring, w + 2 ring). An image of one row or one column is broadcast.
-        otherwise: tree of (h, w) with the values of the other pixels, of the same structure as `function` returns.
+        otherwise: tree of (h, w) with the values of the other pixels, of the structure that `function` returns.
         ring: number of neighbouring pixels in each direction that `function` needs.
 
     Returns:
@@ -46,6 +46,16 @@ def where_active(
     if min(active.shape) < TILE:
         return _dense(function, active, params, images, otherwise)
     return _where_active(function, ring, active, params, images, otherwise)
+
+
+def lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
+    """The first row of an image of x values and the first column of one of y values, since all others are equal."""
+    return images[0][:1], images[1][:, :1]
+
+
+def planes(image: Float[Array, "h w *n 3"]) -> list[Float[Array, "h w *n"]]:
+    """The three channels of an image."""
+    return [image[..., k] for k in range(3)]
 
 
 def _dense(function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images) -> Images:
@@ -76,6 +86,13 @@ def _where_active(
     return chosen(*leaves)
 
 
+class _Progress(NamedTuple):
+    """State of the loop over batches of tiles."""
+
+    next_tile: Int[Array, ""]  # first tile of the next batch
+    result: Images
+
+
 def _sparse(
     function: Function, ring: int, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images
 ) -> Images:
@@ -85,16 +102,17 @@ def _sparse(
     flags = jnp.pad(active, [(0, rows * TILE - height), (0, columns * TILE - width)])
     used = jnp.any(flags.reshape(rows, TILE, columns, TILE), axis=(1, 3)).reshape(number)
     end = jnp.sum(used)
-    order = jnp.pad(_math.positions(used), (0, -number % BATCH), constant_values=number)
+    order = jnp.pad(_cpu_reductions.flatnonzero(used), (0, -number % BATCH), constant_values=number)
     # The last row and column of tiles overlap those before them, so that every tile lies in the image. The last batch
     # is filled up with repetitions of one of these tiles.
     first_row = jnp.minimum(order // columns * TILE, height - TILE)
     first_column = jnp.minimum(order % columns * TILE, width - TILE)
 
-    def body(state: tuple[Array, Images]) -> tuple[Array, Images]:
-        base, result = state
+    def evaluate_batch(progress: _Progress) -> _Progress:
         # Tiles lie along the last axis, where a CPU vectorises best.
-        row, column = (jax.lax.dynamic_slice(first, (base,), (BATCH,)) for first in (first_row, first_column))
+        row, column = (
+            jax.lax.dynamic_slice(first, (progress.next_tile,), (BATCH,)) for first in (first_row, first_column)
+        )
         inside = jnp.arange(TILE, dtype=jnp.int32)[:, None]
         own = (row[None, :] + inside)[:, None] * width + (column[None, :] + inside)[None, :]
 
@@ -111,15 +129,17 @@ def _sparse(
         wanted = active.reshape(-1).at[own].get(mode="promise_in_bounds")
         own = jnp.where(wanted, own, height * width).reshape(-1)
 
-        def put(all_: Array, value: Array) -> Array:
-            return all_.reshape(-1).at[own].set(value.reshape(-1), mode="drop").reshape(height, width)
+        def put(image: Array, value: Array) -> Array:
+            return image.reshape(-1).at[own].set(value.reshape(-1), mode="drop").reshape(height, width)
 
-        return base + BATCH, jax.tree.map(put, result, values)
+        return _Progress(progress.next_tile + BATCH, jax.tree.map(put, progress.result, values))
+
+    def tile_by_tile() -> Images:
+        start = _Progress(jnp.int32(0), otherwise)
+        return jax.lax.while_loop(lambda progress: progress.next_tile < end, evaluate_batch, start).result
 
     return jax.lax.cond(
-        end > CROWDED * number,
-        lambda: _dense(function, active, params, images, otherwise),
-        lambda: jax.lax.while_loop(lambda state: state[0] < end, body, (jnp.int32(0), otherwise))[1],
+        end > CROWDED * number, lambda: _dense(function, active, params, images, otherwise), tile_by_tile
     )
 
 

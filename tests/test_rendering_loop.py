@@ -1,11 +1,11 @@
-"""`looped` against the plain function: values, derivatives, batches, and that a batch is a loop."""
+"""`looped` against the plain function: values, derivatives and batches."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax._loop import looped
+from sts_jax.rendering.loop import looped
 
 
 def plain(x, n, p):
@@ -40,7 +40,7 @@ WAYS = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_every_transformation_gives_what_the_plain_function_gives(way):
+def test_every_transformation_equals_that_of_the_plain_function(way):
     ours, theirs = WAYS[way](looped(plain)), WAYS[way](plain)
     assert jax.tree.structure(ours) == jax.tree.structure(theirs)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), ours, theirs)

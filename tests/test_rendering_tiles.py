@@ -1,17 +1,17 @@
-"""An image function on the tiles that need it, against the same function on the whole image."""
+"""An image function on active tiles against the same function on the whole image."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sts_jax._tiles import TILE, where_active
+from sts_jax.rendering.tiles import TILE, where_active
 
 SHAPES = [(8, 8), (17, 33), (64, 64), (131, 53), (5, 40), (TILE - 1, 40)]
 
 
 def blur(params, images):
-    """Every pixel from its 3x3 neighbourhood, twice over."""
+    """Two images, each pixel from its 3x3 neighbourhood."""
     first, second = images
     height, width = (n - 2 for n in first.shape[:2])
     total = sum(first[i : i + height, j : j + width] for i in range(3) for j in range(3))
@@ -44,7 +44,7 @@ def dense(active, params, images, otherwise):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_it_is_where_of_the_whole_image(shape):
+def test_result_equals_where_over_the_whole_image(shape):
     given = inputs(shape, jax.random.key(1))
     tiled = jax.jit(lambda active, *rest: where_active(blur, active, *rest, ring=1))
     for name, active in patterns(shape):
@@ -53,7 +53,7 @@ def test_it_is_where_of_the_whole_image(shape):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_row_and_a_column_stand_for_images_of_such(shape):
+def test_a_single_row_or_column_is_broadcast(shape):
     rng = np.random.default_rng(3)
     image, otherwise = (jnp.asarray(rng.normal(size=shape), jnp.float32) for _ in range(2))
     across, down = jnp.arange(shape[1], dtype=jnp.float32)[None, :], jnp.arange(shape[0], dtype=jnp.float32)[:, None]
@@ -68,7 +68,7 @@ def test_a_row_and_a_column_stand_for_images_of_such(shape):
         np.testing.assert_allclose(tiled(active), expected, rtol=1e-6, err_msg=name)
 
 
-def test_vmap_is_the_loop():
+def test_vmap_agrees_with_a_loop():
     shape = (40, 27)
     active = jnp.asarray(np.stack([pattern for _, pattern in patterns(shape)]))
     given = jax.vmap(lambda key: inputs(shape, key))(jax.random.split(jax.random.key(2), len(active)))
@@ -79,7 +79,7 @@ def test_vmap_is_the_loop():
             np.testing.assert_allclose(one[k], other, atol=1e-5)
 
 
-def test_its_gradient_is_that_of_the_whole_image():
+def test_gradient_equals_that_of_the_whole_image():
     shape = (TILE + 3, 3 * TILE)
     given = inputs(shape, jax.random.key(3))
     active = jnp.asarray(np.random.default_rng(1).uniform(size=shape) < 0.3)

@@ -1,51 +1,44 @@
-"""Reductions in a form that XLA's CPU backend vectorises, and an eigenvector in closed form."""
+"""Normals of a surface that is given by a grid of points."""
 
 import functools
-from collections.abc import Callable
+import operator
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
-
-_LANES = 32  # row length in `running_sum`, and half the length from which `_fold` splits a vector
+from jaxtyping import Array, Float
 
 
-def least(values: Array) -> Array:
-    """`jnp.min` of a vector by elementwise minima of its parts, which a CPU vectorises. XLA's own is sequential."""
-    return _fold(jnp.minimum, jnp.min, values)
+def surface_normals(
+    points: tuple[Float[Array, "a b *n"], Float[Array, "a b *n"], Float[Array, "a b *n"]],
+) -> Float[Array, "h w *n 3"]:
+    """Unit normals of a grid of points: the axis of least variance of each point's 3x3 neighbourhood.
 
+    Args:
+        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`. Further axes
+            hold further grids.
 
-def most(values: Array) -> Array:
-    """`jnp.max` of a vector, computed like `least`."""
-    return _fold(jnp.maximum, jnp.max, values)
+    Returns:
+        Unit normals towards the camera (z <= 0) (paper, supplement "Simulator Details").
+    """
+    height, width = (n - 2 for n in points[0].shape[:2])
+    # Differences from the middle point, in millimetres, preserve the precision of float32.
+    padded = [1e3 * part for part in points]
+    planes = [part[1:-1, 1:-1] for part in padded]
+    near = [
+        [padded[k][i : i + height, j : j + width] - planes[k] for k in range(3)]
+        for i in range(3)
+        for j in range(3)
+        if (i, j) != (1, 1)
+    ]
+    total = [functools.reduce(operator.add, (n[k] for n in near)) for k in range(3)]
 
+    def covariance(i: int, j: int) -> Float[Array, "h w *n"]:
+        return functools.reduce(operator.add, (n[i] * n[j] for n in near)) / 9 - total[i] * total[j] / 81
 
-def running_sum(counts: Array) -> Int[Array, "n"]:
-    """`jnp.cumsum` of integers whose sum is below 2^24, as products with triangular matrices. Faster on a CPU."""
-    size = len(counts)
-    rows = -(-size // _LANES)
-    table = jnp.pad(counts.astype(jnp.float32), (0, rows * _LANES - size)).reshape(rows, _LANES)
-    sums = jnp.matmul(table, jnp.triu(jnp.ones((_LANES, _LANES))), precision=jax.lax.Precision.HIGHEST)
-    sums = sums.astype(jnp.int32)
-    if rows > 1:
-        sums = sums.at[1:].add(running_sum(sums[:-1, -1])[:, None])
-    return sums.reshape(-1)[:size]
-
-
-def positions(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
-    """Indices of the set flags in order, padded with n to the length of `flags`."""
-    size = len(flags)
-    place = jnp.where(flags, running_sum(flags) - 1, size)
-    return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
-
-
-def _fold(pair: Callable[[Array, Array], Array], whole: Callable[[Array], Array], values: Array) -> Array:
-    while len(values) >= 2 * _LANES:
-        part = len(values) // 8
-        parts = [values[k * part : (k + 1) * part] for k in range(8)]
-        rest = values[8 * part :]
-        values = jnp.concatenate([functools.reduce(pair, parts), rest]) if len(rest) else functools.reduce(pair, parts)
-    return whole(values)
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    normal = smallest_eigenvector(*(covariance(i, j) for i, j in pairs))
+    away = normal[2] > 0
+    return jnp.stack([jnp.where(away, -n, n) for n in normal], axis=-1)
 
 
 @jax.custom_jvp
@@ -61,20 +54,20 @@ def smallest_eigenvector(
 
     The eigenvalue lambda is the smallest root of the characteristic cubic, `mean + spread b` with `b^3 - 3 b = 2 h`,
     computed as a polynomial in `sqrt(1 - h)` and one Newton step. The vector is the largest column of
-    `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. The derivative only needs lambda to be simple.
-    The other two eigenvalues may be equal, as for points spread evenly in a plane. If lambda is not simple, some unit
-    vector is returned, with zero gradient.
+    `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. The derivative exists if lambda is simple.
+    The other two eigenvalues may be equal, as for points spread evenly in a plane. If lambda is not simple, the result
+    is an arbitrary unit vector with zero gradient.
 
     Args:
-        xx: with the other five, the elements of A. Separate arrays are faster on a CPU.
-        yy: see above.
-        zz: see above.
-        xy: see above.
-        xz: see above.
-        yz: see above.
+        xx: element (0, 0) of A. Separate arrays are faster on a CPU.
+        yy: element (1, 1).
+        zz: element (2, 2).
+        xy: element (0, 1).
+        xz: element (0, 2).
+        yz: element (1, 2).
 
     Returns:
-        The vector's three components. Its sign is arbitrary.
+        Components x, y and z of the vector. Its sign is arbitrary.
     """
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean

@@ -1,0 +1,48 @@
+"""Reductions of vectors in a form that XLA's CPU backend vectorises. XLA computes its own one element at a time."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+_LANES = 32  # row length in `cumsum`, and half the length from which `_fold` splits a vector
+
+
+def minimum(values: Array) -> Array:
+    """`jnp.min` of a vector, by elementwise minima of its parts."""
+    return _fold(jnp.minimum, jnp.min, values)
+
+
+def maximum(values: Array) -> Array:
+    """`jnp.max` of a vector, by elementwise maxima of its parts."""
+    return _fold(jnp.maximum, jnp.max, values)
+
+
+def cumsum(counts: Array) -> Int[Array, "n"]:
+    """`jnp.cumsum` of integers whose sum is below 2^24, as products with triangular matrices."""
+    size = len(counts)
+    rows = -(-size // _LANES)
+    table = jnp.pad(counts.astype(jnp.float32), (0, rows * _LANES - size)).reshape(rows, _LANES)
+    sums = jnp.matmul(table, jnp.triu(jnp.ones((_LANES, _LANES))), precision=jax.lax.Precision.HIGHEST)
+    sums = sums.astype(jnp.int32)
+    if rows > 1:
+        sums = sums.at[1:].add(cumsum(sums[:-1, -1])[:, None])
+    return sums.reshape(-1)[:size]
+
+
+def flatnonzero(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
+    """`jnp.flatnonzero` of a vector of flags, padded with n to the length of `flags`."""
+    size = len(flags)
+    place = jnp.where(flags, cumsum(flags) - 1, size)
+    return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
+
+
+def _fold(pair: Callable[[Array, Array], Array], whole: Callable[[Array], Array], values: Array) -> Array:
+    while len(values) >= 2 * _LANES:
+        part = len(values) // 8
+        parts = [values[k * part : (k + 1) * part] for k in range(8)]
+        rest = values[8 * part :]
+        values = jnp.concatenate([functools.reduce(pair, parts), rest]) if len(rest) else functools.reduce(pair, parts)
+    return whole(values)

@@ -1,0 +1,39 @@
+"""Allowed ranges of a dataclass's fields, declared in their metadata.
+
+`aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that all numbers of the field are > 0.
+The keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=). `limits` evaluates them.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+POSITIVE = {"above": 0.0}
+NOT_NEGATIVE = {"at_least": 0.0}
+SHARE = {"at_least": 0.0, "at_most": 1.0}
+STATIC = {"static": True}  # JAX compiles a program for each value of the field
+
+_SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes smaller numbers to 0
+
+
+def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
+    """Compare numbers with the range of a field.
+
+    Args:
+        metadata: of the field.
+        array: the numbers, a NumPy array or a traced one.
+
+    Returns:
+        For each limit, whether all numbers keep it, and the message if they do not.
+    """
+    found = []
+    if "above" in metadata:
+        found.append(((array - metadata["above"] >= _SMALLEST).all(), f"it must be > {metadata['above']:g}"))
+    if "at_least" in metadata:
+        found.append(((array >= metadata["at_least"]).all(), f"it must be >= {metadata['at_least']:g}"))
+    if "below" in metadata:
+        found.append(((array < metadata["below"]).all(), f"it must be < {metadata['below']:.4f}"))
+    if "at_most" in metadata:
+        found.append(((array <= metadata["at_most"]).all(), f"it must be <= {metadata['at_most']:g}"))
+    return found

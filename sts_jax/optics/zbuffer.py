@@ -1,0 +1,306 @@
+"""A z-buffer in plain JAX: the nearest face at each pixel, for triangles of any size on the screen.
+
+Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop takes the list of runs in chunks,
+and each chunk column by column, so the work grows with the covered pixels and not with the product of faces and pixels.
+Each step is one scatter-min of a 32-bit key, with the depth in the high bits and the index of the face in the low ones.
+The choice of the face has no gradient. Values interpolated from the chosen face have one.
+
+Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. `order` is smaller for
+nearer points and affine across a face on the screen: -1/depth in the view of a pinhole, depth in a parallel view.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, ScalarLike, UInt32
+
+from sts_jax import _cpu_reductions
+
+_SLACK = 1e-4  # pixels by which faces are enlarged, so that no pixel centre on a shared edge is missed
+_GROUP = 1024  # faces cut at a time
+_RUN = 8  # pixels of the longest run
+_NOTHING = np.uint32(0xFFFFFFFF)  # key of a pixel without a face
+
+_Corner = tuple[Array, Array, Array]  # column, row, order
+
+
+class _Screen(NamedTuple):
+    """The triangles to draw."""
+
+    column: Float[Array, "v"]  # pixels, of the vertices
+    row: Float[Array, "v"]  # pixels
+    order: Float[Array, "v"]
+    keep: Bool[Array, "v"]
+    faces: Int[Array, "f 3"]
+    two_sided: Bool[Array, ""]
+
+    def corners(self, chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
+        """The three corners of some faces."""
+        a, b, c = ((self.column[k], self.row[k], self.order[k]) for k in self.faces[chosen].T)
+        return a, b, c
+
+
+class _Runs(NamedTuple):
+    """State of the loop over groups of faces: the list of faces that have runs."""
+
+    next_face: Int[Array, ""]  # first face of the next group
+    count: Int[Array, ""]  # number of listed faces
+    total: Int[Array, ""]  # number of their runs
+    first: Int[Array, "n"]  # number of the first run of each listed face
+    face: Int[Array, "n"]  # index of the face
+    per_row: Int[Array, "n"]  # number of runs in each of its rows
+
+
+class _Canvas(NamedTuple):
+    """State of the loop over chunks of runs: the keys drawn so far."""
+
+    next_run: Int[Array, ""]  # first run of the next chunk
+    listed: Int[Array, ""]  # the listed face with the last run before it
+    image: UInt32[Array, "p"]  # key of each pixel
+
+
+class _Spans(NamedTuple):
+    """The runs of one chunk."""
+
+    pixel: Int[Array, "r"]  # index of the first pixel
+    length: Int[Array, "r"]  # number of pixels, at most `_RUN`
+    face: Int[Array, "r"]
+    value: Float[Array, "r"]  # order at the first pixel
+    slope: Float[Array, "r"]  # change of the order per pixel
+    least: Float[Array, "r"]  # least order of the face's corners
+    most: Float[Array, "r"]
+
+
+def rasterise(
+    points: Float[Array, "v 2"],
+    order: Float[Array, "v"],
+    faces: Int[Array, "f 3"],
+    keep: Bool[Array, "v"],
+    two_sided: Bool[Array, ""],
+    shape: tuple[int, int],
+    *,
+    within: ScalarLike | None = None,
+    chunk: int = 1024,
+) -> Int[Array, "*layers h w"]:
+    """Index of the nearest face at every pixel centre.
+
+    Args:
+        points: vertices on the screen, (column, row) in pixels.
+        order: of each vertex, smaller is nearer.
+        faces: corner indices, counter-clockwise seen from outside the object in a right-handed frame. Padding faces at
+            the end, whose three corners are the same vertex, cost next to nothing.
+        keep: vertices that can be drawn. A face is drawn if all three of its corners can be.
+        two_sided: whether faces are visible from behind too.
+        shape: (height, width) of the image, pixels.
+        within: an order. If given, the faces with a corner nearer than this are also drawn in an image of their own.
+        chunk: runs drawn at a time.
+
+    Returns:
+        Face indices, -1 where no face is visible. With `within`, two such images, (2, h, w): of the near faces, and of
+        all faces. No gradient.
+    """
+    points, order, within = jax.lax.stop_gradient((points, order, within))
+    screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided)
+    image = _draw(screen, _list_runs(screen, shape, chunk), shape, within, chunk)
+    if within is not None:
+        near, far = image.reshape(2, math.prod(shape))
+        image = jnp.stack([near, jnp.minimum(near, far)])
+    winner = (image & jnp.uint32(2 ** _face_bits(faces) - 1)).astype(jnp.int32)
+    layers = () if within is None else (2,)
+    return jnp.where(image == _NOTHING, -1, winner).reshape(*layers, *shape)
+
+
+def _face_bits(faces: Int[Array, "f 3"]) -> int:
+    """Number of bits of a key that hold the index of a face."""
+    return max((faces.shape[0] - 1).bit_length(), 1)
+
+
+def _list_runs(screen: _Screen, shape: tuple[int, int], chunk: int) -> _Runs:
+    """List all faces that have runs, one group of faces at a time."""
+    faces = screen.faces
+    num_faces = faces.shape[0]
+    group = min(_GROUP, num_faces)
+    different = (faces[:, 0] != faces[:, 1]) | (faces[:, 0] != faces[:, 2])
+    real = _cpu_reductions.maximum(jnp.where(different, jnp.arange(1, num_faces + 1, dtype=jnp.int32), 0))
+
+    def append(runs: _Runs) -> _Runs:
+        face = jnp.minimum(runs.next_face, num_faces - group) + jnp.arange(group, dtype=jnp.int32)
+        per_row, number = _count_runs(screen, face, runs.next_face, shape)
+        nth, upto = _cpu_reductions.cumsum(number > 0), jnp.cumsum(number, dtype=jnp.int32)
+        place = jnp.where(number > 0, runs.count + nth - 1, num_faces + chunk)
+        return _Runs(
+            runs.next_face + group,
+            runs.count + nth[-1],
+            runs.total + upto[-1],
+            runs.first.at[place].set(runs.total + upto - number, mode="drop"),
+            runs.face.at[place].set(face, mode="drop"),
+            runs.per_row.at[place].set(per_row, mode="drop"),
+        )
+
+    zero = jnp.int32(0)
+    none = jnp.full(num_faces + chunk, jnp.iinfo(jnp.int32).max, jnp.int32)
+    return jax.lax.while_loop(
+        lambda runs: runs.next_face < real, append, _Runs(zero, zero, zero, first=none, face=none, per_row=none)
+    )
+
+
+def _count_runs(
+    screen: _Screen, face: Int[Array, "n"], first_face: Int[Array, ""], shape: tuple[int, int]
+) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+    """Number of runs per row and in total of some faces, 0 in total for those that are not drawn.
+
+    Faces before `first_face` belong to an earlier group and are not drawn again.
+    """
+    height, width = shape
+    a, b, c = screen.corners(face)
+    area = _cross(a, b, c)
+    # Seen along +z with x right and y down, a face towards the camera is counter-clockwise: negative area.
+    drawn = jnp.where(screen.two_sided, area != 0, area < 0) & jnp.all(screen.keep[screen.faces[face]], axis=1)
+    left, right = _lowest(a[0], b[0], c[0]), _highest(a[0], b[0], c[0])
+    top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
+    tall = bottom - top
+    widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
+    # A face that is nearly flat on the screen has rows as wide as the face.
+    widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
+    outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
+    empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
+    columns = jnp.clip(jnp.floor(widest + 2 * _SLACK) + 1, 0, width)
+    rows = jnp.clip(jnp.floor(bottom + _SLACK), -1, height - 1) - _first_row(top, height) + 1
+    drawn &= (face >= first_face) & ~outside & ~empty & (rows > 0)
+    per_row = jnp.ceil(columns / _RUN)
+    number = jnp.where(drawn, rows * per_row, 0).astype(jnp.int32)
+    return per_row.astype(jnp.int32), number
+
+
+def _draw(
+    screen: _Screen, runs: _Runs, shape: tuple[int, int], within: ScalarLike | None, chunk: int
+) -> UInt32[Array, "p"]:
+    """Smallest key at each pixel. With `within`, near faces come first, and the other faces in a second image."""
+    pixels = math.prod(shape) * (1 if within is None else 2)
+    nearest = _cpu_reductions.minimum(jnp.where(screen.keep, screen.order, jnp.inf))
+    last = _cpu_reductions.maximum(jnp.where(screen.keep, screen.order, -jnp.inf))
+    face_bits = _face_bits(screen.faces)
+    levels = 2.0 ** min(32 - face_bits, 23) - 2
+    scale = levels / jnp.where(last > nearest, last - nearest, 1)
+
+    def draw_chunk(canvas: _Canvas) -> _Canvas:
+        spans, listed = _spans(screen, runs, canvas, shape, within, chunk)
+
+        def step(along: Int[Array, ""], image: Array) -> Array:
+            value = jnp.clip(spans.value + spans.slope * along, spans.least, spans.most)
+            level = jnp.clip((value - nearest) * scale, 0, levels)
+            key = (level.astype(jnp.uint32) << face_bits) | spans.face.astype(jnp.uint32)
+            return image.at[jnp.where(along < spans.length, spans.pixel + along, pixels)].min(key, mode="drop")
+
+        # The same number of steps for every chunk, because under `vmap` a loop of variable length copies the image.
+        return _Canvas(canvas.next_run + chunk, listed, jax.lax.fori_loop(0, _RUN, step, canvas.image))
+
+    blank = _Canvas(jnp.int32(0), jnp.int32(0), jnp.full(pixels, _NOTHING))
+    return jax.lax.while_loop(lambda canvas: canvas.next_run < runs.total, draw_chunk, blank).image
+
+
+def _spans(
+    screen: _Screen, runs: _Runs, canvas: _Canvas, shape: tuple[int, int], within: ScalarLike | None, chunk: int
+) -> tuple[_Spans, Int[Array, ""]]:
+    """The runs of the next chunk, and the listed face with which the chunk after it begins."""
+    height, width = shape
+    run = canvas.next_run + jnp.arange(chunk, dtype=jnp.int32)
+    # Every listed face has a run, so at most `chunk` faces begin in this chunk: the next ones of the list.
+    begins = jax.lax.dynamic_slice(runs.first, (canvas.listed + 1,), (chunk,)) - canvas.next_run
+    of = canvas.listed + _cpu_reductions.cumsum(jnp.zeros(chunk, jnp.int32).at[begins].add(1, mode="drop"))
+    following = of[-1] + (runs.first[of[-1] + 1] == canvas.next_run + chunk)
+    begin, face, per_row = runs.first[of], runs.face[of], runs.per_row[of]
+
+    corners = screen.corners(face)
+    (x0, y0, o0), (x1, y1, o1), (x2, y2, o2) = corners
+    area = _cross(*corners)
+    safe_area = jnp.where(area == 0, 1, area)
+    slope_x = ((o1 - o0) * (y2 - y0) - (o2 - o0) * (y1 - y0)) / safe_area
+    slope_y = ((o2 - o0) * (x1 - x0) - (o1 - o0) * (x2 - x0)) / safe_area
+    line = jnp.floor((run - begin + 0.5) / per_row)  # exact, for whole numbers below 2^22
+    row = _first_row(_lowest(y0, y1, y2), height) + line
+    start, stop = _row_ends(corners, area, row)
+    column = jnp.maximum(jnp.ceil(start - _SLACK), 0) + _RUN * (run - begin - line * per_row)
+    length = jnp.clip(jnp.minimum(jnp.floor(stop + _SLACK), width - 1) - column + 1, 0, _RUN)
+    length = jnp.where(run < runs.total, length, 0).astype(jnp.int32)
+    value = o0 + slope_x * (column - x0) + slope_y * (row - y0)
+    least, most = _lowest(o0, o1, o2), _highest(o0, o1, o2)
+    pixel = row.astype(jnp.int32) * width + column.astype(jnp.int32)
+    if within is not None:
+        pixel += jnp.where(least < within, 0, height * width)
+    return _Spans(pixel, length, face, value, slope_x, least, most), following
+
+
+def _row_ends(
+    corners: tuple[_Corner, _Corner, _Corner], area: Float[Array, "r"], row: Float[Array, "r"]
+) -> tuple[Float[Array, "r"], Float[Array, "r"]]:
+    """Columns at which a row of a face starts and stops.
+
+    A row runs from the face's left edges to its right edges, and not beyond its corners. A face within one row's slack
+    covers that row from end to end.
+    """
+    a, b, c = corners
+    top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
+    flat = bottom - top <= 1e-3
+    at = jnp.clip(row, top, bottom)
+    starts, stops = [], []
+    for (px, py, _), (qx, qy, _) in ((a, b), (b, c), (c, a)):
+        rise = qy - py
+        crossing = px + (at - py) * ((qx - px) / jnp.where(rise == 0, 1, rise))
+        starts.append(jnp.where(rise * area < 0, crossing, -jnp.inf))
+        stops.append(jnp.where(rise * area > 0, crossing, jnp.inf))
+    start = jnp.maximum(_lowest(a[0], b[0], c[0]), jnp.where(flat, -jnp.inf, _highest(*starts)))
+    stop = jnp.minimum(_highest(a[0], b[0], c[0]), jnp.where(flat, jnp.inf, _lowest(*stops)))
+    return start, stop
+
+
+def barycentrics(
+    corners: Sequence[tuple[Float[Array, "*n"], Float[Array, "*n"]]],
+    column: Float[Array, "*n"],
+    row: Float[Array, "*n"],
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
+    """Weights of a face's corners at a point on the screen, affine on the screen.
+
+    Args:
+        corners: the three corners, (column, row) in pixels.
+        column: of the point, pixels.
+        row: of the point, pixels.
+
+    Returns:
+        Weights that sum to 1. None is below 0, even where rounding puts a point outside its face. A face without area
+        has the weights (1, 0, 0).
+    """
+    # Relative to the point, because with absolute pixels float32 has errors of several per cent on slivers.
+    a, b, c = ((x - column, y - row) for x, y in corners)
+    area = _cross(a, b, c)
+    ok = area != 0
+    area = jnp.where(ok, area, 1)
+    first = jnp.clip((b[0] * c[1] - c[0] * b[1]) / area, 0, 1)
+    second = jnp.clip((c[0] * a[1] - a[0] * c[1]) / area, 0, 1 - first)
+    return jnp.where(ok, first, 1), jnp.where(ok, second, 0), jnp.where(ok, 1 - first - second, 0)
+
+
+def pixel_centres(shape: tuple[int, int]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+    """Columns and rows of an image's pixels."""
+    row, column = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij")
+    return column, row
+
+
+def _cross(a: tuple[Array, ...], b: tuple[Array, ...], c: tuple[Array, ...]) -> Array:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+
+
+def _first_row(top: Array, height: int) -> Array:
+    return jnp.clip(jnp.ceil(top - _SLACK), 0, height)
+
+
+def _lowest(a: Array, b: Array, c: Array) -> Array:
+    return jnp.minimum(jnp.minimum(a, b), c)
+
+
+def _highest(a: Array, b: Array, c: Array) -> Array:
+    return jnp.maximum(jnp.maximum(a, b), c)

@@ -1,0 +1,1 @@
+"""The two compiled programs of `sense`: `equilibrium` balances an object on the gel, and `drawing` draws the images."""

@@ -1,0 +1,135 @@
+"""The first program of `sense`: an object in balance on the gel, independent of the images' resolution."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sts_jax import _cpu_reductions, geometry, optics, tactile
+from sts_jax.rendering.corners import Corners, interpolated
+from sts_jax.rendering.loop import looped
+from sts_jax.rendering.tiles import lines, where_active
+
+
+class Resting(NamedTuple):
+    """An object in balance on the gel."""
+
+    points: Float[Array, "v 3"]  # m, vertices, sensor frame
+    pose: Float[Array, "7"]  # in balance, or a pose below the pad if the given one is not finite
+    shown: Float[Array, "7"]  # in balance, or the given one if it is not finite
+    heights: Float[Array, "r c"]  # m, of its underside over the gel's grid
+    present: Bool[Array, ""]  # whether some part is above the gel's face
+    pressing: Bool[Array, ""]  # whether it presses on the gel
+    balanced: Bool[Array, ""]  # whether the gel carries the wrench within its limits
+    pressure: Float[Array, "r c"]  # Pa
+
+
+def _balance(
+    gel: tactile.Gel,
+    sound: Bool[Array, ""],
+    vertices: Float[Array, "v 3"],
+    faces: Int[Array, "f 3"],
+    two_sided: Bool[Array, ""],
+    pose: Float[Array, "7"],
+    wrench: Float[Array, "6"] | None,
+) -> Resting:
+    """Let an object sink and tilt until the gel carries its wrench.
+
+    Args:
+        gel: constants of the gel.
+        sound: False for an invalid sensor or body, which gives an object below the pad.
+        vertices: mesh frame (m).
+        faces: vertex indices.
+        two_sided: whether faces are visible from behind too.
+        pose: mesh frame in the sensor frame, before it sinks.
+        wrench: of the pad on the object (N, N m), or None for the imprint of the pose alone.
+
+    Returns:
+        The object in balance.
+    """
+    length = geometry.norm(jnp.where(jnp.isfinite(pose), pose, 0)[3:])
+    finite = sound & jnp.all(jnp.isfinite(pose)) & (length > 0) & jnp.isfinite(length)
+    if wrench is not None:
+        finite &= jnp.all(jnp.isfinite(wrench))
+        wrench = jnp.where(finite, wrench, 0)
+    safe_pose = jnp.where(finite, pose, jnp.array([0.0, 0, -1, 1, 0, 0, 0]))
+    safe_pose = jnp.concatenate([safe_pose[:3], geometry.normalize(safe_pose[3:])])
+
+    points = _placed(finite, safe_pose, vertices, jnp.full_like(vertices, -1))
+    present = _cpu_reductions.maximum(points[:, 2]) > 0
+    heights, whole = underside(gel, faces, two_sided, points, present)
+    if wrench is None:
+        contact = tactile.indent(gel, heights)
+        pressing = present
+    else:
+        contact = tactile.settle(gel, heights, jnp.where(present, wrench, 0))
+        pressing = present & (wrench[2] > 0)
+    balanced_pose = _moved(safe_pose, contact)
+    return Resting(
+        points=_placed(pressing, balanced_pose, vertices, points),
+        pose=balanced_pose,
+        shown=jnp.where(finite, balanced_pose, pose),
+        heights=whole,
+        present=present,
+        pressing=pressing,
+        balanced=contact.balanced & finite,
+        pressure=contact.pressure,
+    )
+
+
+balance = jax.jit(looped(_balance))
+
+
+def underside(
+    gel: tactile.Gel,
+    faces: Int[Array, "f 3"],
+    two_sided: Bool[Array, ""],
+    points: Float[Array, "v 3"],
+    present: Bool[Array, ""],
+) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
+    """Heights of an object's underside over the gel's face, on the gel's grid.
+
+    Args:
+        gel: the gel, which has the grid.
+        faces: vertex indices of the object's faces.
+        two_sided: whether faces are visible from behind too.
+        points: vertices, sensor frame (m).
+        present: whether there is an object at all.
+
+    Returns:
+        Two height maps (m): of the faces within the gel's reach, which alone can press on it, and of all faces, which
+        block the light. Both are `inf` where no face lies over a cell.
+    """
+    rows, columns = gel.cells
+    across, down, height = (points[:, k] for k in range(3))
+    # Parts that are farther above the lowest point than the largest depth and tilt can lower them never press.
+    extent = sum(_cpu_reductions.maximum(part) - _cpu_reductions.minimum(part) for part in (across, down))
+    reach = _cpu_reductions.minimum(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
+    across = (across / gel.size[0] + 0.5) * columns - 0.5
+    down = (down / gel.size[1] + 0.5) * rows - 0.5
+    keep = jnp.broadcast_to(present, height.shape)
+    places = jnp.stack([across, down], axis=-1)
+    near, winner = optics.rasterise(places, height, faces, keep, two_sided, gel.cells, within=reach)
+    images = (winner, *lines(optics.pixel_centres(gel.cells)))
+    corners = Corners(across, down, height, faces)
+    whole = where_active(interpolated, winner >= 0, corners, images, jnp.full(gel.cells, jnp.inf))
+    return jnp.where(winner == near, whole, jnp.inf), whole
+
+
+def _moved(pose: Float[Array, "7"], contact: tactile.Equilibrium) -> Float[Array, "7"]:
+    """The pose of an object after it has turned and sunk into the gel."""
+    turn = geometry.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
+    drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
+    position = geometry.transform(jnp.concatenate([drop, turn]), pose[:3])
+    return jnp.concatenate([position, geometry.quat_canonical(geometry.quat_multiply(turn, pose[3:]))])
+
+
+def _placed(
+    condition: Bool[Array, ""], pose: Float[Array, "7"], vertices: Float[Array, "v 3"], otherwise: Float[Array, "v 3"]
+) -> Float[Array, "v 3"]:
+    """Vertices in the sensor frame if the condition holds, else `otherwise`."""
+    # XLA keeps the result of a condition. It would recompute any other value at each use. x, y and z have separate
+    # memory.
+    planes = jax.lax.cond(condition, lambda: tuple(geometry.transform(pose, vertices).T), lambda: tuple(otherwise.T))
+    return jnp.stack(planes, axis=-1)
