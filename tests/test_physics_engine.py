@@ -12,7 +12,7 @@ import pytest
 
 from sts_jax import objects, physics
 from sts_jax.physics import native, roll, scene
-from sts_jax.physics.scenarios import STANDING, G, Start
+from sts_jax.physics.scenario import STANDING, G, Start
 from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)

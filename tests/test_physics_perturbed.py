@@ -13,7 +13,7 @@ import pytest
 from benchmarks import invariance
 from sts_jax import objects, physics
 from sts_jax.physics import contact, native, roll, scene
-from sts_jax.physics.scenarios import G, Start
+from sts_jax.physics.scenario import G, Start
 from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)

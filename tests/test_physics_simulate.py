@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from sts_jax import objects, physics
-from sts_jax.physics import contact, roll, scene
-from sts_jax.physics.scenarios import G
+from sts_jax.physics import contact, engines, roll, scene, simulation
+from sts_jax.physics.scenario import G
 from sts_jax.sensor import Sensor
 
 NUM = 6
@@ -280,25 +280,20 @@ def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body], engi
 
 @pytest.mark.slow
 def test_objects_compile_once(bodies: list[objects.Body]) -> None:
-    from sts_jax.physics.simulate import _roll
-
     physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
-    before = _roll._cache_size()
+    before = engines.roll_worlds._cache_size()
     more = [objects.make(jax.random.key(20), "spoon"), objects.make(jax.random.key(21), "mouse")]
     physics.simulate(jax.random.key(0), more, Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
-    assert _roll._cache_size() == before
+    assert engines.roll_worlds._cache_size() == before
 
 
 @pytest.mark.slow
 def test_progress_and_resampling(
     bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sys
-
-    module = sys.modules["sts_jax.physics.simulate"]
     sunk = drops.sunk[:NUM]
     limit = float(np.sort(sunk)[-2] + np.sort(sunk)[-1]) / 2
-    monkeypatch.setattr(module, "SUNK_LIMIT", limit)
+    monkeypatch.setattr(simulation, "SUNK_LIMIT", limit)
     done: list[int] = []
     again = physics.simulate(
         jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24, progress=done.append, engine=engine
@@ -308,8 +303,8 @@ def test_progress_and_resampling(
     assert np.all(again.sunk <= limit)
     np.testing.assert_array_equal(np.delete(again.pose, worst, 0), np.delete(drops.pose[:NUM], worst, 0))
     assert done[-1] == NUM
-    monkeypatch.setattr(module, "SUNK_LIMIT", 0.0)
-    monkeypatch.setattr(module, "ATTEMPTS", 1)
+    monkeypatch.setattr(simulation, "SUNK_LIMIT", 0.0)
+    monkeypatch.setattr(simulation, "ATTEMPTS", 1)
     with pytest.raises(ValueError, match=r"body 0: trajectory 0 is .* in 1 draws"):
         physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine=engine)
 

@@ -12,7 +12,7 @@ import scipy
 
 from sts_jax import geometry, objects, physics
 from sts_jax.physics import contact, roll, scene
-from sts_jax.physics.scenarios import STANDING, G
+from sts_jax.physics.scenario import STANDING, G
 from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)
@@ -156,7 +156,7 @@ def test_at_rest_it_is_laid_where_its_contents_decide_whether_it_tips(bodies: li
     for body in bodies[0], bodies[2]:
         corners, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
         coms = com + 0.01 * rng.normal(size=(16, 3))
-        shape = physics.scenarios.Shape(*map(jnp.asarray, (corners, *objects.rest_poses(corners, com), coms)))
+        shape = physics.Shape(*map(jnp.asarray, (corners, *objects.rest_poses(corners, com), coms)))
         undecided = []
         for tries in (1, 16):
             scenario = dataclasses.replace(SCENARIO, resting=1.0, tries=tries)
