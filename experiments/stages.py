@@ -435,12 +435,14 @@ def _draw(
         if query not in shown:
             continue
         title = f"{workdir.name}, from {given}: the first {config.num_shown} of the held-out list"
-        scenario = config.collection.scenario
-        if scenario.quantities:
-            title += "\nred: the velocity over the pad that a freely sliding object receives"
         drawn.append(figures / f"{name}.png")
         evaluation.figures.predictions(
-            drawn[-1], test, shown[query], num=config.num_shown, title=title, scenario=scenario
+            drawn[-1],
+            test,
+            shown[query],
+            num=config.num_shown,
+            title=title,
+            scenario=config.collection.scenario,
         )
         samples, rerolled = shown[query].samples, possible.pose[:, : config.num_shown]
         if samples is not None and samples.pose is not None:

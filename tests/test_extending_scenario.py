@@ -12,10 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 import sts_jax as sts
 from experiments import perturbed, stages
-from sts_jax import dataset, geometry, physics
+from sts_jax import dataset, evaluation, geometry, physics
 
 PAGE = Path(__file__).parent.parent / "docs" / "extending-scenario.md"
 ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
@@ -161,21 +162,39 @@ def test_a_variant_needs_the_fields_that_it_changes(page):
         physics.variant(scenario, "off")
 
 
-def test_a_dataset_of_a_new_scenario_turns_its_vectors_and_keeps_its_numbers(page, tmp_path):
+@pytest.fixture(scope="module")
+def collected(page, tmp_path_factory) -> dict[str, tuple[physics.Scenario, dataset.Dataset]]:
+    """A dataset of two trajectories of each scenario."""
     tiny = {"categories": ("bottle",), "num_objects": 2, "num_per_object": 1, "num_full": 0, "objects_per_shard": 2}
-    for scenario, vectors in ((page["Rolled"](frames=2), 1), (page["Tilting"](frames=2), 0)):
-        folder = tmp_path / type(scenario).__name__
+    found = {}
+    for name in ("Rolled", "Tilting"):
+        scenario, folder = page[name](frames=2), tmp_path_factory.mktemp(name)
         dataset.collect(dataset.Collection(scenario, **tiny), sts.Sensor(), folder)
-        data = dataset.load(folder)
-        assert data.collection["scenario"]["name"] == type(scenario).__name__
-        assert data.collection["scenario"].get("vectors", 1) == vectors
-        pairs, kinds = data.pairs(np.array([0]), symmetries=True), scenario.symmetries
-        assert len(pairs.condition) == len(kinds)
-        condition = data.trajectory["condition"][0]
-        for own, symmetry in zip(pairs.condition, kinds, strict=True):
-            turn = np.diag([1.0, -1.0 if symmetry >= 4 else 1.0])
-            quarter = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), symmetry % 4)
-            np.testing.assert_allclose(own, quarter @ turn @ condition if vectors else condition, atol=1e-6)
+        found[name] = scenario, dataset.load(folder)
+    return found
+
+
+@pytest.mark.parametrize(("name", "vectors"), [("Rolled", 1), ("Tilting", 0)])
+def test_a_dataset_turns_the_vectors_of_a_condition_and_keeps_its_numbers(collected, name, vectors):
+    scenario, data = collected[name]
+    assert data.collection["scenario"]["name"] == name
+    assert data.collection["scenario"].get("vectors", 1) == vectors
+    pairs, condition = data.pairs(np.array([0]), symmetries=True), data.trajectory["condition"][0]
+    for own, symmetry in zip(pairs.condition, scenario.symmetries, strict=True):
+        mirror = np.diag([1.0, -1.0 if symmetry >= 4 else 1.0])
+        quarter = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), symmetry % 4)
+        np.testing.assert_allclose(own, quarter @ mirror @ condition if vectors else condition, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "has_arrows"), [("Rolled", True), ("Tilting", False)])
+def test_the_figure_of_predictions_shows_velocities_as_red_arrows(collected, name, has_arrows, tmp_path):
+    scenario, data = collected[name]
+    pairs = data.pairs(np.array([0, 1]))
+    predicted = evaluation.Predicted(visual=pairs.visual[:, 1] / 255)
+    path = tmp_path / "a.png"
+    evaluation.figures.predictions(path, pairs, predicted, num=2, title="t", scenario=scenario)
+    red, green, blue = np.moveaxis(np.asarray(Image.open(path).convert("RGB")).astype(int), -1, 0)
+    assert ((red > 200) & (green < 60) & (blue < 60)).any() == has_arrows
 
 
 @pytest.mark.slow

@@ -38,8 +38,8 @@ def predictions(
 ) -> None:
     """Draw input, truth, prediction and samples of the first `num` held-out trajectories, with a row for each stream.
 
-    An arrow on the input shows the velocity over the pad that a freely sliding object receives (`Scenario.drift`). A
-    quarter of the picture is 1 m/s.
+    A red arrow on the input shows the velocity over the pad that a freely sliding object receives (`Scenario.drift`),
+    unless it is 0. A quarter of the picture is 1 m/s.
 
     Args:
         path: The PNG to write.
@@ -56,6 +56,9 @@ def predictions(
     drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
     heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
     rows = len(streams) * num
+    drift = np.zeros((num, 2))
+    if scenario is not None:
+        drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[:num]])
     figure, axes = plt.subplots(rows, len(heads), figsize=(1.25 * len(heads) + 0.7, 1.25 * rows + 0.8), squeeze=False)
     for row in range(rows):
         item, stream = row // len(streams), streams[row % len(streams)]
@@ -75,12 +78,13 @@ def predictions(
             outcome = physics.Outcome(number) if scenario is None else scenario.named(number)
             label = f"#{test.trajectory[item]}: {outcome}\n{stream}"
         axes[row, 0].set_ylabel(label, fontsize=9)
-        if stream == streams[0] and scenario is not None and scenario.quantities:
+        if stream == streams[0] and drift[item].any():
             height, width = test.visual.shape[2:4]
             middle = np.array([width - 1, height - 1]) / 2
-            tip = middle + np.asarray(scenario.drift(jnp.asarray(test.condition[item]))) * width / 4
+            tip = middle + drift[item] * width / 4
             axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
-    figure.suptitle(title, fontsize=11)
+    arrows = "\nred: the velocity over the pad that a freely sliding object receives" if drift.any() else ""
+    figure.suptitle(title + arrows, fontsize=11)
     _save(figure, path)
 
 

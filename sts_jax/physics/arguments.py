@@ -41,7 +41,7 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
         raise ValueError("no body was given: pass one Body or a sequence of them")
     if not isinstance(sensor, Sensor):
         raise TypeError(f"sensor is {sensor!r}, but it must be a Sensor, for instance sts.Sensor()")
-    if isinstance(scenario, type) or not isinstance(scenario, Scenario) or not _is_frozen(scenario):
+    if not isinstance(scenario, Scenario) or not _is_frozen(scenario):
         raise TypeError(
             f"scenario is {scenario!r}, but it must be Freefall(), Inclined(), Perturbed() or a frozen dataclass of "
             "your own that derives from physics.Scenario"

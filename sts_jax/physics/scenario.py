@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import enum
 import math
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -93,8 +93,7 @@ class Quantity(NamedTuple):
     vector: bool = False  # two numbers, which turn with the pad under its symmetries
 
 
-@runtime_checkable
-class Scenario(Protocol):
+class Scenario(abc.ABC):
     """How objects start, under which gravity they move, and how their ends are named.
 
     A scenario is a frozen dataclass that derives from this class. It defines `outcomes`, `start`, `gravity` and
@@ -102,7 +101,7 @@ class Scenario(Protocol):
     The methods are pure functions of JAX for one trajectory.
     """
 
-    __dataclass_fields__: ClassVar[dict[str, Any]]
+    __dataclass_fields__: ClassVar[dict[str, Any]]  # for type checkers: it is a dataclass
 
     # Its outcomes, the most informative first: members of `Outcome` or of another IntEnum with other numbers.
     # Every scenario has `Outcome.FELL_OFF`.
@@ -175,10 +174,17 @@ class Scenario(Protocol):
         return tuple(outcome for outcome in self.outcomes if outcome != Outcome.FELL_OFF)
 
     def named(self, number: int) -> str:
-        """The outcome with a number in words: "fell off"."""
-        return in_words(next(outcome for outcome in self.outcomes if outcome == number))
+        """The outcome with a number in words: "fell off".
 
-    def described(self, condition: Float[np.ndarray, "c"]) -> str:
+        Raises:
+            ValueError: the scenario has no such outcome.
+        """
+        names = {int(outcome): in_words(outcome) for outcome in self.outcomes}
+        if number not in names:
+            raise ValueError(f"number is {number}, but the outcomes of {type(self).__name__} are {names}")
+        return names[number]
+
+    def described(self, condition: Float[Array | np.ndarray, "c"]) -> str:
         """A condition in words: "acceleration (3.1, -7.2) m/s², duration 0.085 s"."""
         words, rest = [], np.asarray(condition).tolist()
         for quantity in self.quantities:
