@@ -66,7 +66,7 @@ def main(name: str, times: int, workdir: Path | None) -> None:
     scores = dict(made.scores)
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
         scores[title] = judge(row, test)
-    summary = evaluation.summarise(scores, test)
+    summary = evaluation.summarise(scores, test, outcomes=config.collection.scenario.outcomes)
     print(evaluation.table(summary, title=f"{name}: the best possible predictions"))
     print(evaluation.full_table(summary, title=f"{name}: every figure"))
     print("\n".join(spread(test.pose[:, 0], made.pose, made.outcome)))

@@ -174,7 +174,8 @@ def main(args: Args) -> str:
     size = sum(x.size for x in jax.tree.leaves(params))
     note = f"{steps} gradient steps of {BATCH} in {args.seconds:g} s, {size:,} parameters."
     title = f"{args.workdir.name}: a deterministic network"
-    return evaluation.full_table(evaluation.summarise(scores, test), title=title, notes=[note])
+    summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
+    return evaluation.full_table(summary, title=title, notes=[note])
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ from tqdm import tqdm
 from sts_jax import geometry, objects, physics
 from sts_jax.dataset.collect import turn, turn_condition
 from sts_jax.physics import scene
-from sts_jax.physics.scenarios import Shape, Start
+from sts_jax.physics.scenario import Shape, Start
 from sts_jax.sensor import Sensor
 
 MARGIN = 0.05  # largest allowed difference of a share

@@ -6,7 +6,8 @@ import numpy as np
 
 from benchmarks.starts import Starts, filled
 from sts_jax import objects, physics
-from sts_jax.physics.scenarios import G
+from sts_jax.physics.perturbed import jerk
+from sts_jax.physics.scenario import G
 from sts_jax.sensor import Sensor
 
 FILLS = np.linspace(0, 1, 17)  # fills at which mass properties are computed for a shape
@@ -49,7 +50,7 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 
     The push on the object is the opposite of the pad's acceleration.
     """
-    push = -condition[:, :2]
+    push = -np.asarray(jerk(condition).acceleration)
     sign = np.where(push < 0, -1, 1)
     push, place = push * sign, pose[:, :2] * sign
     swap = (push[:, 1] > push[:, 0])[:, None]
@@ -87,7 +88,7 @@ def shaken(
     seen = sight(items)
     friction = float(np.mean(scenario.friction))
     place, push = canonical(starts.pose, starts.condition)
-    time, size = starts.condition[:, 2], np.linalg.norm(push, axis=1)
+    time, size = np.asarray(jerk(starts.condition).duration), np.linalg.norm(push, axis=1)
     ahead = push / size[:, None]
     room = (float(Sensor().gel.size[0]) / 2 - place[:, 0]) / ahead[:, 0]
     slip = np.maximum(size - friction * G, 0) * time**2 / 2 * size / (friction * G)

@@ -40,12 +40,16 @@ import numpy as np
 from benchmarks.starts import bodies, rigid_of
 from sts_jax import dataset, objects, physics
 from sts_jax.dataset.collect import RENDER_BATCH
+from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
-from sts_jax.physics.scenarios import G
-from sts_jax.physics.scene import mjx
 
-# `simulate` has no public way to measure its compiled functions separately. A break shows at this import.
-from sts_jax.physics.simulate import WORKERS, _draw, _draws, _gravity, _rigid, _roll, _shapes, _Worlds
+# `simulate` has no public way to measure its compiled functions separately. A break shows at these imports.
+from sts_jax.physics.draws import draw as draw_starts
+from sts_jax.physics.engines import Worlds, drawn_fields, gravity_at, roll_worlds
+from sts_jax.physics.mass_properties import rigid_of_draws
+from sts_jax.physics.scenario import G
+from sts_jax.physics.simulation import WORKERS
+from sts_jax.physics.solver import mjx
 from sts_jax.sensor import Sensor
 
 RESULTS = Path(__file__).parent / "results" / "physics"
@@ -155,20 +159,20 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
     return [([m for m, n in zip(models, sizes, strict=True) if n == k], states[sizes == k]) for k in np.unique(sizes)]
 
 
-def worlds(count: int, frames: int) -> tuple[_Worlds, mjx.Model, mjx.Data]:
+def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
     """The arguments that `simulate` passes to MJX for drops of the rod from 2 mm."""
     scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
     pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # drawn once, then repeated
     index = np.zeros(some, np.int32)
-    shapes = _shapes([body], scenario)
+    shapes = physics_bodies.shapes([body], scenario)
     nth = np.arange(some, dtype=np.int32)
-    start, hidden = _draw(jax.random.key(0), index, nth, index, shapes, scenario=scenario, pad=pad)
-    fields = _draws([body], index, hidden, pad, scenario.contact, scenario.wall)
+    start, hidden = draw_starts(jax.random.key(0), index, nth, index, shapes, scenario=scenario, pad=pad)
+    fields = drawn_fields([body], index, hidden, pad, scenario.contact, scenario.wall)
     fields, start = jax.tree.map(lambda x: np.resize(x, (count, *x.shape[1:])), (fields, start))
     hull = jax.tree.map(lambda x: np.broadcast_to(x, (count, *x.shape)), contact.hull(np.asarray(body.hulls)))
     gravity = jnp.broadcast_to(jnp.array([0, 0, -G]), (count, frames, scenario.steps, 3))
     _, model, data = scene.template(pad, scenario.contact, scenario.wall)
-    return _Worlds(fields, hull, start, gravity), model, data
+    return Worlds(fields, hull, start, jnp.zeros((count, 6)), gravity), model, data
 
 
 def scaling(frames: int = 8, chunk: int = 32) -> None:
@@ -187,12 +191,12 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
         own = [mujoco.MjData(models[0]) for _ in range(os.cpu_count() or 1)]
         on_device = jax.device_put(full)
 
-        def at_once(full: _Worlds = on_device, model: mjx.Model = model, data: mjx.Data = data) -> None:
-            jax.block_until_ready(_roll(full, model, data))
+        def at_once(full: Worlds = on_device, model: mjx.Model = model, data: mjx.Data = data) -> None:
+            jax.block_until_ready(roll_worlds(full, model, data))
 
-        def in_chunks(split: list[_Worlds] = split, model: mjx.Model = model, data: mjx.Data = data) -> None:
+        def in_chunks(split: list[Worlds] = split, model: mjx.Model = model, data: mjx.Data = data) -> None:
             with concurrent.futures.ThreadPoolExecutor(WORKERS) as pool:
-                list(pool.map(lambda part: jax.block_until_ready(_roll(part, model, data)), split))
+                list(pool.map(lambda part: jax.block_until_ready(roll_worlds(part, model, data)), split))
 
         def rollout(models: list = models, own: list = own, states: np.ndarray = states) -> None:
             mujoco.rollout.rollout(models, own, states, nstep=steps, persistent_pool=True)
@@ -272,7 +276,12 @@ def first_call(name: str, count: int) -> None:
     again = time.perf_counter() - begin
     jax.clear_caches()
     physics.simulate(jax.random.key(0), items, sensor, scenario, engine="mjx")
-    compiled: dict[str, Any] = {"_roll": _roll, "_draw": _draw, "_rigid": _rigid, "_gravity": _gravity}
+    compiled: dict[str, Any] = {
+        "roll": roll_worlds,
+        "draw": draw_starts,
+        "rigid": rigid_of_draws,
+        "gravity": gravity_at,
+    }
     programs = {name: function._cache_size() for name, function in compiled.items()}
     print(json.dumps({"seconds": first - again, "objects": len(items), "programs": programs}))
 

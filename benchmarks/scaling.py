@@ -89,7 +89,7 @@ def main(args: Args) -> str:
                 found = stages.predict(scenario, predictor, subset, given, given, blank, num_samples=config.num_samples)
                 scores[title] = judge(found, test)
                 points[title] = (" and ".join(subset), trajectories, round(minutes, 1))
-    summary = evaluation.summarise(scores, test)
+    summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     skills = {title: summary["predictors"][title]["visual_skill"] for title in points}
     trained = [
         Trained(*points[title], skill["value"], skill["low"], skill["high"])

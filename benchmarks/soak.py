@@ -24,8 +24,8 @@ from tqdm import tqdm
 
 from benchmarks.starts import Starts, bodies, rigid_of
 from sts_jax import dataset, geometry, objects, physics
-from sts_jax.physics.scenarios import G
-from sts_jax.physics.simulate import SUNK_LIMIT
+from sts_jax.physics.scenario import G
+from sts_jax.physics.simulation import SUNK_LIMIT
 from sts_jax.sensor import Sensor
 
 SCENARIOS: dict[str, physics.Scenario] = {
@@ -62,7 +62,7 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
     """Simulate a block of trajectories. Returns arrays (size, ...) of results. `size` is a multiple of NUM."""
     scenario = SCENARIOS[name]
     first = index * size // NUM
-    items = bodies(("bottle",) if name == "perturbed" else objects.CATEGORIES, size // NUM, first)
+    items = bodies(("bottle",) if scenario.must_stand else objects.CATEGORIES, size // NUM, first)
     key = jax.random.fold_in(jax.random.key(1), index)
     traj = jax.tree.map(np.asarray, physics.simulate(key, items, Sensor(), scenario, NUM))
     rigid = rigid_of(items, traj)
@@ -73,6 +73,7 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
     error = np.linalg.norm(traj.wrench[:, -1, :3] - carried, axis=1) / (mass * G)
     at_rest = traj.settled & ~fell & ~traj.wall[:, -1]
     free = excess_energy(rigid, traj.pose, traj.velocity, gravity)
+    constant = not np.ptp(traj.gravity, axis=(0, 1)).any()
     out_of_contact = ~traj.contact & ~traj.wall & ~fell[:, None]
     return {
         "body": first + traj.body,
@@ -88,7 +89,7 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
         "sunk": traj.sunk,
         "touches": traj.touches,
         "wrench_error": np.where(at_rest, error, np.nan),
-        "excess": np.where(out_of_contact, free, -np.inf).max(1) if name != "perturbed" else np.full(len(fell), np.nan),
+        "excess": np.where(out_of_contact, free, -np.inf).max(1) if constant else np.full(len(fell), np.nan),
     }
 
 

@@ -18,7 +18,7 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
     one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
     images = data.strip(index)
     body = dataset.make_bodies(collection, np.array([one["body"]]))[0]
-    what = describe(dataset.class_names(collection)[one["body"]], one, hidden)
+    what = describe(collection.scenario, dataset.class_names(collection)[one["body"]], one, hidden)
     evaluation.figures.strip(
         path,
         one["time"],
@@ -41,14 +41,14 @@ def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor:
     return np.stack([np.asarray(evaluation.outside(body, jnp.asarray(each), size, up, wall)) for each in pose])
 
 
-def describe(name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]) -> str:
+def describe(
+    scenario: sts.physics.Scenario, name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]
+) -> str:
     """Describe one trajectory: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
-    outcome = sts.physics.Outcome(int(trajectory["outcome"])).name.lower().replace("_", " ")
-    words = [f"a {name} {outcome}"]
+    words = [f"a {name} {scenario.named(int(trajectory['outcome']))}"]
     words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]
     if hidden["up"][2] < 1:
         words.append("contents' up ({:.1f}, {:.1f}, {:.1f})".format(*hidden["up"]))
     if len(trajectory["condition"]):
-        x, y, duration = trajectory["condition"]
-        words.append(f"pad jerked by ({x:.1f}, {y:.1f}) m/s² for {1e3 * duration:.0f} ms")
+        words.append(scenario.described(trajectory["condition"]))
     return ", ".join(words)

@@ -59,7 +59,7 @@ def main(config: Config) -> None:
         )
         visual, tactile = (np.asarray(stream) / 255 for stream in seen[:2])
         view = pictures.views(body, one.pose, one.gravity, sensor, collection.scenario.wall)
-        words = pictures.describe(name, one._asdict(), one.hidden._asdict())
+        words = pictures.describe(collection.scenario, name, one._asdict(), one.hidden._asdict())
         path = config.out / f"{config.scenario}-{i}.png"
         evaluation.figures.strip(path, one.time, view, visual, tactile, one.wrench, title=words)
         evaluation.figures.animation(
@@ -71,7 +71,7 @@ def main(config: Config) -> None:
             one.wrench,
             one.gravity,
             title=words,
-            outcome=str(sts.physics.Outcome(int(one.outcome))),
+            outcome=collection.scenario.named(int(one.outcome)),
         )
         print(f"{path.with_suffix('')}: {words}")
 

@@ -347,7 +347,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
             row = predict(scenario, predictor, names, validation, given, blank, num_samples=number_of_samples(config))
             scores[title] = judge(row, test)
             shown[title] = evaluation.first(row, config.num_shown)
-        summary = evaluation.summarise(scores, test)
+        summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
         bar("evaluate", len(jobs), len(jobs), "intervals done")
 
     drawn = _draw(config, workdir, figures, sensor, test, scores, shown, possible)
@@ -435,10 +435,15 @@ def _draw(
         if query not in shown:
             continue
         title = f"{workdir.name}, from {given}: the first {config.num_shown} of the held-out list"
-        if config.collection.scenario.condition_scale:
-            title += "\nred: where to, and how hard, the jerk drives it"
         drawn.append(figures / f"{name}.png")
-        evaluation.figures.predictions(drawn[-1], test, shown[query], num=config.num_shown, title=title)
+        evaluation.figures.predictions(
+            drawn[-1],
+            test,
+            shown[query],
+            num=config.num_shown,
+            title=title,
+            scenario=config.collection.scenario,
+        )
         samples, rerolled = shown[query].samples, possible.pose[:, : config.num_shown]
         if samples is not None and samples.pose is not None:
             spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
@@ -511,10 +516,11 @@ def predict(
     out = run(test, num_samples)
     if out.pose is not None:
         out = out._replace(outcome=evaluation.outcome_of_pose(scenario, test.pose[:, 0], out.pose))
-    elif out.visual is not None and len(scenario.outcomes) == 2:
+    elif out.visual is not None and len(scenario.stays) == 1:
         score = evaluation.emptiness(np.asarray(run(validation, 0).visual), blank)
         threshold = evaluation.metrics.best_threshold(score, validation.outcome != int(sts.physics.Outcome.FELL_OFF))
-        out = out._replace(outcome=evaluation.outcome_of_image(out.visual, blank, threshold))
+        stays = int(scenario.stays[0])
+        out = out._replace(outcome=evaluation.outcome_of_image(out.visual, blank, threshold, stays))
     if out.samples is not None and out.samples.pose is not None and out.outcome_probability is None:
         ends = np.stack([evaluation.outcome_of_pose(scenario, test.pose[:, 0], pose) for pose in out.samples.pose])
         out = out._replace(outcome_probability=evaluation.shares(ends, scenario.outcomes))

@@ -35,7 +35,7 @@ def test_ends_do_not_depend_on_the_step_the_engine_or_the_hand(index: int) -> No
 def test_a_mirrored_start_is_the_mirror_image() -> None:
     case = invariance.cases()[2]
     points = np.float32([[0.01, 0.02, -0.03], [0, -0.04, 0.05]])
-    shape = physics.scenarios.Shape(points, np.eye(3), np.ones(3) / 3, np.float32([[0, 0.01, 0]]))
+    shape = physics.Shape(points, np.eye(3), np.ones(3) / 3, np.float32([[0, 0.01, 0]]))
     key, pad = jax.random.key(3), (0.15, 0.15)
     seen = case.scenario.start(key, shape, pad)
     mirrored = case.mirrored.start(key, invariance.mirror_shape(shape), pad)

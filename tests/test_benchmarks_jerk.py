@@ -9,7 +9,7 @@ import pytest
 from benchmarks import jerk
 from benchmarks.starts import Starts
 from sts_jax import objects, physics
-from sts_jax.physics.scenarios import G
+from sts_jax.physics.scenario import G
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import pytest
 from benchmarks import soak
 from benchmarks.starts import Starts
 from sts_jax import physics
-from sts_jax.physics.simulate import SUNK_LIMIT
+from sts_jax.physics.simulation import SUNK_LIMIT
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,8 @@ from test_evaluation_report import pairs
 import sts_jax as sts
 from sts_jax import dataset, evaluation, physics
 from sts_jax.evaluation import rerolls
-from sts_jax.physics.simulate import _draw, _shapes
+from sts_jax.physics.bodies import shapes
+from sts_jax.physics.draws import draw
 
 TIMES, SIDE = 3, 4
 COLLECTION = dataset.Collection(physics.Freefall(), num_objects=2, num_per_object=2, resolution=(2 * SIDE, 2 * SIDE))
@@ -37,7 +38,7 @@ def engine(monkeypatch):
     def simulate(key, bodies, sensor, scenario, num, *, engine, progress):
         which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
         pad = tuple(float(side) for side in sensor.gel.size)
-        start, hidden = _draw(key, which, nth, 0 * nth, _shapes(bodies, scenario), scenario=scenario, pad=pad)
+        start, hidden = draw(key, which, nth, 0 * nth, shapes(bodies, scenario), scenario=scenario, pad=pad)
         seen.update(bodies=bodies, held=start.held, hidden=hidden)
         pose = jnp.stack([start.pose, start.pose + jnp.zeros(7).at[2].set(1) * OFF_FIRST[nth][:, None]], 1)
         nothing = jnp.zeros((len(which), 2, 6))

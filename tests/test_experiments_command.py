@@ -189,7 +189,7 @@ def test_what_is_refused_is_one_line(refused, tmp_path):
     ("fault", "kind"),
     [
         (lambda: command.configure(freefall.SMOKE, None), AttributeError),
-        (lambda: pictures.describe("cup", {}, {}), KeyError),
+        (lambda: pictures.describe(sts.physics.Freefall(), "cup", {}, {}), KeyError),
     ],
 )
 def test_a_fault_of_the_program_keeps_its_traceback(fault, kind):

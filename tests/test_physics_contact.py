@@ -1,4 +1,4 @@
-"""Contacts of hulls with the pad, against C MuJoCo's collision of the same mesh."""
+"""Contacts of hulls with the pad, compared with those of the same mesh in C MuJoCo."""
 
 import jax
 import jax.numpy as jnp
@@ -127,8 +127,8 @@ def test_flat_points_are_refused() -> None:
 
 
 @pytest.mark.slow
-def test_parts_leave_free_what_their_common_hull_fills() -> None:
-    # An arch of two posts and a beam straddles the stop wall: only the beam, 5 mm above it, keeps it from the wall.
+def test_convex_parts_leave_the_space_between_them_free() -> None:
+    # An arch of two posts and a beam straddles the stop wall. Its beam lies 5 mm above the wall.
     def box(centre: list[float], size: list[float]) -> np.ndarray:
         grid = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]), -1).reshape(-1, 3) * size + centre
         return np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])
@@ -141,7 +141,7 @@ def test_parts_leave_free_what_their_common_hull_fills() -> None:
     arch, filled = (jax.tree.map(jnp.asarray, contact.hull(x)) for x in (parts, parts.reshape(1, -1, 3)))
     found = CONTACTS(model, arch, pose)
     assert np.all(found.dist[8:] > 0)
-    assert np.sum(found.dist[:8] < 0) == 4  # the post that stands on the pad; the other is beyond it
+    assert np.sum(found.dist[:8] < 0) == 4  # of the post on the pad. The other post is beyond the pad
     np.testing.assert_allclose(found.dist[:8].min(), -1e-4, atol=1e-6)
     assert np.all(found.pos[:8][np.asarray(found.dist[:8] < 0), 1] < 0.066)
     assert np.min(CONTACTS(model, filled, pose).dist[8:]) < -0.004
@@ -149,7 +149,7 @@ def test_parts_leave_free_what_their_common_hull_fills() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("lean", [0.0, 0.4, -0.4])
-def test_what_lies_across_the_wall_is_held_by_it_as_in_c(lean: float) -> None:
+def test_the_wall_holds_an_object_that_lies_across_it_as_in_c_mujoco(lean: float) -> None:
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.01, 0.05, 0.004]
     rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)])[None]
     model = scene.compile_scene(rod, PAD, physics.Contact(), 0.02)
@@ -172,7 +172,7 @@ def test_what_lies_across_the_wall_is_held_by_it_as_in_c(lean: float) -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1e-7, 1e-5, 1e-3])
-def test_edges_all_but_parallel_to_a_rim_take_no_contact_away(yaw: float) -> None:
+def test_edges_nearly_parallel_to_a_rim_keep_all_contacts(yaw: float) -> None:
     pose = jnp.array([0.03, -0.01, 0.02 - 3e-5, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
     box = points("box")[:, :, [0, 2, 1]]  # lies on its side, 60 x 80 mm
     found = contact.collide(jax.tree.map(jnp.asarray, contact.hull(box)), pose, HALF)
@@ -183,15 +183,15 @@ def test_edges_all_but_parallel_to_a_rim_take_no_contact_away(yaw: float) -> Non
 
 
 @pytest.mark.parametrize("lean", [0.0, 0.02, 0.1])
-def test_an_edge_across_a_corner_is_held_by_both_rims_where_its_ends_are_lower(lean: float) -> None:
-    """A rod on one of its long edges, whose ends lie beyond two sides of the pad; it leans along its length."""
+def test_both_rims_hold_an_edge_across_a_corner_whose_ends_are_lower(lean: float) -> None:
+    """A rod on one of its long edges, whose ends lie beyond two sides of the pad. It leans along its length."""
     grid = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * [0.06, 0.005, 0.005]
     rod = np.concatenate([grid, np.repeat(grid[-1:], 24, axis=0)]).astype(np.float32)[None]
     turn = jnp.array([jnp.array([0, 0, -np.pi / 4]), jnp.array([0, lean, 0]), jnp.array([np.pi / 4, 0, 0])])
     yaw, pitch, edge_on = geometry.quat_from_rotvec(turn.astype(jnp.float32))
     quat = np.asarray(geometry.quat_multiply(yaw, geometry.quat_multiply(pitch, edge_on)))
-    away = 0.007  # m, the middle of the lowest edge from either side; it crosses the rims 14 mm from the corner
-    deep = 0.0002  # m, the lower of the two crossings; both ends are lower still, or one is
+    away = 0.007  # m, from the middle of the lowest edge to either side. It crosses the rims 14 mm from the corner
+    deep = 0.0002  # m, depth of the lower crossing. One end or both are lower
     reach, thick = away * np.sqrt(2), 0.005 * np.sqrt(2)
     low = np.array([0.075 - away, 0.075 - away, np.tan(lean) * reach - deep])
     middle = low + thick * np.array([np.sin(lean) / np.sqrt(2), -np.sin(lean) / np.sqrt(2), np.cos(lean)])
@@ -206,4 +206,4 @@ def test_an_edge_across_a_corner_is_held_by_both_rims_where_its_ends_are_lower(l
     expected = [[0.061, 0.075], [0.075, 0.061]] if lean == 0 else [[0.075, 0.061]]
     np.testing.assert_allclose(np.unique(there[:, :2].round(3), axis=0), expected, atol=1.1e-3)
     beneath = contact.collide(hull, jnp.asarray(pose - [0, 0, 0.05, 0, 0, 0, 0], jnp.float32), HALF)
-    assert beneath.dist.min() > -deep  # far below the top nothing lifts it over
+    assert beneath.dist.min() > -deep  # far below the top, no contact lifts the object over it

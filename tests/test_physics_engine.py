@@ -1,4 +1,4 @@
-"""C MuJoCo as the engine of `simulate`: against a plain loop over `mj_step`, and what both engines promise."""
+"""C MuJoCo as the engine of `simulate`, compared with a plain loop over `mj_step`, and properties of both engines."""
 
 import dataclasses
 import functools
@@ -12,7 +12,7 @@ import pytest
 
 from sts_jax import objects, physics
 from sts_jax.physics import native, roll, scene
-from sts_jax.physics.scenarios import STANDING, G, Start
+from sts_jax.physics.scenario import STANDING, G, Start
 from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)
@@ -37,7 +37,14 @@ def contact_wrenches(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, np
 
 
 def plain_loop(
-    model: mujoco.MjModel, points: np.ndarray, pose: np.ndarray, gravity: np.ndarray, held: int, *, as_force: bool
+    model: mujoco.MjModel,
+    points: np.ndarray,
+    pose: np.ndarray,
+    gravity: np.ndarray,
+    held: int,
+    velocity: np.ndarray,
+    *,
+    as_force: bool,
 ) -> dict:
     """One trajectory, step by step as `roll.step` defines it.
 
@@ -47,6 +54,9 @@ def plain_loop(
     force = data.body("object").xfrc_applied[:3]
     mass, base = model.body("object").mass[0], gravity[-1, -1]
     data.qpos[:] = pose
+    back = pose[3:] * [1, -1, -1, -1]
+    data.qvel[:3] = velocity[:3]
+    mujoco.mju_rotVecQuat(data.qvel[3:], velocity[3:], back)
     timestep = model.opt.timestep
     slow = touches = 0
     apart, gone = 2**20, False
@@ -56,7 +66,7 @@ def plain_loop(
         for pull in interval:
             if held or gone:
                 held, impulse, loaded, wall = max(held - 1, 0), np.zeros(6), 0, False
-                data.qvel[:] = 0
+                data.qvel[:] = 0 if gone else data.qvel
                 continue
             if as_force:
                 model.opt.gravity[:], force[:] = base, mass * (pull - base)
@@ -64,7 +74,7 @@ def plain_loop(
                 model.opt.gravity[:] = pull
             mujoco.mj_step1(model, data)
             mujoco.mj_step2(model, data)
-            # Contact forces are those of the step; mj_step2 moves the state only.
+            # Contact forces belong to the step, because mj_step2 only moves the state.
             pushes = contact_wrenches(model, data)
             contact, wall = bool(pushes["pad"].any()), bool(pushes["wall"].any())
             impulse, loaded = (impulse + pushes["pad"], loaded + 1) if contact else (np.zeros(6), 0)
@@ -92,12 +102,14 @@ CASES = {
     "falls off": (physics.Freefall(), [0.1, 0.01, 0.06, 0.5, 0.5, 0.5, 0.5], 32),
     "is jerked in the air": (physics.Perturbed(frames=30), [0.0, 0.0, 0.2, 0.9, 0.3, 0.1, 0.3], 0),
     "is jerked on the pad": (physics.Perturbed(frames=12), [0.01, 0.005, ON_PAD, 1.0, 0.0, 0.0, 0.0], 0),
+    "is pushed and spins": (physics.Freefall(frames=14), [-0.02, 0.01, 0.06, 0.96, 0.2, 0.1, 0.17], 32),
     "slides to the wall": (physics.Inclined(friction=(0.2, 0.2), frames=30), [0.01, 0.02, 0.05, 0.7, 0.1, 0.7, 0], 48),
 }
+PUSHED = np.array([0.2, -0.1, 0.05, 2.0, -3.0, 4.0])  # m/s, rad/s
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_is_a_plain_loop_of_steps(name: str) -> None:
+def test_native_roll_equals_a_plain_loop_of_steps(name: str) -> None:
     scenario, pose, held = CASES[name]
     body = BODIES[0]
     pose = np.array([*pose[:3], *(np.array(pose[3:]) / np.linalg.norm(pose[3:]))])
@@ -113,13 +125,14 @@ def test_it_is_a_plain_loop_of_steps(name: str) -> None:
     scene.set_rigid(model, mujoco.MjData(model), float(mass), com, inertia, scenario.friction[0])
     points = np.unique(hulls.reshape(-1, 3), axis=0)
     start = Start(pose[None], np.array([held]), np.asarray(condition)[None])
-    ends, record = native.roll([model], points, start, gravity[None], freeze=False)
+    velocity = PUSHED if name == "is pushed and spins" else np.zeros(6)
+    ends, record = native.roll([model], points, start, gravity[None], velocity[None], freeze=False)
     # Force and gravity differ by rounding, which the contacts of a rocking base magnify to a millimetre. Whether the
     # force has the effect of gravity is tested below.
-    truth = plain_loop(model, points, pose, gravity, held, as_force=name == "is jerked on the pad")
+    truth = plain_loop(model, points, pose, gravity, held, velocity, as_force=name == "is jerked on the pad")
     assert truth["gone"] == (name in ("falls off", "is jerked in the air"))
     assert truth["wall"].any() == (name == "slides to the wall")
-    assert truth["contact"].any() == (name != "is jerked in the air")  # that one flies past the pad
+    assert truth["contact"].any() == (name != "is jerked in the air")  # that object flies past the pad
     np.testing.assert_array_equal(record.contact[0], truth["contact"])
     np.testing.assert_array_equal(record.wall[0], truth["wall"])
     np.testing.assert_allclose(record.pose[0], truth["pose"], atol=1e-6)
@@ -131,7 +144,7 @@ def test_it_is_a_plain_loop_of_steps(name: str) -> None:
 
 
 @pytest.mark.parametrize("as_force", [True, False])
-def test_a_jerked_box_slides_as_coulomb_says(as_force: bool) -> None:
+def test_a_jerked_box_slides_by_coulombs_law(as_force: bool) -> None:
     half, mass, friction = np.array([0.03, 0.03, 0.008]), 0.1, 0.5
     pull, lasts, frames, steps = 8.0, 0.08, 6, 160
     points = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * half
@@ -158,7 +171,7 @@ def drops() -> physics.Trajectory:
     return jax.tree.map(np.asarray, simulate(BODIES, scenario=physics.Freefall(), num=6))
 
 
-def test_results_depend_on_no_chunk_no_thread_and_no_other_body(
+def test_results_are_independent_of_chunk_thread_and_other_bodies(
     drops: physics.Trajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = simulate(BODIES[0], scenario=physics.Freefall(), num=3, chunk=1)
@@ -170,7 +183,7 @@ def test_results_depend_on_no_chunk_no_thread_and_no_other_body(
 
 
 @pytest.mark.parametrize("scenario", [physics.Freefall(), physics.Inclined(), physics.Perturbed()])
-def test_what_has_settled_ends_where_it_would_have_ended_and_keeps_its_wrench(
+def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(
     scenario: physics.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bodies = BODIES[:1] if scenario.must_stand else BODIES
@@ -183,18 +196,18 @@ def test_what_has_settled_ends_where_it_would_have_ended_and_keeps_its_wrench(
     assert stopped.sum() >= 9
     for name in ("outcome", "settled", "touches", "condition"):
         np.testing.assert_array_equal(getattr(frozen, name), getattr(rolled, name))
-    for name in FIELDS:  # what moves is not touched
+    for name in FIELDS:  # moving objects are unchanged
         np.testing.assert_array_equal(getattr(frozen, name)[~stopped], getattr(rolled, name)[~stopped])
     np.testing.assert_allclose(frozen.pose[stopped, -1, :3], rolled.pose[stopped, -1, :3], atol=1e-3)
     assert frozen.contact[stopped, -1].all()
-    alone = stopped & ~frozen.wall[:, -1]  # what leans on the wall shifts its weight as it creeps
+    alone = stopped & ~frozen.wall[:, -1]  # an object that leans on the wall shifts its weight as it creeps
     assert alone.sum() >= 5
     largest = np.abs(rolled.wrench[alone, -1, :3]).max()
     np.testing.assert_allclose(frozen.wrench[alone, -1, :3], rolled.wrench[alone, -1, :3], atol=0.02 * largest)
 
 
-def test_a_pad_that_coasts_slowly_is_not_taken_for_the_end_of_a_jerk(monkeypatch: pytest.MonkeyPatch) -> None:
-    # For a second the pull is too weak to move anything; then it topples the bottle.
+def test_a_weak_pull_does_not_end_a_trajectory_before_a_strong_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    # For a second the pull is too weak to move the bottle. Then it topples the bottle.
     class Late(physics.Perturbed):
         def gravity(self, time: jax.Array, condition: jax.Array) -> jax.Array:
             return jnp.array([0.0, 0.0, -G]) + jnp.array([6.0, 0.0, 0.0]) * (time > 1.0)
@@ -216,7 +229,7 @@ def test_compound_bodies_land_on_their_parts() -> None:
     np.testing.assert_allclose(lowest, 0, atol=5e-5)
 
 
-def test_it_is_the_engine_of_a_cpu_and_another_name_is_refused(drops: physics.Trajectory) -> None:
+def test_c_mujoco_is_the_default_on_a_cpu_and_unknown_engines_are_refused(drops: physics.Trajectory) -> None:
     if jax.default_backend() == "cpu":
         found = physics.simulate(jax.random.key(3), BODIES[0], Sensor(), physics.Freefall(), 1)
         np.testing.assert_array_equal(found.pose, drops.pose[:1])

@@ -1,4 +1,4 @@
-"""The jerked pad: against a pad that really moves (C MuJoCo), the toppling of blocks, and what `Perturbed` promises."""
+"""`Perturbed`, compared with a moving pad in C MuJoCo, and the acceleration at which blocks topple."""
 
 import copy
 import dataclasses
@@ -13,7 +13,7 @@ import pytest
 from benchmarks import invariance
 from sts_jax import objects, physics
 from sts_jax.physics import contact, native, roll, scene
-from sts_jax.physics.scenarios import G, Start
+from sts_jax.physics.scenario import G, Start
 from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)
@@ -44,7 +44,7 @@ def rigid(bodies: list[objects.Body], traj: physics.Trajectory, row: int) -> tup
 
 
 @pytest.mark.slow
-def test_it_stands_and_is_felt_in_the_first_frame(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
+def test_objects_load_the_pad_in_the_first_frame(bottles: list[objects.Body], shaken: physics.Trajectory) -> None:
     up = jax.vmap(upright)(jnp.asarray(shaken.pose[:, 0, 3:]))
     np.testing.assert_allclose(up, 1, atol=1e-4)
     assert np.all(np.linalg.norm(shaken.pose[:, 0, :2], axis=1) < SCENARIO.spread + 1e-4)
@@ -74,7 +74,7 @@ def test_the_condition_is_the_jerk_and_the_future_does_not_leak(
     assert len(np.unique(shaken.outcome)) >= 3
 
 
-def test_gravity_holds_the_whole_impulse_and_ends() -> None:
+def test_gravity_contains_the_whole_impulse_and_returns_to_normal() -> None:
     condition = jnp.array([3.0, -4.0, 0.0754])
     scenario = dataclasses.replace(SCENARIO, contact=physics.Contact(timestep=0.001))
     time = jnp.arange(-32, 300) * 1e-3
@@ -85,12 +85,12 @@ def test_gravity_holds_the_whole_impulse_and_ends() -> None:
     np.testing.assert_array_equal(gravity[32 + 76 :, :2], 0)
 
 
-def test_a_jerk_as_gravity_is_a_pad_that_moves(
+def test_a_jerk_in_gravity_equals_a_moving_pad(
     bottles: list[objects.Body], shaken: physics.Trajectory, engine: physics.Engine
 ) -> None:
-    # In C MuJoCo, every vertex of the hull a contact: the object on a driven pad, and on a fixed one under the
-    # scenario's gravity; and ours at every frame. Up to the end of the jerk or the first loss of contact, whatever
-    # rocks; after that small things decide. Frequencies of outcomes are in test_benchmarks_invariance.
+    # C MuJoCo with a contact at every vertex moves the object on a driven pad, and on a fixed pad under the scenario's
+    # gravity. Compare them with `simulate` until the end of the jerk or the first loss of contact, after which rounding
+    # decides. test_benchmarks_invariance compares the frequencies of outcomes.
     apart, ours = [], []
     for row in range(2 * NUM):
         pair = []
@@ -119,7 +119,7 @@ def test_a_jerk_as_gravity_is_a_pad_that_moves(
                 ours.append(np.linalg.norm(place - shaken.pose[row, step // SCENARIO.steps, :3]))
     assert len(ours) >= 2 * 2 * NUM
     assert np.max(apart) < 2e-4
-    # In C the mesh pushes too, from .1 mm on, where the truth has it at 1 mm.
+    # In C MuJoCo the mesh pushes too, from 0.1 mm on, and in the truth from 1 mm on.
     assert np.quantile(ours, 0.9) < (1e-4 if engine == "mjx" else 2e-4)
     assert np.max(ours) < 3e-4  # while it moves by centimetres
 
@@ -149,7 +149,7 @@ def ends_in_mjx(
 def ends_in_c(
     points: np.ndarray, pose: np.ndarray, rigid: tuple[float, np.ndarray, np.ndarray, float], gravity: np.ndarray
 ) -> np.ndarray:
-    """As `ends_in_mjx`; a level frame follows, so that every pull is a force."""
+    """As `ends_in_mjx`. A level frame follows, so that every pull is a force."""
     model = native.compile_body(np.float32(points)[None], PAD, SCENARIO.contact)
     scene.set_rigid(model, mujoco.MjData(model), *rigid)
     count = len(gravity)
@@ -168,7 +168,7 @@ ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)
 def test_a_tall_prism_topples_at_g_b_over_h(
     shape: str, ends: Callable[[np.ndarray, np.ndarray, tuple, np.ndarray], np.ndarray], low: float
 ) -> None:
-    height, half = 0.1, 0.015  # m; the centre of mass is `low` below the middle
+    height, half = 0.1, 0.015  # m. The centre of mass is `low` below the middle
     if shape == "box":
         base = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) * half
     else:
@@ -194,7 +194,7 @@ def test_a_tall_prism_topples_at_g_b_over_h(
         assert np.all((lean > 20) == falls), (factor, lean)
 
 
-def test_outcomes_are_read_from_the_poses() -> None:
+def test_outcomes_follow_from_the_poses() -> None:
     first = jnp.array([0.01, 0, 0.05, 1, 0, 0, 0])
     turn = jnp.array([jnp.cos(0.5), jnp.sin(0.5), 0, 0])  # 57 degrees
     cases = {
@@ -208,6 +208,6 @@ def test_outcomes_are_read_from_the_poses() -> None:
 
 
 @pytest.mark.parametrize("change", [{"acceleration": (-1.0, 2.0)}, {"duration": (0.2, 0.1)}, {"spread": -0.1}])
-def test_bad_fields_are_named(bottles: list[objects.Body], change: dict) -> None:
+def test_errors_name_bad_fields(bottles: list[objects.Body], change: dict) -> None:
     with pytest.raises(ValueError, match=f"scenario.{next(iter(change))}"):
         physics.simulate(jax.random.key(0), bottles, Sensor(), dataclasses.replace(SCENARIO, **change))

@@ -85,7 +85,7 @@ def test_the_wrench_is_the_weight_with_its_moment_about_the_origin(bodies):
     np.testing.assert_allclose(wrench, np.concatenate([force, np.cross(centre, force)]), rtol=1e-4, atol=1e-7)
 
 
-def test_faces_yaw_and_position_are_as_asked(bodies):
+def test_placement_has_the_requested_face_yaw_and_position(bodies):
     body = bodies[0]
     standing = physics.place(body, sts.Sensor(), face="upright", position=(0.01, -0.02), yaw=np.pi / 2)
     w, x, y, z = np.asarray(standing.pose[3:], np.float64)
@@ -124,12 +124,12 @@ def test_more_shell_or_contents_weigh_more(bodies):
         ({"up": (0.0, 0.0, 2.0)}, r"up is .* unit vector"),
     ],
 )
-def test_what_cannot_be_placed_is_named(bodies, changes, message):
+def test_errors_name_arguments_of_place_that_are_out_of_range(bodies, changes, message):
     with pytest.raises(ValueError, match=message):
         physics.rest.place.__wrapped__(bodies[0], sts.Sensor(), **changes)
 
 
-def test_bodies_that_cannot_be_placed_are_named(bodies):
+def test_errors_name_bodies_that_cannot_be_placed(bodies):
     leaning = Rotation.from_euler("x", 30, degrees=True).as_matrix().astype(np.float32)
     with pytest.raises(ValueError, match=r"face is 'upright', but the body does not stand"):
         physics.place(dataclasses.replace(bodies[0], hulls=bodies[0].hulls @ leaning.T), sts.Sensor(), face="upright")
@@ -142,7 +142,7 @@ def test_bodies_that_cannot_be_placed_are_named(bodies):
         physics.place(dataclasses.replace(bodies[0], vertices=bodies[0].vertices.at[3, 1].set(jnp.nan)), sts.Sensor())
 
 
-def test_arguments_of_place_of_another_kind_are_named(bodies):
+def test_errors_name_arguments_of_place_of_another_type(bodies):
     sensor, place = sts.Sensor(), inspect.unwrap(physics.place)
     for given, message in (
         (("mug.obj", sensor), r"body is 'mug\.obj', but it must be one Body: .* objects\.load reads a mesh file"),

@@ -256,12 +256,15 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
     return geometry.transform(jnp.concatenate([jnp.zeros(3), spin]), pair).reshape(wrench.shape)
 
 
-def turn_condition(condition: Float[Array, "*n c"], symmetry: int) -> Float[Array, "*n c"]:
-    """A condition under a symmetry of the pad. The first two numbers are a vector (x, y), and the others stay."""
+def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int = 1) -> Float[Array, "*n c"]:
+    """A condition under a symmetry of the pad. It begins with so many vectors (x, y), and the other numbers stay."""
     if condition.shape[-1] == 0:
         return condition
-    vector = jnp.concatenate([condition[..., :2], jnp.zeros((*condition.shape[:-1], 4))], -1)
-    return jnp.concatenate([turn_wrench(vector, symmetry)[..., :2], condition[..., 2:]], -1)
+    parts = [condition[..., 2 * vectors :]]
+    for place in reversed(range(0, 2 * vectors, 2)):
+        vector = jnp.concatenate([condition[..., place : place + 2], jnp.zeros((*condition.shape[:-1], 4))], -1)
+        parts.insert(0, turn_wrench(vector, symmetry)[..., :2])
+    return jnp.concatenate(parts, -1)
 
 
 def collect(
@@ -547,5 +550,9 @@ def _report(progress: Callable[[Progress], None] | None, before: int, total: int
 
 def _as_json(collection: Collection) -> dict:
     content = dataclasses.asdict(collection)
-    content["scenario"] = {"name": type(collection.scenario).__name__, **content["scenario"]}
+    scenario = collection.scenario
+    content["scenario"] = {"name": type(scenario).__name__, **content["scenario"]}
+    # Left out where it is 1, so that the descriptions of older datasets, whose conditions have one vector, stay valid.
+    if scenario.quantities and scenario.vectors != 1:
+        content["scenario"]["vectors"] = scenario.vectors
     return {"format": records.FORMAT, **content}

@@ -241,7 +241,8 @@ class Dataset:
         index = np.array([t for t, _ in wanted], np.int64)
         ends, input = jnp.asarray(self.trajectory["pose"][:, [0, last]]), jnp.asarray(self.trajectory["condition"])
         turned = np.stack([np.asarray(turn(ends, kind)) for kind in kinds])
-        conditions = np.stack([np.asarray(turn_condition(input, kind)) for kind in kinds])
+        vectors = self.collection["scenario"].get("vectors", 1)
+        conditions = np.stack([np.asarray(turn_condition(input, kind, vectors)) for kind in kinds])
         place = np.tile(np.arange(len(kinds)), len(trajectories))
         mirrored = np.array(kinds)[place, None] >= 4
         com = self.solid["com"][index]

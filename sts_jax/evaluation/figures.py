@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import colors, font_manager
@@ -26,11 +27,19 @@ SAMPLES = 4  # samples shown of each prediction
 _POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of possible and of predicted ends
 
 
-def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, title: str) -> None:
+def predictions(
+    path: Path,
+    test: Pairs,
+    predicted: Predicted,
+    *,
+    num: int,
+    title: str,
+    scenario: physics.Scenario | None = None,
+) -> None:
     """Draw input, truth, prediction and samples of the first `num` held-out trajectories, with a row for each stream.
 
-    If there is a condition, an arrow on the input shows the velocity relative to the pad that the jerk gives to a
-    freely sliding object. A quarter of the picture is 1 m/s.
+    A red arrow on the input shows the velocity over the pad that a freely sliding object receives (`Scenario.drift`),
+    unless it is 0. A quarter of the picture is 1 m/s.
 
     Args:
         path: The PNG to write.
@@ -38,6 +47,8 @@ def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, titl
         predicted: Predictions of these, or of the first ones. A stream that is not predicted has no rows.
         num: Number of trajectories.
         title: Title of the figure.
+        scenario: The scenario of the trajectories, for the names of its outcomes and the arrows (None: no arrows, and
+            the names of `physics.Outcome`).
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
     samples = predicted.samples or Predicted()
@@ -45,6 +56,9 @@ def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, titl
     drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
     heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
     rows = len(streams) * num
+    drift = np.zeros((num, 2))
+    if scenario is not None:
+        drift = np.stack([scenario.drift(jnp.asarray(condition)) for condition in test.condition[:num]])
     figure, axes = plt.subplots(rows, len(heads), figsize=(1.25 * len(heads) + 0.7, 1.25 * rows + 0.8), squeeze=False)
     for row in range(rows):
         item, stream = row // len(streams), streams[row % len(streams)]
@@ -60,14 +74,17 @@ def predictions(path: Path, test: Pairs, predicted: Predicted, *, num: int, titl
                 axis.set_title(heads[column], fontsize=10)
         label = stream
         if row % len(streams) == 0:
-            label = f"#{test.trajectory[item]}: {physics.Outcome(int(test.outcome[item]))}\n{stream}"
+            number = int(test.outcome[item])
+            outcome = physics.Outcome(number) if scenario is None else scenario.named(number)
+            label = f"#{test.trajectory[item]}: {outcome}\n{stream}"
         axes[row, 0].set_ylabel(label, fontsize=9)
-        if stream == streams[0] and test.condition.shape[1]:
+        if stream == streams[0] and drift[item].any():
             height, width = test.visual.shape[2:4]
             middle = np.array([width - 1, height - 1]) / 2
-            tip = middle - test.condition[item, :2] * test.condition[item, 2] * width / 4
+            tip = middle + drift[item] * width / 4
             axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
-    figure.suptitle(title, fontsize=11)
+    arrows = "\nred: the velocity over the pad that a freely sliding object receives" if drift.any() else ""
+    figure.suptitle(title + arrows, fontsize=11)
     _save(figure, path)
 
 

@@ -1,5 +1,6 @@
 """Predictions on held-out objects, baselines, and their errors per item."""
 
+import enum
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -93,7 +94,7 @@ def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndar
     return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
 
 
-def shares(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarray:
+def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
     """Probabilities `(n, c)` of outcomes from samples of the outcome.
 
     One more sample is spread evenly over the outcomes, so that no probability is 0.
@@ -106,7 +107,7 @@ def shares(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarr
     return (counts + 1 / len(outcomes)) / (len(outcome) + 1)
 
 
-def frequency(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.ndarray:
+def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
     """Frequency of each outcome `(c,)`, with one more item that is spread evenly, so that no frequency is 0.
 
     Args:
@@ -116,13 +117,16 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[physics.Outcome]) -> np.nd
     return shares(outcome[:, None], outcomes)[0]
 
 
-def outcome_of_image(visual: np.ndarray, blank: np.ndarray, threshold: float) -> np.ndarray:
-    """The outcome of freefall from an image: `FELL_OFF` if its distance from the empty image is at most a threshold.
+def outcome_of_image(
+    visual: np.ndarray, blank: np.ndarray, threshold: float, stays: int = int(physics.Outcome.RESTS)
+) -> np.ndarray:
+    """The outcome from an image: `FELL_OFF` if its distance from the empty image is at most a threshold, else `stays`.
 
-    The outcomes of other scenarios depend on how an object lies on the pad, which is not read from images.
+    This decides only scenarios with one outcome of objects that stay on the pad. Outcomes that depend on how an object
+    lies there are not read from images.
     """
     empty = emptiness(visual, blank) <= threshold
-    return np.where(empty, int(physics.Outcome.FELL_OFF), int(physics.Outcome.RESTS))
+    return np.where(empty, int(physics.Outcome.FELL_OFF), stays)
 
 
 def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
@@ -189,7 +193,7 @@ def score(
     predicted: Predicted,
     test: Pairs,
     *,
-    outcomes: Sequence[physics.Outcome] = (),
+    outcomes: Sequence[enum.IntEnum] = (),
     frequency: np.ndarray | None = None,
 ) -> Scores:
     """Errors per item of a prediction of the last moment.
@@ -258,7 +262,7 @@ def _with_probability(
     scores: Scores,
     probability: np.ndarray,
     test: Pairs,
-    outcomes: Sequence[physics.Outcome],
+    outcomes: Sequence[enum.IntEnum],
     frequency: np.ndarray | None,
 ) -> Scores:
     """Add the scores of the outcome probabilities."""

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sts_jax import dataset, physics
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.report import Predicted, shares
-from sts_jax.physics.scenarios import Shape, Start
-from sts_jax.physics.simulate import ATTEMPTS
+from sts_jax.physics.scenario import Shape, Start
+from sts_jax.physics.simulation import ATTEMPTS
 from sts_jax.sensor import Sensor
 
 RENDER_BATCH = 32  # frames rendered by one compiled call

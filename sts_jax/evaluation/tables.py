@@ -1,5 +1,6 @@
 """Metrics of several predictors with their intervals, as numbers and as two tables, a short and a complete one."""
 
+import enum
 import functools
 from collections.abc import Callable, Mapping, Sequence
 
@@ -54,13 +55,21 @@ FIGURES = (
 )
 
 
-def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, seed: int = 0) -> dict:
+def summarise(
+    scores: Mapping[str, Scores],
+    test: Pairs,
+    *,
+    outcomes: Sequence[enum.IntEnum] = tuple(physics.Outcome),
+    num: int = 2000,
+    seed: int = 0,
+) -> dict:
     """All metrics of all predictors with 95 % intervals over objects, and their differences from the baselines.
 
     Args:
         scores: Scores by name, including the baselines. A predictor may have scores of the first items only. Its
             metrics are then over these.
         test: The items that were scored.
+        outcomes: `scenario.outcomes`, for their names.
         num: Number of bootstrap draws.
         seed: Seed of the draws.
 
@@ -91,7 +100,7 @@ def summarise(scores: Mapping[str, Scores], test: Pairs, *, num: int = 2000, see
     return {
         "items": len(test.object),
         "objects": len(np.unique(test.object)),
-        "outcomes": {physics.Outcome(o).name.lower(): int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
+        "outcomes": {o.name.lower(): int((test.outcome == o).sum()) for o in sorted(outcomes) if o in test.outcome},
         "scored": scored,
         "predictors": {name: column(value[i], draws[:, i]) for i, name in enumerate(names)},
         "differences": {

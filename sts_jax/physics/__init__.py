@@ -1,20 +1,27 @@
 """Physics: objects fall, slide and topple on the pad in MuJoCo (`simulate`) or rest on it (`place`)."""
 
+from sts_jax.physics.bodies import BodyError, refusal
 from sts_jax.physics.draws import Starts, starts
+from sts_jax.physics.engines import Engine
+from sts_jax.physics.freefall import Freefall
+from sts_jax.physics.inclined import Inclined
+from sts_jax.physics.mass_properties import Rigid, rigids
+from sts_jax.physics.perturbed import Perturbed
 from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
-from sts_jax.physics.scenarios import (
-    Freefall,
+from sts_jax.physics.scenario import (
     Hidden,
-    Inclined,
     Outcome,
-    Perturbed,
+    Quantity,
     Scenario,
+    Shape,
+    Start,
     Variant,
     fell_off,
     variant,
 )
 from sts_jax.physics.scene import Contact
-from sts_jax.physics.simulate import BodyError, Engine, Rigid, Trajectory, refusal, rigids, simulate
+from sts_jax.physics.simulation import simulate
+from sts_jax.physics.trajectory import Trajectory
 
 __all__ = [
     "BodyError",
@@ -26,9 +33,12 @@ __all__ = [
     "Outcome",
     "Perturbed",
     "Placement",
+    "Quantity",
     "Rigid",
     "Scenario",
+    "Shape",
     "StableFaces",
+    "Start",
     "Starts",
     "Trajectory",
     "Variant",

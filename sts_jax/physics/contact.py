@@ -19,7 +19,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax import geometry
@@ -58,10 +58,11 @@ def hull(parts: np.ndarray) -> Hull:
     Raises:
         ValueError: the points of a part span no volume.
     """
-    return Hull(*(np.stack(x, axis=-2) for x in zip(*(_part(part) for part in parts), strict=True)))
+    return jax.tree.map(lambda *x: np.stack(x, axis=-2), *(_part(part) for part in parts))
 
 
-def _part(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _part(vertices: np.ndarray) -> Hull:
+    """Vertices, edges and faces of one part, without the axis of parts."""
     points = np.asarray(vertices, np.float64)
     try:
         found = ConvexHull(points)
@@ -76,11 +77,25 @@ def _part(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return np.moveaxis(padded, 0, -1).astype(np.float32)
 
     n = len(points)
-    return pad(points, n), pad(edges, 3 * n - 6), pad(planes, 2 * n - 4)
+    return Hull(pad(points, n), pad(edges, 3 * n - 6), pad(planes, 2 * n - 4))
 
 
-# Candidates of one kind: depth (c,) in m, place (3, c) in m, normal (3, c).
-_Candidates = tuple[Float[Array, "c"], Float[Array, "3 c"], Float[Array, "3 c"]]
+class _Candidates(NamedTuple):
+    """Possible contact points of one kind."""
+
+    depth: Float[Array, "c"]  # m, negative where there is no contact
+    point: Float[Array, "3 c"]  # m
+    normal: Float[Array, "3 c"]  # from pad to object
+
+
+class _Crossing(NamedTuple):
+    """The edges of a hull at the side plane of the box that holds one rim of its top."""
+
+    crosses: Bool[Array, "e"]  # whether an edge has one end on either side of the plane
+    point: Float[Array, "3 e"]  # m, where it meets the plane
+    inner: Float[Array, "3 e"]  # m, its inner end, or where it leaves the box by the side next to the rim
+    beyond: Bool[Array, "e"]  # whether its inner end lies beyond that side
+    to_corner: Float[Array, "e"]  # m, from the point along the rim to the corner on the side of the inner end
 
 
 def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 3 h"]) -> Float[Array, "*n 3 h"]:
@@ -90,34 +105,44 @@ def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 
 
 
 def _vertices(points: Float[Array, "3 h"], half: Float[Array, "2"]) -> _Candidates:
+    """Vertices of the hull inside the box. The nearest of the top and the four sides pushes."""
     x, y, z = points
     side_x, side_y = half[0] - jnp.abs(x), half[1] - jnp.abs(y)
     top = -z <= jnp.minimum(side_x, side_y)
     through_x, through_y = ~top & (side_x <= side_y), ~top & (side_x > side_y)
     normal = [jnp.where(through_x, jnp.where(x < 0, -1.0, 1.0), 0.0)]
     normal += [jnp.where(through_y, jnp.where(y < 0, -1.0, 1.0), 0.0), jnp.where(top, 1.0, 0.0)]
-    return jnp.minimum(-z, jnp.minimum(side_x, side_y)), points, jnp.stack(normal)
+    return _Candidates(jnp.minimum(-z, jnp.minimum(side_x, side_y)), points, jnp.stack(normal))
 
 
-def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: float) -> _Candidates:
-    along = ends[1] - ends[0]
+def _crossing(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: float) -> _Crossing:
+    """Where the edges meet the side plane of the box on one side (`sign`) of an axis."""
     out = sign * ends[:, axis] - half[axis]
     crosses = out[0] * out[1] < 0
     share = jnp.where(crosses, out[0] / jnp.where(crosses, out[0] - out[1], 1.0), 0.0)
-    point = ends[0] + share * along
-    # The inner end of the edge, or where it leaves the box by a side next to the rim, across a corner.
+    point = ends[0] + share * (ends[1] - ends[0])
     inner, other = jnp.where(out[0] < out[1], ends[0], ends[1]), 1 - axis
     beyond = jnp.abs(inner[other]) > half[other]
     to_corner = jnp.where(inner[other] < 0, -half[other], half[other]) - point[other]
     whole = jnp.where(beyond & (inner[other] != point[other]), inner[other] - point[other], 1.0)
     inner = jnp.where(beyond, point + to_corner / whole * (inner - point), inner)
-    # The edge came through the top if this end is above the box, inside it and nearer to the top than to a side, or
-    # beyond its far side.
+    return _Crossing(crosses, point, inner, beyond, to_corner)
+
+
+def _through_top(edges: _Crossing, half: Float[Array, "2"], axis: int, sign: float) -> Bool[Array, "e"]:
+    """Whether an edge came through the top of the box and not through a side.
+
+    It did if its inner end is above the box, inside it and nearer to the top than to a side, or beyond its far side.
+    """
+    inner = edges.inner
     cut = jnp.abs(sign * half[axis] - inner[axis])
-    aside = jnp.abs(to_corner) * cut / jnp.sqrt(jnp.maximum(to_corner**2 + cut**2, 1e-12))
-    inside = jnp.where(beyond, aside, jnp.minimum(half[0] - jnp.abs(inner[0]), half[1] - jnp.abs(inner[1])))
-    through_top = (-inner[2] <= jnp.maximum(0, inside)) | (sign * inner[axis] < -half[axis])
-    # The normal is perpendicular to the edge and to the rim, which runs along the other axis.
+    aside = jnp.abs(edges.to_corner) * cut / jnp.sqrt(jnp.maximum(edges.to_corner**2 + cut**2, 1e-12))
+    inside = jnp.where(edges.beyond, aside, jnp.minimum(half[0] - jnp.abs(inner[0]), half[1] - jnp.abs(inner[1])))
+    return (-inner[2] <= jnp.maximum(0, inside)) | (sign * inner[axis] < -half[axis])
+
+
+def _rim_normal(along: Float[Array, "3 e"], axis: int, sign: float) -> Float[Array, "3 e"]:
+    """Unit vectors perpendicular to edges of some directions and to the rim, which runs along the other axis."""
     across, up = along[2], -along[axis]
     length = jnp.sqrt(across**2 + up**2)
     scale = jnp.where(up < 0, -1.0, 1.0) / jnp.where(length > 0, length, 1.0)
@@ -125,13 +150,21 @@ def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: 
     # If the inner end is lower, it is itself a contact, and the rim only supports the edge from below.
     tilted = sign * across >= 0
     across, up = jnp.where(tilted, across, 0.0), jnp.where(tilted, up, 1.0)
-    on_rim = jnp.abs(point[other]) < half[other]
-    depth = jnp.where(crosses & through_top & on_rim, -point[2] * up, -1.0)
     none = jnp.zeros_like(up)
-    return depth, point, jnp.stack([across, none, up] if axis == 0 else [none, across, up])
+    return jnp.stack([across, none, up] if axis == 0 else [none, across, up])
+
+
+def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: float) -> _Candidates:
+    """Edges of the hull across the rim of the top on one side (`sign`) of an axis."""
+    edges = _crossing(ends, half, axis, sign)
+    normal = _rim_normal(ends[1] - ends[0], axis, sign)
+    on_rim = jnp.abs(edges.point[1 - axis]) < half[1 - axis]
+    touches = edges.crosses & _through_top(edges, half, axis, sign) & on_rim
+    return _Candidates(jnp.where(touches, -edges.point[2] * normal[2], -1.0), edges.point, normal)
 
 
 def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidates:
+    """Corners of the top inside a convex part. The nearest of its lower faces is pushed."""
     found = []
     for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         corner = jnp.stack([x * half[0], y * half[1], jnp.zeros(())])
@@ -140,9 +173,8 @@ def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidate
         nearest = jnp.argmin(below)
         depth = jnp.where(jnp.all(inside > 0), below[nearest], -1.0)
         normal = -planes[:3, nearest]
-        found.append((depth, corner - depth * normal, normal))
-    depths, corners, normals = zip(*found, strict=True)
-    return jnp.stack(depths), jnp.stack(corners, axis=1), jnp.stack(normals, axis=1)
+        found.append(_Candidates(depth, corner - depth * normal, normal))
+    return jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *found)
 
 
 def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> Int[Array, "k"]:
@@ -202,7 +234,7 @@ def collide(
     rims = [_rim(ends, half, axis, sign) for axis in (0, 1) for sign in (-1.0, 1.0)]
     corners = [_corners(planes[:, part], half) for part in range(planes.shape[1])]
     kinds = [_vertices(points, half), *rims, *corners]
-    depth, points, normal = (jnp.concatenate(x, axis=-1) for x in zip(*kinds, strict=True))
+    depth, points, normal = jax.tree.map(lambda *x: jnp.concatenate(x, axis=-1), *kinds)
     chosen = _spread(depth, points[jnp.array(plane)], num)
     new = jnp.sum(jnp.tril(chosen == chosen[:, None]), axis=1) == 1
     depth, points, normal = depth[chosen], points[:, chosen].T, normal[:, chosen].T

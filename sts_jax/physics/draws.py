@@ -1,5 +1,6 @@
-"""Further starts of bodies, without their trajectories."""
+"""Random starts and hidden values: of the trajectories of `simulate`, and of further starts without trajectories."""
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,8 +11,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from sts_jax._keys import check_key
 from sts_jax.objects.body import Body
-from sts_jax.physics.scenarios import Hidden, Scenario
-from sts_jax.physics.simulate import _check, _draw, _shapes
+from sts_jax.physics.arguments import check_arguments, listed
+from sts_jax.physics.bodies import shapes
+from sts_jax.physics.scenario import Hidden, Scenario, Shape, Start
 from sts_jax.sensor import Sensor
 
 _FURTHER = 2**32 - 1  # folded into the key. `simulate` folds in the indices of bodies, which are lower
@@ -23,6 +25,36 @@ class Starts(NamedTuple):
     pose: Float[Array, "n 7"]  # mesh frame in the sensor frame, w >= 0
     hidden: Hidden  # (n,) each, `up` (n, 3)
     body: Int[Array, "n"]  # index into the sequence of bodies
+
+
+@functools.partial(jax.jit, static_argnames=("scenario", "pad"))
+def draw(
+    key: PRNGKeyArray,
+    body: Int[Array | np.ndarray, "n"],
+    nth: Int[Array | np.ndarray, "n"],
+    attempt: Int[Array | np.ndarray, "n"],
+    shapes: Shape,
+    scenario: Scenario,
+    pad: tuple[float, float],
+) -> tuple[Start, Hidden]:
+    """Draw starts and hidden values. Each depends on its own body, number and attempt only.
+
+    Args:
+        key: for the whole set.
+        body: index of the body of each draw.
+        nth: number of each draw among those of its body.
+        attempt: how often each was drawn before.
+        shapes: of all bodies.
+        scenario: scenario of the starts.
+        pad: m, size of the pad along x and y.
+    """
+
+    def one(body: Int[Array, ""], nth: Int[Array, ""], attempt: Int[Array, ""]) -> tuple[Start, Hidden]:
+        own = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), nth), attempt)
+        start, hidden = jax.random.split(own)
+        return scenario.start(start, jax.tree.map(lambda x: x[body], shapes), pad), scenario.hidden(hidden)
+
+    return jax.vmap(one)(body, nth, attempt)
 
 
 def starts(
@@ -37,7 +69,7 @@ def starts(
         key: for the whole set. The key of `simulate` may be used again.
         bodies: one body, or a sequence of different ones.
         sensor: `sensor.gel.size` is the pad's size.
-        scenario: `Freefall()`, `Inclined()` or `Perturbed()`.
+        scenario: `Freefall()`, `Inclined()`, `Perturbed()` or another `Scenario`.
         num: starts of each body.
 
     Returns:
@@ -48,11 +80,11 @@ def starts(
         ValueError: another argument, which the message names, is out of range.
         TypeError: an argument is of another type.
     """
-    bodies = list(bodies) if isinstance(bodies, Sequence) and not isinstance(bodies, str) else [bodies]
+    several = listed(bodies)
     check_key(key)
-    _check(bodies, sensor, scenario, num, 1)
+    check_arguments(several, sensor, scenario, num=num)
     pad = (float(sensor.gel.size[0]), float(sensor.gel.size[1]))
-    which, nth = np.repeat(np.arange(len(bodies)), num), np.tile(np.arange(num), len(bodies))
+    which, nth = np.repeat(np.arange(len(several)), num), np.tile(np.arange(num), len(several))
     own, first = jax.random.fold_in(key, _FURTHER), np.zeros(len(which), np.int32)
-    start, hidden = _draw(own, which, nth, first, _shapes(bodies, scenario), scenario=scenario, pad=pad)
+    start, hidden = draw(own, which, nth, first, shapes(several, scenario), scenario=scenario, pad=pad)
     return Starts(start.pose, hidden, jnp.asarray(which, jnp.int32))

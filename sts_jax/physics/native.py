@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from sts_jax.physics import scene
 from sts_jax.physics.roll import GONE_DEPTH, PARTED_TIME, SLOW_SPEED, SLOW_TURN, Record
-from sts_jax.physics.scenarios import Start
+from sts_jax.physics.scenario import Start
 
 POINT = 1e-6  # m, radius of the contact sphere at each vertex
 MESH_GAP = 0.0001  # m, depth from which the mesh pushes, more than that of vertices at rest
@@ -160,11 +160,23 @@ def _record(steps: _Steps, frames: int) -> Record:
     )
 
 
+class _Simulation(NamedTuple):
+    """Several worlds of one body. The records are written in place."""
+
+    batch: mujoco.batch.Batch
+    points: Float[np.ndarray, "h 3"]  # m, vertices of the hull in the mesh frame
+    lowest: float  # m, height of the mesh frame's origin above which the object cannot be gone
+    change: Float[np.ndarray, "n f s 3"]  # N, weight in each step less that in the last step
+    timestep: float  # s
+    records: Record
+
+
 def roll(
     models: Sequence[mujoco.MjModel],
     points: Float[np.ndarray, "h 3"],
     start: Start,
     gravity: Float[np.ndarray, "n f s 3"],
+    velocity: Float[np.ndarray, "n 6"] | None = None,
     *,
     freeze: bool = True,
 ) -> tuple[Ends, Record]:
@@ -178,6 +190,7 @@ def roll(
         points: m, vertices of the hull in the mesh frame.
         start: n starts.
         gravity: m/s^2, sensor frame, for every step of every frame's interval.
+        velocity: on release, m/s of the mesh frame's origin, rad/s; sensor frame. None for objects at rest.
         freeze: whether a trajectory ends once the object has been still for STILL_TIME. The object then keeps its pose
             and wrench, and its velocity becomes 0.
 
@@ -185,25 +198,54 @@ def roll(
         Final values of each trajectory, and one record per trajectory and frame.
     """
     count, frames, steps, _ = gravity.shape
-    timestep = models[0].opt.timestep
-    mass = np.array([model.body("object").mass[0] for model in models])
-    change = mass[:, None, None, None] * (gravity - gravity[:, -1:, -1:])
-    changing = np.any(change, axis=(2, 3))
+    worlds = _simulation(models, points, start, gravity, np.zeros((count, 6)) if velocity is None else velocity)
+    none = np.zeros(count, int)
+    counts = _Counts(none > 0, none, none, none + 2**20, none, np.zeros(count))
+    held = np.asarray(start.held)
+    for steps_held in np.unique(held[held < steps]):
+        counts = _advance(worlds, counts, np.flatnonzero(held == steps_held), 0, 1, steps - int(steps_held))
+    changing = np.any(worlds.change, axis=(2, 3))
     # The first frame from which gravity is constant.
     calm = np.where(changing.any(axis=1), frames - changing[:, ::-1].argmax(axis=1), 0)
+    active = np.arange(count)
+    for begin in range(1, frames, BLOCK):
+        end = min(begin + BLOCK, frames)
+        counts = _advance(worlds, counts, active, begin, end, steps)
+        calm_steps = np.minimum(counts.still, (end - calm) * steps)
+        still = (calm_steps * worlds.timestep >= STILL_TIME) & freeze & ~counts.gone
+        ended = active[(counts.gone | still)[active]]
+        _keep(worlds.records, end, ended, active[still[active]])
+        counts = counts._replace(slow=np.where(still, counts.slow + (frames - end) * steps, counts.slow))
+        active = np.setdiff1d(active, ended)
+        if not len(active):
+            break
+    finite = _finite(worlds)
+    ends = Ends(counts.gone, counts.slow, counts.touches, counts.sunk, finite)
+    return ends, Record(*(x if x.dtype == bool else x.astype(np.float32) for x in worlds.records))
+
+
+def _simulation(
+    models: Sequence[mujoco.MjModel],
+    points: Float[np.ndarray, "h 3"],
+    start: Start,
+    gravity: Float[np.ndarray, "n f s 3"],
+    velocity: Float[np.ndarray, "n 6"],
+) -> _Simulation:
+    """Worlds at their starts, with records of objects that stay there. The arguments are those of `roll`."""
+    count, frames, _, _ = gravity.shape
+    mass = np.array([model.body("object").mass[0] for model in models])
     for model, pull in zip(models, gravity[:, -1, -1], strict=True):
         model.opt.gravity[:] = pull
     radius = np.linalg.norm(points, axis=1).max()
     outside = ConvexHull(points).equations[:, 3].max() > 0
-    lowest = -GONE_DEPTH + (radius if outside else 0.0)
 
     batch = mujoco.batch.Batch(models[0], count, nthread=1)
     batch.set_models(models)
     batch.qpos = start.pose
-    xfrc = batch.bind("xfrc_applied")
-    none = np.zeros(count, int)
-    counts = _Counts(none > 0, none, none, none + 2**20, none, np.zeros(count))
     pose = np.asarray(start.pose, np.float64)
+    turn = Rotation.from_quat(pose[:, 3:], scalar_first=True).apply(velocity[:, 3:], inverse=True)
+    batch.qvel = np.concatenate([velocity[:, :3], turn], axis=1)
+
     pose[pose[:, 3] < 0, 3:] *= -1
     shapes = {"pose": 7, "velocity": 6, "wrench": 6}
     records = Record(
@@ -212,43 +254,57 @@ def roll(
         wall=np.zeros((count, frames), bool),
     )
     records.pose[:] = pose[:, None]
+    records.velocity[:, 0] = velocity
+    return _Simulation(
+        batch=batch,
+        points=points,
+        lowest=-GONE_DEPTH + (radius if outside else 0.0),
+        change=mass[:, None, None, None] * (gravity - gravity[:, -1:, -1:]),
+        timestep=models[0].opt.timestep,
+        records=records,
+    )
 
-    def advance(which: np.ndarray, begin: int, end: int, per_frame: int) -> _Counts:
-        """Roll worlds through the last `per_frame` steps of each interval, and keep their records."""
-        push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
-        push[:, :, 1, :3] = change[which, begin:end, steps - per_frame :].reshape(len(which), -1, 3)
-        xfrc[which] = 0
-        control = push.reshape(*push.shape[:2], 12) if push.any() else None
-        found = batch.rollout(push.shape[1], control, int(FORCE), record=("qpos", "qvel", "sensordata"), ids=which)
-        qpos = found["qpos"]
-        rolled = _Steps(qpos, found["qvel"], found["sensordata"], _gone(qpos, points, lowest))
-        for field, new in zip(records, _record(rolled, end - begin), strict=True):
-            field[which, begin:end] = new
-        after = _count(rolled, _Counts(*(x[which] for x in counts)), timestep)
-        whole = [x.copy() for x in counts]
-        for field, new in zip(whole, after, strict=True):
-            field[which] = new
-        return _Counts(*whole)
 
-    held = np.asarray(start.held)
-    for steps_held in np.unique(held[held < steps]):
-        counts = advance(np.flatnonzero(held == steps_held), 0, 1, steps - int(steps_held))
-    active = np.arange(count)
-    for begin in range(1, frames, BLOCK):
-        end = min(begin + BLOCK, frames)
-        counts = advance(active, begin, end, steps)
-        calm_steps = np.minimum(counts.still, (end - calm) * steps)
-        still = (calm_steps * timestep >= STILL_TIME) & freeze & ~counts.gone
-        ended = active[(counts.gone | still)[active]]
-        records.pose[ended, end:] = records.pose[ended, end - 1 : end]
-        kept = active[still[active]]
-        for field in (records.wrench, records.contact, records.wall):
-            field[kept, end:] = field[kept, end - 1 : end]
-        counts = counts._replace(slow=np.where(still, counts.slow + (frames - end) * steps, counts.slow))
-        active = np.setdiff1d(active, ended)
-        if not len(active):
-            break
-    failed = batch.warning[..., 1].any(axis=1) | (batch.status != 0)
-    finite = ~failed & np.isfinite(records.pose).all(axis=(1, 2)) & np.isfinite(records.velocity).all(axis=(1, 2))
-    ends = Ends(counts.gone, counts.slow, counts.touches, counts.sunk, finite)
-    return ends, Record(*(x if x.dtype == bool else x.astype(np.float32) for x in records))
+def _advance(
+    worlds: _Simulation, counts: _Counts, which: Int[np.ndarray, "k"], begin: int, end: int, per_frame: int
+) -> _Counts:
+    """Roll some worlds through the last steps of each interval from frame `begin` to `end`, and keep their records.
+
+    Args:
+        worlds: all worlds.
+        counts: of all worlds.
+        which: indices of the worlds to roll.
+        begin: the first frame.
+        end: the frame after the last one.
+        per_frame: number of steps in each interval.
+    """
+    steps = worlds.change.shape[2]
+    push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
+    push[:, :, 1, :3] = worlds.change[which, begin:end, steps - per_frame :].reshape(len(which), -1, 3)
+    worlds.batch.bind("xfrc_applied")[which] = 0
+    control = push.reshape(*push.shape[:2], 12) if push.any() else None
+    recorded = ("qpos", "qvel", "sensordata")
+    found = worlds.batch.rollout(push.shape[1], control, int(FORCE), record=recorded, ids=which)
+    qpos = found["qpos"]
+    rolled = _Steps(qpos, found["qvel"], found["sensordata"], _gone(qpos, worlds.points, worlds.lowest))
+    for field, new in zip(worlds.records, _record(rolled, end - begin), strict=True):
+        field[which, begin:end] = new
+    after = _count(rolled, _Counts(*(x[which] for x in counts)), worlds.timestep)
+    whole = [x.copy() for x in counts]
+    for field, new in zip(whole, after, strict=True):
+        field[which] = new
+    return _Counts(*whole)
+
+
+def _keep(records: Record, end: int, ended: Int[np.ndarray, "k"], still: Int[np.ndarray, "m"]) -> None:
+    """Keep the last pose of the worlds that have ended, and the wrench and contacts of those whose object is still."""
+    records.pose[ended, end:] = records.pose[ended, end - 1 : end]
+    for field in (records.wrench, records.contact, records.wall):
+        field[still, end:] = field[still, end - 1 : end]
+
+
+def _finite(worlds: _Simulation) -> Bool[np.ndarray, "n"]:
+    """Whether MuJoCo warned of nothing, and all recorded poses and velocities are finite."""
+    failed = worlds.batch.warning[..., 1].any(axis=1) | (worlds.batch.status != 0)
+    pose, velocity = worlds.records.pose, worlds.records.velocity
+    return ~failed & np.isfinite(pose).all(axis=(1, 2)) & np.isfinite(velocity).all(axis=(1, 2))

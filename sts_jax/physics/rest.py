@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sts_jax import geometry, objects
 from sts_jax.objects import Body
 from sts_jax.objects.body import is_traced
-from sts_jax.physics.scenarios import STANDING, G
+from sts_jax.physics.scenario import STANDING, G
 from sts_jax.sensor import Sensor
 
 UPRIGHT = math.radians(1)  # rad, largest lean of a body that stands upright

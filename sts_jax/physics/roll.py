@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sts_jax import geometry
 from sts_jax.physics import scene
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide, turned
-from sts_jax.physics.scene import mjx
+from sts_jax.physics.solver import mjx
 
 SLOW_SPEED = 0.005  # m/s, an object slower than this ...
 SLOW_TURN = 0.1  # rad/s, ... and slower than this ...
@@ -68,27 +68,35 @@ def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Arra
     )
 
 
-def _fixed(model: mjx.Model) -> list[tuple[Array, Array]]:
-    """Centre of the top (m) and half the size (m) of the pad, and of the wall if there is one."""
-    geoms = np.flatnonzero(model.geom_bodyid == 0)
-    return [(model.geom_pos[i] + jnp.zeros(3).at[2].set(model.geom_size[i, 2]), model.geom_size[i, :2]) for i in geoms]
+class _Top(NamedTuple):
+    """The top of a fixed box."""
+
+    centre: Float[Array, "3"]  # m
+    half: Float[Array, "2"]  # m, half its size along x and y
+
+
+def _tops(model: mjx.Model) -> list[_Top]:
+    """The tops of the pad, and of the wall if there is one."""
+    centre, half = model.geom_pos, model.geom_size
+    fixed = np.flatnonzero(model.geom_bodyid == 0)
+    return [_Top(centre[i] + jnp.zeros(3).at[2].set(half[i, 2]), half[i, :2]) for i in fixed]
 
 
 def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts:
     found = []
     kinds = ((PAD_CONTACTS, (0, 1)), (WALL_CONTACTS, (0, 2)))  # the pad lies in x y, the wall's face in x z
-    for (top, half), (num, plane) in zip(_fixed(model), kinds, strict=False):
-        own = collide(hull, pose.at[:3].add(-top), half, num, plane)
-        found.append(own._replace(pos=own.pos + top))
+    for top, (num, plane) in zip(_tops(model), kinds, strict=False):
+        own = collide(hull, pose.at[:3].add(-top.centre), top.half, num, plane)
+        found.append(own._replace(pos=own.pos + top.centre))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
 def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
     """Depth (m) of the deepest point in the pad or the wall."""
     depths = []
-    for top, half in _fixed(model):
-        x, y, z = points - top[:, None]
-        depths.append(jnp.minimum(-z, jnp.minimum(half[0] - jnp.abs(x), half[1] - jnp.abs(y))))
+    for top in _tops(model):
+        x, y, z = points - top.centre[:, None]
+        depths.append(jnp.minimum(-z, jnp.minimum(top.half[0] - jnp.abs(x), top.half[1] - jnp.abs(y))))
     return jnp.max(jnp.stack(depths), initial=0.0)
 
 
@@ -130,9 +138,22 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
         loaded=jnp.where(contact, old.loaded + 1, 0),
         wall=wall,
     )
+    return _unless_frozen(old, now)
+
+
+def _unless_frozen(old: State, now: State) -> State:
+    """The state after a step, or the state before it while the object is held or once it is gone.
+
+    A held object keeps the velocity that it will have on its release.
+    """
     nothing = jax.tree.map(jnp.zeros_like, old)
-    frozen = old._replace(qvel=nothing.qvel, impulse=nothing.impulse, loaded=nothing.loaded, wall=nothing.wall)
-    frozen = frozen._replace(held=jnp.maximum(old.held - 1, 0))
+    frozen = old._replace(
+        qvel=jnp.where(old.gone, nothing.qvel, old.qvel),
+        held=jnp.maximum(old.held - 1, 0),
+        impulse=nothing.impulse,
+        loaded=nothing.loaded,
+        wall=nothing.wall,
+    )
     return jax.tree.map(lambda a, b: jnp.where(old.gone | (old.held > 0), a, b), frozen, now)
 
 

@@ -8,27 +8,20 @@ MJX steps one template model for all objects (`step`, `template`). Objects diffe
 contacts. `compile_scene` compiles the same scene with the object's mesh for C MuJoCo.
 """
 
-import contextlib
 import dataclasses
 import functools
-import importlib.util
-import io
-from types import ModuleType
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts
-
-with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp, another engine, is not installed
-    from mujoco import mjx
+from sts_jax.physics.solver import SOLVER, mjx
 
 PAD_DEPTH = 0.2  # m, an object that leaves the pad slides down its side and never gets beneath it
 WALL_DEPTH = 0.01  # m, thickness of the stop wall
 WALL_OVERHANG = 0.5  # m, reach of the wall beyond the pad on either side, so that no object gets to its ends
-SMALLEST_SLIP = 1e-6  # lower bound of |u + alpha v|^2 / |u|^2 in the line search, above float32's rounding
 CONDIM = 6  # solver rows of a contact: normal, two for sliding, one for torsion, two for rolling
 
 _SCENE = """
@@ -74,22 +67,31 @@ class Contact:
     ls_iterations: int = 8  # line-search iterations of one Newton iteration
 
 
-def boxes(pad: tuple[float, float], wall: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Centre (m) and half size (m) of the fixed boxes: the pad, and the wall if its height (m) is not 0."""
+class Box(NamedTuple):
+    """A fixed box with sides parallel to the axes."""
+
+    centre: Float[np.ndarray, "3"]  # m, sensor frame
+    half: Float[np.ndarray, "3"]  # m, half its size
+
+
+def boxes(pad: tuple[float, float], wall: float) -> list[Box]:
+    """The fixed boxes: the pad, and the wall if its height (m) is not 0."""
     beneath = WALL_DEPTH if wall else 0.0  # the pad extends beneath the wall
-    found = [([0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2])]
+    centre, half = [0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2]
+    found = [Box(np.array(centre), np.array(half))]
     if wall:
-        middle = [0, (pad[1] + WALL_DEPTH) / 2, (wall - PAD_DEPTH) / 2]
-        found.append((middle, [pad[0] / 2 + WALL_OVERHANG, WALL_DEPTH / 2, (wall + PAD_DEPTH) / 2]))
-    return [(np.array(centre), np.array(half)) for centre, half in found]
+        centre = [0, (pad[1] + WALL_DEPTH) / 2, (wall - PAD_DEPTH) / 2]
+        half = [pad[0] / 2 + WALL_OVERHANG, WALL_DEPTH / 2, (wall + PAD_DEPTH) / 2]
+        found.append(Box(np.array(centre), np.array(half)))
+    return found
 
 
 def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[str], asset: str, inert: str) -> str:
     friction = f"0.5 {contact.torsional} {contact.rolling}"
     fixed = [
-        f'<geom name="{name}" type="box" pos="{" ".join(map(str, centre))}" size="{" ".join(map(str, half))}" '
+        f'<geom name="{name}" type="box" pos="{" ".join(map(str, box.centre))}" size="{" ".join(map(str, box.half))}" '
         f'friction="0 0 0" {extra}/>'
-        for name, extra, (centre, half) in zip(("pad", "wall"), ("", inert), boxes(pad, wall), strict=False)
+        for name, extra, box in zip(("pad", "wall"), ("", inert), boxes(pad, wall), strict=False)
     ]
     return _SCENE.format(
         shapes="\n".join(f'<geom {shape} friction="{friction}"/>' for shape in shapes),
@@ -188,32 +190,6 @@ def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 
 
-def _sound_solver() -> ModuleType:
-    """Load a copy of MJX 3.17's solver whose line search never computes NaN.
-
-    At each step length alpha, the line search takes the root of |u + alpha v|^2 = uu + alpha (2 uv + alpha vv). In
-    float32 this sum can be negative where the tangential part is zero, as in free fall, and the search then stops.
-    One in six first touches of drops without spin missed part of the contact's force (up to 0.15 m/s wrong).
-    """
-    spec = importlib.util.find_spec("mujoco.mjx._src.solver")
-    assert spec is not None
-    assert spec.loader is not None
-    solver = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(solver)
-    create = solver._LSPoint.create
-
-    # MJX's own signature, for which there are no public types.
-    def point(m, d, ctx, alpha, jv, quad, quad_gauss, uu, v0, uv, vv):  # type: ignore[no-untyped-def]
-        short = SMALLEST_SLIP * uu - (uu + alpha * (2 * uv + alpha * vv))
-        return create(m, d, ctx, alpha, jv, quad, quad_gauss, uu + jnp.maximum(0, short), v0, uv, vv)
-
-    solver._LSPoint.create = point
-    return solver
-
-
-_SOLVER = _sound_solver()
-
-
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
     """The position stage of `mjx.forward`, with the given contacts instead of those of the stand-in boxes."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
@@ -227,7 +203,7 @@ def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
     """`mjx.step` (semi-implicit Euler) with the given contacts."""
     data = mjx.fwd_velocity(model, position(model, data, contacts))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    return mjx.euler(model, _SOLVER.solve(model, data))
+    return mjx.euler(model, SOLVER.solve(model, data))
 
 
 def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:

@@ -46,7 +46,7 @@ class Config:
 
     inputs: tuple[str, ...] = ("visual", "pose")  # some of INPUTS
     outcomes: int = 2  # of the scenario
-    condition: int = 0  # numbers in the scenario's condition, of which the first two are a vector of the pad's plane
+    condition: int = 0  # numbers in the scenario's condition
     input_size: int = 128  # pixels, side of the images that are given
     image_size: int = 64  # pixels, side of the images that are predicted
     camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
@@ -75,6 +75,7 @@ class Config:
     look_weight: float = 0.1  # of the look's divergence: below 1, samples are sharper
     drawn: float = 0.4375  # share of a batch whose last moment is drawn (all train the other parts)
     drawn_first: float = 0.125  # share whose first moment is drawn
+    vectors: int = 1  # vectors (x, y) of the pad's plane with which the condition begins, if there is one
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
@@ -86,8 +87,11 @@ class Config:
                 raise ValueError(f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}")
         if len(self.encoder) != 3 or len(self.decoder) != 3:
             raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths, both need 3")
-        if self.condition < 0 or self.condition == 1:
-            raise ValueError(f"condition is {self.condition} numbers, but it must be 0, or at least the 2 of a vector")
+        if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
+            raise ValueError(
+                f"condition is {self.condition} numbers and vectors is {self.vectors}, but a condition must be 0, or "
+                "hold the 2 numbers of each vector"
+            )
         if self.traits < TINT:
             raise ValueError(f"traits is {self.traits}, but it must be at least {TINT}, the numbers of the tint")
         for name in ("drawn", "drawn_first"):
@@ -100,8 +104,9 @@ class Config:
         return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain dictionaries and lists."""
-        return dataclasses.asdict(self)
+        """Plain dictionaries and lists. `vectors` is left out where it is 1, as older models do not have it."""
+        values = dataclasses.asdict(self)
+        return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
@@ -309,7 +314,8 @@ class Transition(nnx.Module):
             known.pose[:, :2],
         ]
         if condition is not None:
-            features += [condition, poses.turn_back(heading, condition[:, :2]), condition[:, 2:]]
+            pairs = [condition[:, 2 * k : 2 * k + 2] for k in range(config.vectors)]
+            features += [condition, *(poses.turn_back(heading, pair) for pair in pairs), condition[:, 2 * len(pairs) :]]
         x = self.first(_joined(*features))
         for layer in self.layers:
             x = layer(x)

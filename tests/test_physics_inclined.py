@@ -1,4 +1,4 @@
-"""The slope: blocks hold or slide as Coulomb says in every direction, a ball rolls, and what `Inclined` promises."""
+"""`Inclined`: blocks hold or slide by Coulomb's law in every direction, a ball rolls, and starts and outcomes."""
 
 import copy
 import dataclasses
@@ -12,7 +12,7 @@ import scipy
 
 from sts_jax import geometry, objects, physics
 from sts_jax.physics import contact, roll, scene
-from sts_jax.physics.scenarios import STANDING, G
+from sts_jax.physics.scenario import STANDING, G
 from sts_jax.sensor import Sensor
 
 PAD = (0.15, 0.15)
@@ -28,7 +28,7 @@ INERTIA = 0.1 * np.diag([1.7e-4, 3.3e-4, 4.3e-4])
 
 
 def slide(friction: float, constants: physics.Contact, frames: int, slope: float = SLOPE) -> roll.Record:
-    """A block 60 x 40 x 20 mm laid on the pad, which is then tilted towards each azimuth; a record every 50 ms."""
+    """A block of 60 x 40 x 20 mm on a pad that is tilted towards each azimuth, recorded every 50 ms."""
     hull = jax.tree.map(jnp.asarray, contact.hull(np.concatenate([CORNERS, np.repeat(CORNERS[-1:], 24, axis=0)])[None]))
     model, like, data = scene.template(PAD, constants)
     model = copy.copy(model)
@@ -45,7 +45,7 @@ def slide(friction: float, constants: physics.Contact, frames: int, slope: float
 
 
 @pytest.mark.slow
-def test_below_the_friction_angle_it_holds() -> None:
+def test_a_block_holds_below_the_friction_angle() -> None:
     found = slide(float(np.tan(SLOPE) / 0.97), physics.Inclined().contact, 10)
     creep = np.linalg.norm(found.pose[:, -1, :2] - found.pose[:, 6, :2], axis=1) / (5 * 0.05)
     assert np.all(creep < 1e-3), creep
@@ -53,7 +53,7 @@ def test_below_the_friction_angle_it_holds() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "degrees"), [(0.2, 30), (0.4, 30), (0.2, 18), (0.4, 45)])
-def test_above_it_slides_with_what_friction_leaves(friction: float, degrees: float) -> None:
+def test_a_block_above_the_friction_angle_slides_by_coulombs_law(friction: float, degrees: float) -> None:
     slope = np.radians(degrees)
     found = slide(friction, physics.Inclined().contact, 10, slope)
     down = np.stack([np.cos(AZIMUTHS), np.sin(AZIMUTHS)], axis=-1)
@@ -67,7 +67,7 @@ def test_above_it_slides_with_what_friction_leaves(friction: float, degrees: flo
     assert np.all(across < 0.01 * speed[:, 4])
 
 
-def test_it_slides_as_in_c() -> None:
+def test_a_block_slides_as_in_c_mujoco() -> None:
     friction, frames = 0.4, 4
     found = slide(friction, SCENARIO.contact, frames)
     model = scene.compile_scene(CORNERS[None], PAD, SCENARIO.contact)
@@ -110,7 +110,7 @@ def bodies() -> list[objects.Body]:
 
 @pytest.fixture(scope="module", params=["mjx", "mujoco"])
 def slid(bodies: list[objects.Body], request: pytest.FixtureRequest) -> physics.Trajectory:
-    varied = dataclasses.replace(SCENARIO, friction=(0.35, 0.75), resting=0.8, tries=1)  # so that much slides
+    varied = dataclasses.replace(SCENARIO, friction=(0.35, 0.75), resting=0.8, tries=1)  # so that many objects slide
     found = physics.simulate(jax.random.key(1), bodies, Sensor(), varied, 8, engine=request.param)
     return jax.tree.map(np.asarray, found)
 
@@ -129,7 +129,7 @@ def weight(bodies: list[objects.Body], slid: physics.Trajectory, row: int) -> tu
 
 
 @pytest.mark.slow
-def test_starts_rest_on_a_face_or_hang_just_above_and_never_in_the_wall(
+def test_starts_are_on_a_face_or_just_above_the_pad_and_outside_the_wall(
     bodies: list[objects.Body], slid: physics.Trajectory
 ) -> None:
     resting = 0
@@ -150,13 +150,15 @@ def test_starts_rest_on_a_face_or_hang_just_above_and_never_in_the_wall(
 
 
 @pytest.mark.slow
-def test_at_rest_it_is_laid_where_its_contents_decide_whether_it_tips(bodies: list[objects.Body]) -> None:
+def test_the_contents_decide_whether_an_object_at_rest_tips(
+    bodies: list[objects.Body],
+) -> None:
     keys = jax.random.split(jax.random.key(5), 300)
     rng = np.random.default_rng(0)
     for body in bodies[0], bodies[2]:
         corners, com = np.asarray(body.hulls, np.float64).reshape(-1, 3), np.asarray(body.shell_com, np.float64)
         coms = com + 0.01 * rng.normal(size=(16, 3))
-        shape = physics.scenarios.Shape(*map(jnp.asarray, (corners, *objects.rest_poses(corners, com), coms)))
+        shape = physics.Shape(*map(jnp.asarray, (corners, *objects.rest_poses(corners, com), coms)))
         undecided = []
         for tries in (1, 16):
             scenario = dataclasses.replace(SCENARIO, resting=1.0, tries=tries)
@@ -177,7 +179,7 @@ def test_at_rest_it_is_laid_where_its_contents_decide_whether_it_tips(bodies: li
 
 
 @pytest.mark.slow
-def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], slid: physics.Trajectory) -> None:
+def test_the_wrench_excludes_the_wall(bodies: list[objects.Body], slid: physics.Trajectory) -> None:
     on_pad = slid.settled & (slid.outcome != physics.Outcome.FELL_OFF)
     leaning, alone = np.flatnonzero(on_pad & slid.wall[:, -1]), np.flatnonzero(on_pad & ~slid.wall[:, -1])
     assert len(leaning) >= 5
@@ -188,7 +190,7 @@ def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], 
         centre = np.asarray(geometry.transform(jnp.asarray(slid.pose[row, -1]), jnp.asarray(com)))
         np.testing.assert_allclose(slid.wrench[row, -1, :3], -pull, atol=0.02 * size)
         np.testing.assert_allclose(slid.wrench[row, -1, 3:], -np.cross(centre, pull), atol=0.02 * size * 0.075)
-    for row in leaning:  # of Coulomb's friction on the pad no more than there can be
+    for row in leaning:  # friction on the pad is at most that of Coulomb's law
         force = slid.wrench[row, -1, :3]
         assert np.linalg.norm(force[:2]) <= slid.hidden.friction[row] * force[2] * 1.02 + 1e-3
     carried = np.array([-slid.wrench[row, -1, 1] / (weight(bodies, slid, row)[0] * np.sin(SLOPE)) for row in leaning])
@@ -196,7 +198,7 @@ def test_the_wrench_is_the_pad_s_without_the_wall_s(bodies: list[objects.Body], 
 
 
 @pytest.mark.slow
-def test_pad_and_wall_together_are_all_that_pushes() -> None:
+def test_pad_and_wall_exert_the_whole_contact_force() -> None:
     model, like, data = scene.template(PAD, SCENARIO.contact, 0.03)
     model = copy.copy(model)
     scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
@@ -226,7 +228,7 @@ def test_pad_and_wall_together_are_all_that_pushes() -> None:
 
 
 @pytest.mark.slow
-def test_what_falls_beside_the_pad_gains_no_energy_at_the_wall() -> None:
+def test_objects_that_fall_beside_the_pad_gain_no_energy_at_the_wall() -> None:
     model, like, data = scene.template(PAD, SCENARIO.contact, 0.02)
     model = copy.copy(model)
     scene.set_rigid(model, mujoco.MjData(model), 0.1, np.zeros(3), INERTIA, 0.3)
@@ -246,7 +248,7 @@ def test_what_falls_beside_the_pad_gains_no_energy_at_the_wall() -> None:
 
 
 @pytest.mark.slow
-def test_outcomes_are_read_from_the_poses() -> None:
+def test_outcomes_follow_from_the_poses() -> None:
     first = jnp.array([0.01, -0.02, 0.05, 1, 0, 0, 0])
     turn = jnp.array([jnp.cos(0.5), 0, 0, jnp.sin(0.5)])  # 57 degrees
     cases = {
@@ -260,7 +262,7 @@ def test_outcomes_are_read_from_the_poses() -> None:
 
 
 @pytest.mark.slow
-def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
+def test_contents_lie_in_all_directions_except_in_variants() -> None:
     keys = jax.random.split(jax.random.key(0), 2000)
     up = np.asarray(jax.vmap(SCENARIO.hidden)(keys).up)
     np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1, atol=1e-5)
@@ -290,13 +292,13 @@ def test_contents_lie_in_all_directions_and_variants_say_otherwise() -> None:
         {"tries": 0},
     ],
 )
-def test_bad_fields_are_named(bodies: list[objects.Body], change: dict) -> None:
+def test_errors_name_bad_fields(bodies: list[objects.Body], change: dict) -> None:
     with pytest.raises(ValueError, match=f"scenario.{next(iter(change))}"):
         physics.simulate(jax.random.key(0), bodies, Sensor(), dataclasses.replace(SCENARIO, **change))
 
 
 @pytest.mark.slow
-def test_what_does_not_stand_is_refused_by_name(bodies: list[objects.Body]) -> None:
+def test_errors_name_objects_that_do_not_stand(bodies: list[objects.Body]) -> None:
     turned = dataclasses.replace(bodies[0], hulls=bodies[0].hulls[..., ::-1], shell_com=bodies[0].shell_com[::-1])
     leaning = jnp.asarray(bodies[0].hulls) + bodies[0].hulls[..., 2:] * jnp.array([1.5, 0, 0])
     for body in (dataclasses.replace(bodies[0], hulls=leaning), dataclasses.replace(turned, hulls=leaning)):

@@ -1,4 +1,4 @@
-"""Drops: against C MuJoCo, closed forms, and what `simulate` promises."""
+"""`simulate` and `Freefall`, compared with C MuJoCo and closed forms."""
 
 import copy
 import dataclasses
@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from sts_jax import objects, physics
-from sts_jax.physics import contact, roll, scene
-from sts_jax.physics.scenarios import G
+from sts_jax.physics import contact, engines, roll, scene, simulation
+from sts_jax.physics.scenario import G
 from sts_jax.sensor import Sensor
 
 NUM = 6
@@ -128,7 +128,7 @@ def energy(bodies: list[objects.Body], drops: physics.Trajectory, row: int) -> n
 
 
 @pytest.mark.slow
-def test_energy_out_of_contact_never_exceeds_the_start_s_in_any_step(
+def test_energy_out_of_contact_never_exceeds_the_initial_energy(
     bodies: list[objects.Body], engine: physics.Engine
 ) -> None:
     every_step = dataclasses.replace(SCENARIO, rate=1000.0, frames=400)
@@ -145,7 +145,7 @@ def test_energy_out_of_contact_never_exceeds_the_start_s_in_any_step(
     assert flights >= 4 * NUM  # most of them part from the pad more than once
 
 
-def test_states_are_c_mujoco_s_before_and_shortly_after_the_first_touch(
+def test_states_equal_those_of_c_mujoco_until_shortly_after_the_first_touch(
     bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine
 ) -> None:
     steps = round(1 / SCENARIO.rate / SCENARIO.contact.timestep)
@@ -163,14 +163,14 @@ def test_states_are_c_mujoco_s_before_and_shortly_after_the_first_touch(
                 break
     assert len(after) == 4 * NUM
     assert np.max(before) < 2e-5
-    # Within one frame of a touch at 1 m/s: nearly all drops strike with one or two points, which C finds too.
-    # As an engine C has the mesh's contact beside that of the vertex, and is stiffer for the moment of the impact.
+    # Within one frame of a touch at 1 m/s, nearly all drops strike with one or two points, which C MuJoCo finds too.
+    # The engine in C has the contact of the mesh beside that of the vertex, and is stiffer during the impact.
     assert np.median(after) < {"mjx": 1e-6, "mujoco": 2e-5}[engine]
     assert np.mean(np.array(after) < 1e-3) >= 0.9
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
-def test_a_draw_is_a_freshly_compiled_model(scale: float) -> None:
+def test_a_drawn_model_equals_a_freshly_compiled_one(scale: float) -> None:
     constants = physics.Contact()
     model, like, _ = scene.template(PAD, constants)
     model = copy.copy(model)
@@ -223,7 +223,7 @@ def test_a_step_returns_the_structure_it_received() -> None:
     assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(lambda x: (x.shape, x.dtype), state)
 
 
-def test_what_comes_later_leaves_frame_0_bit_identical() -> None:
+def test_later_gravity_leaves_frame_0_bit_identical() -> None:
     shaken = CALM.at[1:, :, 0].set(5.0)
     (_, a), (_, b) = (ROLL(*block(0.1), released(0.01), gravity) for gravity in (CALM, shaken))
     assert bool(a.contact[0])
@@ -238,7 +238,7 @@ def test_gravity_may_change_with_time() -> None:
     np.testing.assert_allclose(record.velocity[:, :3], [[0, speed, 0]] * 3, atol=1e-6)
 
 
-def test_same_key_same_bytes_and_independent_of_number_and_of_a_bar_that_is_shown_before_the_first_chunk(
+def test_trajectories_are_reproducible_whatever_their_number_and_the_progress_bar(
     bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, capsys: pytest.CaptureFixture
 ) -> None:
     again = physics.simulate(
@@ -252,7 +252,7 @@ def test_same_key_same_bytes_and_independent_of_number_and_of_a_bar_that_is_show
         np.testing.assert_array_equal(getattr(again, name), getattr(drops, name)[:3])
 
 
-def test_hidden_rolls_the_same_start_again_and_nothing_is_printed_unasked(
+def test_given_hidden_values_keep_the_starts_and_nothing_is_printed_by_default(
     bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, capsys: pytest.CaptureFixture
 ) -> None:
     hidden = jax.tree.map(lambda x: x[:NUM], drops.hidden)
@@ -266,7 +266,7 @@ def test_hidden_rolls_the_same_start_again_and_nothing_is_printed_unasked(
     assert not np.any(np.all(other.pose[1:, -1] == drops.pose[1:NUM, -1], axis=1))
 
 
-def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body], engine: physics.Engine) -> None:
+def test_objects_that_leave_the_pad_are_frozen(bodies: list[objects.Body], engine: physics.Engine) -> None:
     scenario = dataclasses.replace(SCENARIO, spread=0.15)
     drops = physics.simulate(jax.random.key(0), bodies[2], Sensor(), scenario, 24, chunk=24, engine=engine)
     fell = np.asarray(drops.outcome) == physics.Outcome.FELL_OFF
@@ -280,25 +280,20 @@ def test_what_leaves_the_pad_is_frozen_and_gone(bodies: list[objects.Body], engi
 
 @pytest.mark.slow
 def test_objects_compile_once(bodies: list[objects.Body]) -> None:
-    from sts_jax.physics.simulate import _roll
-
     physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
-    before = _roll._cache_size()
+    before = engines.roll_worlds._cache_size()
     more = [objects.make(jax.random.key(20), "spoon"), objects.make(jax.random.key(21), "mouse")]
     physics.simulate(jax.random.key(0), more, Sensor(), SCENARIO, 1, chunk=24, engine="mjx")
-    assert _roll._cache_size() == before
+    assert engines.roll_worlds._cache_size() == before
 
 
 @pytest.mark.slow
 def test_progress_and_resampling(
     bodies: list[objects.Body], drops: physics.Trajectory, engine: physics.Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import sys
-
-    module = sys.modules["sts_jax.physics.simulate"]
     sunk = drops.sunk[:NUM]
     limit = float(np.sort(sunk)[-2] + np.sort(sunk)[-1]) / 2
-    monkeypatch.setattr(module, "SUNK_LIMIT", limit)
+    monkeypatch.setattr(simulation, "SUNK_LIMIT", limit)
     done: list[int] = []
     again = physics.simulate(
         jax.random.key(3), bodies[0], Sensor(), SCENARIO, NUM, chunk=24, progress=done.append, engine=engine
@@ -308,13 +303,13 @@ def test_progress_and_resampling(
     assert np.all(again.sunk <= limit)
     np.testing.assert_array_equal(np.delete(again.pose, worst, 0), np.delete(drops.pose[:NUM], worst, 0))
     assert done[-1] == NUM
-    monkeypatch.setattr(module, "SUNK_LIMIT", 0.0)
-    monkeypatch.setattr(module, "ATTEMPTS", 1)
+    monkeypatch.setattr(simulation, "SUNK_LIMIT", 0.0)
+    monkeypatch.setattr(simulation, "ATTEMPTS", 1)
     with pytest.raises(ValueError, match=r"body 0: trajectory 0 is .* in 1 draws"):
         physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine=engine)
 
 
-def test_the_outcome_is_read_from_the_last_pose() -> None:
+def test_the_outcome_of_a_fall_follows_from_the_last_pose() -> None:
     first = jnp.array([0, 0, 0.1, 1, 0, 0, 0])
     assert int(SCENARIO.outcome(first, first.at[2].set(0.001))) == physics.Outcome.RESTS
     assert int(SCENARIO.outcome(first, first.at[2].set(-0.02))) == physics.Outcome.FELL_OFF
@@ -340,7 +335,7 @@ def test_the_outcome_is_read_from_the_last_pose() -> None:
         ({"height": 1000.0}, 1, r"scenario.frames is 60, which last 1.89 s, .* 1000 m .* at least 14.5 s"),
     ],
 )
-def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:
+def test_errors_name_fields_out_of_range(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:
     with pytest.raises(ValueError, match=match):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), dataclasses.replace(SCENARIO, **change), num)
 
@@ -358,7 +353,7 @@ def test_bad_scenarios_are_named(bodies: list[objects.Body], change: dict, num: 
         ({"shell_inertia": -jnp.eye(3), "contents_density": jnp.float32(0)}, "body 1: principal moments"),
     ],
 )
-def test_bad_bodies_are_named(bodies: list[objects.Body], change: dict, match: str) -> None:
+def test_errors_name_bodies_with_bad_values(bodies: list[objects.Body], change: dict, match: str) -> None:
     bad = dataclasses.replace(bodies[1], **change)
     with pytest.raises(ValueError, match=match):
         physics.simulate(jax.random.key(0), [bodies[0], bad], Sensor(), SCENARIO)
@@ -383,7 +378,7 @@ def test_the_fewest_frames_that_are_allowed_let_an_object_settle() -> None:
         ("contact", 0.001, r"a physics\.Contact"),
     ],
 )
-def test_fields_of_another_kind_are_named(field: str, value: object, wanted: str) -> None:
+def test_errors_name_fields_of_another_kind(field: str, value: object, wanted: str) -> None:
     scenario = physics.Freefall()
     object.__setattr__(scenario, field, value)  # past the tests' own checks of types
     with pytest.raises(ValueError, match=rf"scenario\.{field} is .*it must be {wanted}"):
@@ -403,13 +398,13 @@ def test_fields_of_another_kind_are_named(field: str, value: object, wanted: str
         ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),
     ],
 )
-def test_arguments_of_another_kind_are_named(bodies: list[objects.Body], changes: dict, match: str) -> None:
+def test_errors_name_arguments_of_another_type(bodies: list[objects.Body], changes: dict, match: str) -> None:
     given = {"key": jax.random.key(0), "body": bodies[0], "sensor": Sensor(), "scenario": SCENARIO, "num": 1}
     with pytest.raises((TypeError, ValueError), match=match):
         inspect.unwrap(physics.simulate)(**given | changes)
 
 
-def test_outcomes_are_words_and_a_trajectory_is_summed_up_in_a_line(drops: physics.Trajectory) -> None:
+def test_outcomes_print_as_words_and_a_trajectory_prints_as_a_summary(drops: physics.Trajectory) -> None:
     assert len(drops.outcomes) == 4 * NUM
     assert all(isinstance(outcome, physics.Outcome) for outcome in drops.outcomes)
     np.testing.assert_array_equal(drops.outcomes, drops.outcome)
@@ -420,7 +415,7 @@ def test_outcomes_are_words_and_a_trajectory_is_summed_up_in_a_line(drops: physi
     assert repr(jax.tree.map(lambda x: x[0], ended)).startswith("Trajectory(1 trajectory of 1 body, 60 frames")
 
 
-def test_a_trajectory_s_line_does_without_values(drops: physics.Trajectory) -> None:
+def test_a_traced_trajectory_prints_its_shapes(drops: physics.Trajectory) -> None:
     seen: list[str] = []
     jax.jit(lambda x: seen.append(repr(x)))(drops)
     jax.vmap(lambda x: seen.append(repr(x)))(drops)
@@ -429,7 +424,7 @@ def test_a_trajectory_s_line_does_without_values(drops: physics.Trajectory) -> N
     assert "pose=(60, 7)" in seen[1]
 
 
-def test_bad_hidden_values_are_named(bodies: list[objects.Body]) -> None:
+def test_errors_name_bad_hidden_values(bodies: list[objects.Body]) -> None:
     good = physics.Hidden(np.ones(2), np.ones(2), np.ones(2), np.tile(np.float32([0, 0, 1]), (2, 1)))
     with pytest.raises(ValueError, match=r"hidden.fill has shape \(2,\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 3, hidden=good)
@@ -465,7 +460,7 @@ def test_further_starts_are_independent_of_simulated_ones_and_of_their_number(bo
         physics.starts(key, two, Sensor(), SCENARIO, 0)
 
 
-def test_mass_properties_of_draws_are_those_of_each(bodies: list[objects.Body]) -> None:
+def test_mass_properties_of_draws_equal_those_of_single_bodies(bodies: list[objects.Body]) -> None:
     drawn = physics.starts(jax.random.key(5), bodies[:2], Sensor(), SCENARIO, 9).hidden
     which = np.repeat([0, 1], 9)
     found = physics.rigids(bodies[:2], which, drawn)

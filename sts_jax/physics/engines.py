@@ -1,0 +1,167 @@
+"""Chunks of trajectories in the two engines, MJX and C MuJoCo."""
+
+import copy
+import functools
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sts_jax.objects.body import Body
+from sts_jax.physics import native, scene
+from sts_jax.physics.bodies import BodyError
+from sts_jax.physics.contact import Hull
+from sts_jax.physics.mass_properties import Rigid, rigids
+from sts_jax.physics.roll import Record, State, initial, roll
+from sts_jax.physics.scenario import Hidden, Scenario, Start
+from sts_jax.physics.scene import Contact
+from sts_jax.physics.solver import mjx
+
+COMPILED = 64  # bodies whose compiled model is kept for C MuJoCo
+
+Engine = Literal["mjx", "mujoco"]
+
+
+class Setup(NamedTuple):
+    """The properties of a set of n trajectories that no draw changes."""
+
+    bodies: list[Body]
+    which: Int[np.ndarray, "n"]  # index of the body of each trajectory
+    hulls: list[Hull]  # of the bodies
+    scenario: Scenario
+    pad: tuple[float, float]  # m, size along x and y
+    time: Float[Array, "f s"]  # s, time at which each step begins
+
+
+class Rolled(NamedTuple):
+    """The results of one or more trajectories."""
+
+    ends: State | native.Ends
+    record: Record
+
+
+Run = Callable[[np.ndarray], Rolled]  # takes indices of at most `chunk` trajectories
+
+
+class Worlds(NamedTuple):
+    """The arrays that one call of MJX steps, with a leading axis of trajectories."""
+
+    fields: dict[str, Array]  # fields of the model, see `scene.drawn`
+    hull: Hull
+    start: Start
+    velocity: Float[Array, "n 6"]  # on release, m/s, rad/s, sensor frame
+    gravity: Float[Array, "n f s 3"]
+
+
+@functools.partial(jax.jit, static_argnames="scenario")
+def gravity_at(
+    condition: Float[Array | np.ndarray, "n c"], time: Float[Array, "f s"], scenario: Scenario
+) -> Float[Array, "n f s 3"]:
+    """Gravity in the sensor frame (m/s^2) for each step that begins at a time (s)."""
+    return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
+
+
+@functools.partial(jax.jit, static_argnames="scenario")
+def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario) -> Float[Array, "n 6"]:
+    """Velocity on release (m/s, rad/s, sensor frame)."""
+    return jax.vmap(scenario.velocity)(condition)
+
+
+@jax.jit
+def roll_worlds(worlds: Worlds, model: mjx.Model, data: mjx.Data) -> Rolled:
+    """Roll trajectories of bodies with hulls of one size in MJX."""
+
+    def one(world: Worlds) -> Rolled:
+        own = model.tree_replace(world.fields)
+        state = initial(world.start.pose, world.velocity, world.start.held)
+        return Rolled(*roll(own, data, world.hull, state, world.gravity))
+
+    return jax.vmap(one)(worlds)
+
+
+def drawn_fields(
+    bodies: Sequence[Body],
+    which: Int[np.ndarray, "n"],
+    hidden: Hidden,
+    pad: tuple[float, float],
+    constants: Contact,
+    wall: float,
+) -> dict[str, np.ndarray]:
+    """The fields of MJX's model for each draw, which MuJoCo derives from mass properties and friction.
+
+    Args:
+        bodies: the bodies.
+        which: index of the body of each draw.
+        hidden: the hidden values of each draw.
+        pad: m, size of the pad along x and y.
+        constants: contact and solver constants.
+        wall: m, height of the stop wall, 0 for none.
+    """
+    original, like, _ = scene.template(pad, constants, wall)
+    model = copy.copy(original)
+    data = mujoco.MjData(model)
+    rigid = rigids(bodies, which, hidden)
+    fields = []
+    for row, body in enumerate(which.tolist()):
+        _set_rigid(model, data, body, rigid, row)
+        fields.append(scene.drawn(model, like))
+    return {name: np.stack([f[name] for f in fields]) for name in fields[0]}
+
+
+def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rigid, row: int) -> None:
+    """`scene.set_rigid` with the values of one draw. Errors name the body."""
+    try:
+        scene.set_rigid(model, data, *(x[row] for x in rigid))
+    except ValueError as error:
+        raise BodyError(body, str(error)) from error
+
+
+def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
+    """Prepare the rolling of trajectories in MJX. All bodies of one call have hulls of one size."""
+    scenario = setup.scenario
+    _, model, data = scene.template(setup.pad, scenario.contact, scenario.wall)
+    fields = drawn_fields(setup.bodies, setup.which, hidden, setup.pad, scenario.contact, scenario.wall)
+
+    def run(indices: np.ndarray) -> Rolled:
+        padded = np.pad(indices, (0, chunk - len(indices)), "edge")
+        start = jax.tree.map(lambda x: x[padded], starts)
+        worlds = Worlds(
+            fields={name: x[padded] for name, x in fields.items()},
+            hull=jax.tree.map(lambda *x: np.stack(x), *(setup.hulls[setup.which[i]] for i in padded)),
+            start=start,
+            velocity=velocity_of(start.condition, scenario=scenario),
+            gravity=gravity_at(start.condition, setup.time, scenario=scenario),
+        )
+        return jax.tree.map(lambda x: np.asarray(x)[: len(indices)], roll_worlds(worlds, model, data))
+
+    return run
+
+
+def in_c(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
+    """Prepare the rolling of trajectories in C MuJoCo. All trajectories of one call have the same body."""
+    bodies, scenario = setup.bodies, setup.scenario
+    rigid = rigids(bodies, setup.which, hidden)
+    starts = jax.tree.map(np.asarray, starts)
+
+    @functools.lru_cache(maxsize=COMPILED)
+    def compiled(body: int) -> mujoco.MjModel:
+        return native.compile_body(np.asarray(bodies[body].hulls), setup.pad, scenario.contact, scenario.wall)
+
+    def run(indices: np.ndarray) -> Rolled:
+        body, count = int(setup.which[indices[0]]), len(indices)
+        models = []
+        data = mujoco.MjData(compiled(body))
+        for i in indices.tolist():
+            models.append(copy.copy(compiled(body)))
+            _set_rigid(models[-1], data, body, rigid, i)
+        start = jax.tree.map(lambda x: x[indices], starts)
+        padded = np.pad(start.condition, ((0, chunk - count), (0, 0)))  # so that gravity and velocity compile once
+        gravity = np.asarray(gravity_at(padded, setup.time, scenario=scenario), np.float64)[:count]
+        velocity = np.asarray(velocity_of(padded, scenario=scenario), np.float64)[:count]
+        points = np.unique(np.asarray(bodies[body].hulls).reshape(-1, 3), axis=0)
+        return Rolled(*native.roll(models, points, start, gravity, velocity))
+
+    return run

@@ -1,0 +1,232 @@
+"""The scenarios of `docs/extending-scenario.md`, which the library does not contain, from starts to evaluation."""
+
+import dataclasses
+import enum
+import inspect
+import json
+import math
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import sts_jax as sts
+from experiments import perturbed, stages
+from sts_jax import dataset, evaluation, geometry, physics
+
+PAGE = Path(__file__).parent.parent / "docs" / "extending-scenario.md"
+ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
+FRICTION = 0.4
+
+
+@pytest.fixture(scope="module")
+def page() -> dict:
+    """The names that the code of the page defines."""
+    names: dict = {}
+    exec("\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)), names)
+    return names
+
+
+@pytest.fixture(scope="module")
+def block() -> sts.objects.Body:
+    """A flat solid block, 80 x 80 x 16 mm, which slides and does not topple."""
+    half = np.array([0.04, 0.04, 0.008])
+    corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * half
+    x, y, z = (2 * half) ** 2
+    return dataclasses.replace(
+        sts.objects.make(jax.random.key(0), "fork"),
+        hulls=jnp.asarray(np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None], jnp.float32),
+        shell_mass=jnp.float32(0.1),
+        shell_com=jnp.zeros(3),
+        shell_inertia=jnp.asarray(0.1 / 12 * np.diag([y + z, x + z, x + y]), jnp.float32),
+    )
+
+
+def hidden(num: int) -> physics.Hidden:
+    """Empty objects with a known friction."""
+    ones = np.ones(num, np.float32)
+    return physics.Hidden(0 * ones, ones, FRICTION * ones, np.tile(np.float32([0, 0, 1]), (num, 1)))
+
+
+def simulated(scenario, body, num, engine):
+    found = physics.simulate(
+        jax.random.key(1), body, sts.Sensor(), scenario, num, hidden=hidden(num), chunk=num, engine=engine
+    )
+    return jax.tree.map(np.asarray, found)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_pushed_block_starts_with_its_velocity_and_slides_as_far_as_coulomb_says(page, block, engine):
+    class Pushed(page["Rolled"]):
+        """A block that lies flat."""
+
+        def start(self, key, shape, pad):
+            start = super().start(key, shape, pad)
+            flat = jnp.array([1.0, 0, 0, 0])
+            return start._replace(pose=shape.above(start.pose[:2], flat, -1e-5))
+
+    scenario = Pushed(speed=(0.3, 0.5), frames=12, contact=physics.Contact())
+    found = simulated(scenario, block, 3, engine)
+    np.testing.assert_allclose(found.velocity[:, 0, :2], found.condition, atol=1e-6)
+    np.testing.assert_allclose(found.velocity[:, 0, 2:], 0, atol=1e-6)
+    speed = np.linalg.norm(found.condition, axis=1)
+    moved = found.pose[:, -1, :2] - found.pose[:, 0, :2]
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), speed**2 / (2 * FRICTION * 9.81), rtol=0.03)
+    far = np.linalg.norm(moved, axis=1, keepdims=True)
+    np.testing.assert_allclose(moved / far, found.condition / speed[:, None], atol=0.02)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_block_on_a_tilting_pad_slides_as_a_float64_loop_does(page, block, engine):
+    scenario = page["Tilting"](speed=(0.8, 0.9), frames=24)
+    found = simulated(scenario, block, 2, engine)
+    for row in range(2):
+        rate, step, slid, speed = float(found.condition[row, 0]), scenario.contact.timestep, 0.0, 0.0
+        for k in range((scenario.frames - 1) * scenario.steps):
+            tilt = min(rate * k * step, scenario.steepest)
+            pull = 9.81 * (math.sin(tilt) - FRICTION * math.cos(tilt))
+            speed = max(0.0, speed + pull * step)
+            slid += speed * step
+        moved = found.pose[row, -1] - found.pose[row, 0]
+        assert slid > 0.01
+        np.testing.assert_allclose(moved[1], slid, rtol=0.05)
+        np.testing.assert_allclose(found.gravity[row, -1], 9.81 * np.array([0, np.sin(0.5), -np.cos(0.5)]), rtol=1e-5)
+    assert found.outcomes == (physics.Outcome.SLIDES,) * 2
+    assert scenario.described(found.condition[0]) == f"angular speed {found.condition[0, 0]:.3g} rad/s"
+
+
+def test_outcomes_of_the_scenario_have_names_and_are_counted(page):
+    scenario, rolled = page["Rolled"](), page["rolled"]
+    assert {int(one) for one in rolled.outcome} <= {int(one) for one in scenario.outcomes}
+    assert [scenario.named(number) for number in (1, 100, 101)] == ["fell off", "stops early", "rolls on"]
+    np.testing.assert_array_equal(rolled.outcome, jax.vmap(scenario.outcome)(rolled.pose[:, 0], rolled.pose[:, -1]))
+    text = repr(rolled._replace(outcome=np.repeat(np.int32([100, 1]), [5, 3])))
+    assert "5 outcome 100, 3 fell off" in text
+    with pytest.raises(ValueError, match="100 is not a valid Outcome"):
+        _ = rolled._replace(outcome=np.int32([100])).outcomes
+
+
+def test_a_bottle_that_is_pushed_hard_goes_farther(page):
+    bottle, scenario = page["bottle"], page["Rolled"]
+    moved = []
+    for speed in (0.05, 0.25):
+        found = physics.simulate(jax.random.key(2), bottle, sts.Sensor(), scenario(speed=(speed, speed)), 4)
+        ahead = found.condition / speed
+        moved.append(np.sum((found.pose[:, -1, :2] - found.pose[:, 0, :2]) * ahead, axis=1))
+    assert np.all(moved[1] > moved[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"outcomes": (physics.Outcome.RESTS,)}, r"any object can leave the pad: add physics\.Outcome\.FELL_OFF"),
+        ({"quantities": ()}, "returns a condition of 2 numbers, but scenario.quantities declares 0"),
+        (
+            {"quantities": (physics.Quantity("a", "s", 1.0), physics.Quantity("b", "m", 1.0, vector=True))},
+            "scenario.quantities has a, b in this order, but vectors must come before numbers",
+        ),
+        ({"outcomes": (physics.Outcome.FELL_OFF,)}, r"scenario\.outcome returns 10\d, but the numbers .* are \[1\]"),
+    ],
+)
+def test_mistakes_in_a_scenario_are_named(page, changes, match):
+    wrong = dataclasses.dataclass(frozen=True)(type("Wrong", (page["Rolled"],), changes))
+    with pytest.raises(ValueError, match=match):
+        physics.simulate(jax.random.key(0), page["bottle"], sts.Sensor(), wrong())
+
+
+def test_outcomes_of_another_enumeration_need_numbers_of_their_own(page):
+    end = enum.IntEnum("Taken", {"STOPS": 0})
+    wrong = type("Wrong", (page["Rolled"],), {"outcomes": (end.STOPS, physics.Outcome.FELL_OFF)})
+    with pytest.raises(ValueError, match=r"each outcome needs one of its own.* number others from 100"):
+        wrong().check()
+
+
+def test_a_scenario_that_is_no_frozen_dataclass_is_refused(page):
+    class Plain:
+        """Has no member of a scenario."""
+
+    thawed = dataclasses.make_dataclass("Thawed", [])
+    for wrong in (Plain(), thawed(), page["Rolled"]):
+        with pytest.raises(TypeError, match=r"a frozen dataclass of your own that derives from physics\.Scenario"):
+            inspect.unwrap(physics.simulate)(jax.random.key(0), page["bottle"], sts.Sensor(), wrong)
+
+
+def test_a_variant_needs_the_fields_that_it_changes(page):
+    scenario = page["Rolled"]()
+    assert physics.variant(scenario, "wide-friction") == dataclasses.replace(scenario, friction=(0.3, 0.9))
+    with pytest.raises(ValueError, match="has no field fill, shell_scale, tilt to change"):
+        physics.variant(scenario, "off")
+
+
+@pytest.fixture(scope="module")
+def collected(page, tmp_path_factory) -> dict[str, tuple[physics.Scenario, dataset.Dataset]]:
+    """A dataset of two trajectories of each scenario."""
+    tiny = {"categories": ("bottle",), "num_objects": 2, "num_per_object": 1, "num_full": 0, "objects_per_shard": 2}
+    found = {}
+    for name in ("Rolled", "Tilting"):
+        scenario, folder = page[name](frames=2), tmp_path_factory.mktemp(name)
+        dataset.collect(dataset.Collection(scenario, **tiny), sts.Sensor(), folder)
+        found[name] = scenario, dataset.load(folder)
+    return found
+
+
+@pytest.mark.parametrize(("name", "vectors"), [("Rolled", 1), ("Tilting", 0)])
+def test_a_dataset_turns_the_vectors_of_a_condition_and_keeps_its_numbers(collected, name, vectors):
+    scenario, data = collected[name]
+    assert data.collection["scenario"]["name"] == name
+    assert data.collection["scenario"].get("vectors", 1) == vectors
+    pairs, condition = data.pairs(np.array([0]), symmetries=True), data.trajectory["condition"][0]
+    for own, symmetry in zip(pairs.condition, scenario.symmetries, strict=True):
+        mirror = np.diag([1.0, -1.0 if symmetry >= 4 else 1.0])
+        quarter = np.linalg.matrix_power(np.array([[0.0, -1.0], [1.0, 0.0]]), symmetry % 4)
+        np.testing.assert_allclose(own, quarter @ mirror @ condition if vectors else condition, atol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "has_arrows"), [("Rolled", True), ("Tilting", False)])
+def test_the_figure_of_predictions_shows_velocities_as_red_arrows(collected, name, has_arrows, tmp_path):
+    scenario, data = collected[name]
+    pairs = data.pairs(np.array([0, 1]))
+    predicted = evaluation.Predicted(visual=pairs.visual[:, 1] / 255)
+    path = tmp_path / "a.png"
+    evaluation.figures.predictions(path, pairs, predicted, num=2, title="t", scenario=scenario)
+    red, green, blue = np.moveaxis(np.asarray(Image.open(path).convert("RGB")).astype(int), -1, 0)
+    assert ((red > 200) & (green < 60) & (blue < 60)).any() == has_arrows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Rolled", "Tilting"])
+def test_the_stages_of_an_experiment_train_and_evaluate_a_new_scenario(page, name, tmp_path):
+    scenario = page[name](frames=16)
+    collection = dataclasses.replace(
+        perturbed.SMOKE.collection, scenario=scenario, num_objects=10, num_per_object=2, num_full=1, num_rendered=1
+    )
+    config = dataclasses.replace(
+        perturbed.SMOKE,
+        collection=collection,
+        state_training=dataclasses.replace(perturbed.SMOKE.state_training, steps=2, batch_size=4, checkpoint_every=2),
+        num_shown=2,
+        num_samples=2,
+        rerolls=2,
+    )
+    stages.main(config, tmp_path)
+    summary = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(summary["outcomes"]) <= {outcome.name.lower() for outcome in scenario.outcomes}
+    assert sum(summary["outcomes"].values()) == summary["items"]
+    assert any(title.startswith("state-space model") for title in summary["predictors"])
+
+
+def test_re_rolls_begin_with_the_velocity_of_the_condition(page):
+    from sts_jax.evaluation import rerolls
+
+    scenario = page["Rolled"](frames=4)
+    bodies = [page["bottle"]]
+    first = physics.simulate(jax.random.key(3), bodies, sts.Sensor(), scenario)
+    again = rerolls._replayed(scenario, np.asarray(first.pose[:, 0]), np.asarray(first.condition), 2, jax.random.key(4))
+    found = physics.simulate(jax.random.key(4), bodies, sts.Sensor(), again, 2)
+    np.testing.assert_allclose(found.velocity[:, 0], np.tile(first.velocity[:, 0], (2, 1)), atol=1e-6)
+    np.testing.assert_allclose(found.pose[:, 0], np.tile(first.pose[:, 0], (2, 1)), atol=1e-6)
+    assert np.all(geometry.norm(found.velocity[:, 0, :2]) > 0.04)
