@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 
 import sts_jax as sts
 from experiments import sense
-from experiments.errors import on_one_line
+from experiments.shared.errors import on_one_line
 from sts_jax import tactile
 
 # m, standard deviations of the Gaussian blur under which images are compared. The first is about the distance by which

@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
-from experiments import errors, output
+from experiments.shared import errors, output
 from sts_jax import tactile
 
 G = 9.81  # m/s^2

@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import command, errors
+from experiments.shared import command, errors
 from sts_jax.predict import MODELS
 
 LIMIT = 12e6  # bytes, of a model's folder

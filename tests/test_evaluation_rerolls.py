@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_evaluation_report import pairs
+from test_evaluation_scores import pairs
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, physics

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from test_evaluation_report import FELL, judged
+from test_evaluation_scores import FELL, judged
 
 from sts_jax import evaluation, physics
 

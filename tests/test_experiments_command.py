@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 import sts_jax as sts
-from experiments import command, errors, freefall, inclined, perturbed, pictures, results, stages
+from experiments import freefall, inclined, perturbed
+from experiments.shared import command, config, errors, judging, pictures, results, stages
 from sts_jax import _files, compilation, dataset, physics, training
 
 BOTTLES = ("bottle",)
@@ -45,14 +46,14 @@ def test_presets_hold_out_what_they_should_and_the_paper_s_has_its_counts(experi
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     assert not experiment.PAPER.mask_blank_touch
-    model = training.paper_model(stages.MODELS["paper"]["mvae"], stages.preprocessing_of(experiment.PAPER))
+    model = training.paper_model(config.MODELS["paper"]["mvae"], stages.preprocessing_of(experiment.PAPER))
     assert [m.weight for m in model.modalities] == [1, 1, 1000]
     assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 
 
 def test_flags_reach_the_experiment(tmp_path, monkeypatch, capsys):
     ran = []
-    monkeypatch.setattr(stages, "main", lambda config, workdir: ran.append((config, workdir)))
+    monkeypatch.setattr(stages, "main", lambda config, workdir, only: ran.append((config, workdir)))
     monkeypatch.setattr(command, "plan", lambda config: f"plan of {config.collection.num_objects} objects")
     monkeypatch.setattr("sys.argv", ["freefall", "--hidden", "off", "--classes", "fork", "bottle", "--parts"])
     command.run(freefall.PRESETS, str(tmp_path), "What it does.")
@@ -76,8 +77,8 @@ def test_flags_reach_the_experiment(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("experiment", [freefall, perturbed])
 @pytest.mark.parametrize("asked", [(), ("box", "bottle")])
 def test_of_a_folder_the_experiment_s_classes_are_taken_or_those_asked_for(experiment, asked, folder, tmp_path, capsys):
-    args = command.Args(tmp_path / "run", objects=folder, classes=asked)
-    one = command.configure(experiment.SMOKE, args).collection
+    args = command.Args(tmp_path / "run", experiment.SMOKE, objects=folder, classes=asked)
+    one = command.configure(args).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("bottle",) * 4 + ("box",) * (3 if asked else 0)
     assert one.num_objects == len(one.meshes.names)
@@ -91,32 +92,32 @@ def test_of_a_folder_the_experiment_s_classes_are_taken_or_those_asked_for(exper
 
     stages.note(listing, ["collect: left out object 0"])  # stays when the folder is read again
     before = listing.stat().st_mtime_ns
-    assert command.configure(experiment.SMOKE, args).collection == one
+    assert command.configure(args).collection == one
     assert listing.stat().st_mtime_ns == before
 
 
 def test_a_folder_of_other_classes_is_taken_whole(folder, tmp_path):
-    small = command.Args(tmp_path / "small", objects=folder, scale=0.5, up="y")
-    meshes = command.configure(freefall.SMOKE, small).collection.meshes
+    small = command.Args(tmp_path / "small", freefall.SMOKE, objects=folder, scale=0.5, up="y")
+    meshes = command.configure(small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
     with pytest.raises(ValueError, match="--scale and --up are for the files of a folder"):
-        command.configure(perturbed.SMOKE, command.Args(tmp_path, up="y"))
+        command.configure(command.Args(tmp_path, perturbed.SMOKE, up="y"))
 
     (folder / "bottle").rename(folder / "jar")
-    one = command.configure(perturbed.SMOKE, command.Args(tmp_path / "run", objects=folder)).collection
+    one = command.configure(command.Args(tmp_path / "run", perturbed.SMOKE, objects=folder)).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("box",) * 3 + ("jar",) * 4
 
 
 def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
-    args = command.Args(tmp_path / "run", classes=("bottle", "teapot"))
+    args = command.Args(tmp_path / "run", freefall.SMOKE, classes=("bottle", "teapot"))
     with pytest.raises(ValueError, match=r"unknown classes teapot: choose among .*bottle"):
-        command.configure(freefall.SMOKE, args)
+        command.configure(args)
     with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
-        command.configure(freefall.SMOKE, dataclasses.replace(args, objects=folder))
-    with pytest.raises(ValueError, match="holding some out needs 4 usable objects, got 3"):
-        command.configure(freefall.SMOKE, dataclasses.replace(args, objects=folder, classes=("box",)))
+        command.configure(dataclasses.replace(args, objects=folder))
+    with pytest.raises(ValueError, match="a split needs at least 4 usable objects, got 3: add objects"):
+        command.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
 
 
 def test_what_collecting_left_out_is_listed_once(tmp_path, monkeypatch):
@@ -188,7 +189,7 @@ def test_what_is_refused_is_one_line(refused, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [
-        (lambda: command.configure(freefall.SMOKE, None), AttributeError),
+        (lambda: command.configure(None), AttributeError),
         (lambda: pictures.describe("cup", {}, {}), KeyError),
     ],
 )
@@ -207,15 +208,15 @@ def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "objects.txt").write_text("of the first\n")
     with _files.lock(tmp_path / "run"), pytest.raises(_files.LockedError):
-        command.configure(freefall.SMOKE, command.Args(tmp_path / "run", objects=folder))
+        command.configure(command.Args(tmp_path / "run", freefall.SMOKE, objects=folder))
     assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
 
 
 def test_a_damaged_log_of_a_training_is_named(tmp_path):
     (tmp_path / "metrics.jsonl").write_bytes(b'{"step": 1}\n{"st')
     with pytest.raises(dataset.TornFileError, match=r"metrics\.jsonl is damaged .*delete .* and train again"):
-        stages._read_log(tmp_path)
-    assert stages._read_log(tmp_path / "none") == []
+        judging.read_log(tmp_path)
+    assert judging.read_log(tmp_path / "none") == []
 
 
 @pytest.fixture

@@ -10,8 +10,9 @@ import pytest
 from optics_bodies import public_meshes
 
 import sts_jax as sts
-from experiments import ceilings, freefall, stages
-from sts_jax import dataset, physics
+from experiments import freefall
+from experiments.shared import config, rerolls, stages
+from sts_jax import dataset, evaluation, physics
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +40,7 @@ def test_the_workdir_holds_what_is_promised(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
     assert {"config.json", "dataset", "metrics.json", "table.md", "table-full.md"} <= names
     assert {"ceiling.json", "ceiling.npz"} <= names
-    assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS["paper"]} <= names
+    assert {f"models/{name}/metrics.jsonl" for name in config.MODELS["paper"]} <= names
     assert {f"figures/{name}.png" for name in ("predictions", "predictions-all", "training", "strip")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
     predictors = metrics["predictors"]
@@ -74,9 +75,9 @@ def test_the_workdir_holds_what_is_promised(workdir):
 
 def test_the_ceilings_are_scored_once_and_kept(workdir, monkeypatch):
     sensor, data = sts.Sensor(), dataset.load(workdir / "dataset")
-    test = dataset.reduced(data.pairs(stages.rows_of(data, "object")["test"]), 64)
-    monkeypatch.setattr(ceilings, "reroll", lambda *_: pytest.fail("rolled again"))
-    found = ceilings.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
+    test = dataset.reduced(data.pairs(evaluation.rows_of(data, "object")["test"]), 64)
+    monkeypatch.setattr(rerolls, "reroll", lambda *_: pytest.fail("rolled again"))
+    found = rerolls.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
     metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
     own = found.scores["ceiling (mean of re-rolls)"]
     assert own.position.mean() == pytest.approx(metrics["position"]["value"])
@@ -156,6 +157,6 @@ def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
 
 def test_the_papers_split_is_a_fifth_of_shuffled_trajectories(workdir):
     data = dataset.load(workdir / "dataset")
-    rows = stages.rows_of(data, "trajectory")
+    rows = evaluation.rows_of(data, "trajectory")
     assert len(rows["test"]) == round(0.2 * 16)
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), np.arange(16))

@@ -5,7 +5,8 @@ import tempfile
 import pytest
 
 import sts_jax as sts
-from experiments import fit, objects, output, sense, show
+from experiments import fit, objects, sense, show
+from experiments.shared import output
 
 
 def forbidden(*_, **__):

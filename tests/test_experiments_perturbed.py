@@ -10,8 +10,9 @@ from PIL import Image
 
 import sts_jax as sts
 from benchmarks import deterministic, recognise, scaling
-from experiments import perturbed, show, stages
-from sts_jax import dataset, physics
+from experiments import perturbed, show
+from experiments.shared import stages
+from sts_jax import dataset, evaluation, physics
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +47,7 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     given = {name.partition(", ")[2] for name in predictors if name.startswith("state-space model")}
     inputs = ("visual", "tactile", "pose")
     pairs = ("visual and tactile", "visual and pose", "tactile and pose")
-    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs", stages.KNOWN)}
+    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs", evaluation.TRUE_STATE)}
     assert predictors["state-space model, from tactile"]["outcome_balanced_accuracy"]["value"] >= 0
     rows = [line for line in (workdir / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
     assert len(rows) == 10
@@ -66,7 +67,7 @@ def test_views_and_falls_are_trained_on(workdir):
 def test_distributions_are_judged_where_samples_are_drawn(workdir):
     predictors = json.loads((workdir / "metrics.json").read_text())["predictors"]
     own = predictors["state-space model, from visual and tactile"]
-    assert predictors[f"state-space model, from {stages.KNOWN}"]["outcome_log_loss"]["value"] > 0
+    assert predictors[f"state-space model, from {evaluation.TRUE_STATE}"]["outcome_log_loss"]["value"] > 0
     assert own["outcome_log_loss"]["value"] > 0
     assert 0 <= own["coverage"]["value"] <= 1
     assert own["visual_skill_best"] is not None
