@@ -7,9 +7,9 @@
     python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours, a GPU helps
     python -m experiments.perturbed --plan             # seconds per stage, measured on a little of each
 
-Writes config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png to `runs/perturbed/`. A second run with
-the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs one
-stage. Every field of the configuration is an option too, such as `--collection.num-objects 1000`, see `--help`.
+Results go to `runs/perturbed/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
+run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs
+one stage. Every field of the configuration is an option too, such as `--collection.num-objects 1000`, see `--help`.
 """
 
 import dataclasses

@@ -140,7 +140,7 @@ def test_a_scaling_figure_joins_models_of_one_training_time_or_one_number_of_tra
 
 
 @pytest.mark.parametrize(("last", "scale"), [(0.5, "log"), (-3.0, "linear")])
-def test_a_loss_that_becomes_negative_is_drawn_whole(tmp_path, drawn, last, scale):
+def test_a_loss_that_becomes_negative_is_drawn_on_a_linear_axis(tmp_path, drawn, last, scale):
     log = [{"step": step, "loss": loss} for step, loss in ((10, 100.0), (20, last))]
     figures.training_curves(tmp_path / "a.png", {"model": log})
     axis = drawn[0].axes[0]

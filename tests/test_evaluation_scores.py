@@ -1,4 +1,4 @@
-"""Baselines: what the nearest neighbour takes into account."""
+"""Baselines, and the errors of predictions, compared with values written out by hand."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ SIDE = 4
 
 
 def pairs(grey, condition):
-    """One pair a grey value of the first image; the outcome counts them."""
+    """One pair per grey value of the first image. The outcomes count the pairs."""
     grey = np.asarray(grey, np.uint8)
     num = len(grey)
     images = np.broadcast_to(grey[:, None, None, None, None], (num, 2, SIDE, SIDE, 3))
@@ -51,7 +51,7 @@ def test_image_and_condition_count_alike_whatever_their_units(unit):
     assert nearest(train, pairs([100] * 4, corners), physics.Perturbed()) == [0, 1, 2, 3]
 
 
-def test_the_rule_keeps_the_start_at_the_median_height_of_what_stays():
+def test_the_rule_keeps_the_start_at_the_median_height_of_objects_that_stay():
     train, test = (pairs([0] * size, np.zeros((size, 0))) for size in (4, 2))
     train = train._replace(outcome=np.array([0, 1, 0, 0], np.int32))  # 1: fell off
     train.pose[:, 1, 2] = [0.01, -0.5, 0.05, 0.02]
