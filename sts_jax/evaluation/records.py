@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -78,8 +78,8 @@ class Metric:
     statistic: Callable[[Judged], Statistic | None] | None = None  # None if a predictor does not have the metric
     interval: bool = True  # whether the column shows the interval
     column: bool = True  # whether the complete table has the metric. Summaries always have it.
-    # Which values are better. A metric with a direction is a column of the differences from the baselines.
-    compared: Literal["higher", "lower"] | None = None
+    # "higher" or "lower", the better values. A metric with a direction is a column of the differences from baselines.
+    compared: str | None = None
     note: str = ""  # a sentence above the table that explains the metric
 
     def __post_init__(self) -> None:

@@ -70,7 +70,7 @@ def summarise(
     return {
         "items": len(test.object),
         "objects": len(np.unique(test.object)),
-        "outcomes": {named(o, outcomes): int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
+        "outcomes": {named(int(o), outcomes): int((test.outcome == o).sum()) for o in np.unique(test.outcome)},
         "scored": scored,
         "predictors": {name: cells(value[i], draws[:, i]) for i, name in enumerate(names)},
         "differences": {

@@ -62,7 +62,7 @@ def predictions(
                 axis.set_title(heads[column], fontsize=10)
         label = stream
         if row % len(streams) == 0:
-            label = f"#{test.trajectory[item]}: {named(test.outcome[item], outcomes).replace('_', ' ')}\n{stream}"
+            label = f"#{test.trajectory[item]}: {named(int(test.outcome[item]), outcomes).replace('_', ' ')}\n{stream}"
         axes[row, 0].set_ylabel(label, fontsize=9)
         if stream == streams[0] and test.condition.shape[1]:
             height, width = test.visual.shape[2:4]
