@@ -45,9 +45,9 @@ def test_without_a_condition_the_nearest_image_decides():
 def test_image_and_condition_count_alike_whatever_their_units(unit):
     corners = np.array([[0.0, 0, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1]]) * [1, 1, unit]
     train = pairs([0, 200, 0, 200], corners)
-    # The image says item 1 or 3, clearly; the condition decides between the two.
+    # The image selects items 1 and 3, and the condition decides between them.
     assert nearest(train, pairs([190, 190], [[0.1, 0.1, unit], [0.9, 0.9, unit]]), physics.Perturbed()) == [1, 3]
-    # The image is undecided: the condition alone decides.
+    # The distance of the image is the same for all items, and the condition decides.
     assert nearest(train, pairs([100] * 4, corners), physics.Perturbed()) == [0, 1, 2, 3]
 
 
@@ -74,7 +74,7 @@ def test_the_constants_probabilities_are_the_outcomes_shares():
 
 def test_shares_count_the_samples_and_one_more_spread_over_all_outcomes():
     outcomes = physics.Perturbed.outcomes
-    drawn = np.array([[4, 1], [4, 2], [2, 1]])  # topples, topples, stands; fell off, stands, fell off
+    drawn = np.array([[4, 1], [4, 2], [2, 1]])  # columns: topples, topples, stands, and fell off, stands, fell off
     shares = evaluation.shares(drawn, outcomes)
     assert [outcome.name for outcome in outcomes] == ["TOPPLES", "SLIDES", "STANDS", "FELL_OFF"]
     np.testing.assert_allclose(shares * 4, [[2.25, 0.25, 1.25, 0.25], [0.25, 0.25, 1.25, 2.25]])

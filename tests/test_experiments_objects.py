@@ -31,7 +31,7 @@ def test_the_gaps_of_each_object_are_printed(tmp_path, capsys, monkeypatch):
     def decompose(body):
         return dataclasses.replace(body, hulls=jnp.concatenate([body.hulls, 0.9 * body.hulls]))
 
-    monkeypatch.setattr(sts.objects, "decompose", decompose)  # seconds an object; has its own tests
+    monkeypatch.setattr(sts.objects, "decompose", decompose)  # it takes seconds per object and has its own tests
     config = objects.Config(out=tmp_path / "sheet.png", num=2, categories=("bottle", "fork"), size=20)
     objects.main(config)
     lines = capsys.readouterr().out.splitlines()[1:]

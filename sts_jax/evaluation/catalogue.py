@@ -3,20 +3,18 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 
 from sts_jax import physics
 from sts_jax.evaluation import metrics
-from sts_jax.evaluation.records import Column, Judged, Metric, Scores, Statistic, mean
+from sts_jax.evaluation.records import Column, Judged, Metric, Statistic, mean
 
-_Kind = Literal["bce", "excess", "skill"]
-_KINDS: tuple[_Kind, ...] = ("bce", "excess")  # the numbers of the object's pixels that have no column
+_Number = Callable[[Judged], Statistic | None]
 
 
-def _image(stream: str, kind: _Kind) -> Callable[[Judged], Statistic | None]:
-    """Cross-entropy, excess or skill of a field of `Scores`: a stream, over all pixels or those of the object."""
+def _image(stream: str, kind: str) -> _Number:
+    """The `bce`, `excess` or `skill` of a stream, such as `visual` (all pixels) or `visual_object` (the object's)."""
 
     def statistic(judged: Judged) -> Statistic | None:
         error, constant = getattr(judged.scores, stream), getattr(judged.constant, stream)
@@ -29,41 +27,19 @@ def _image(stream: str, kind: _Kind) -> Callable[[Judged], Statistic | None]:
     return statistic
 
 
-def _mean(field: str) -> Callable[[Judged], Statistic | None]:
-    """Mean of a field of `Scores` over all items."""
+def _of(field: str, reduce: Callable[[np.ndarray, np.ndarray], float] = mean, *, on_pad: bool = False) -> _Number:
+    """Mean or another number of a field of `Scores`, over all items or over those that stay on the pad."""
 
     def statistic(judged: Judged) -> Statistic | None:
         values = getattr(judged.scores, field)
-        return None if values is None else functools.partial(mean, values)
-
-    return statistic
-
-
-def _median(field: str) -> Callable[[Judged], Statistic | None]:
-    """Median of a field of `Scores` over all items."""
-
-    def statistic(judged: Judged) -> Statistic | None:
-        values = getattr(judged.scores, field)
-        return None if values is None else functools.partial(metrics.median, values)
-
-    return statistic
-
-
-def _on_pad(whole: Callable[[Judged], Statistic | None]) -> Callable[[Judged], Statistic | None]:
-    """The same statistic over the items that stay on the pad."""
-
-    def statistic(judged: Judged) -> Statistic | None:
+        if values is None:
+            return None
+        if not on_pad:
+            return functools.partial(reduce, values)
         stayed = judged.test.outcome != int(physics.Outcome.FELL_OFF)
-        own = whole(judged._replace(scores=_kept(judged.scores, stayed)))
-        return None if own is None else lambda weight: own(weight[stayed])
+        return lambda weight: reduce(values[stayed], weight[stayed])
 
     return statistic
-
-
-def _kept(scores: Scores, rows: np.ndarray) -> Scores:
-    """Position, angle and axis of some items."""
-    fields = {name: getattr(scores, name) for name in ("position", "angle", "axis")}
-    return scores._replace(**{name: None if leaf is None else leaf[rows] for name, leaf in fields.items()})
 
 
 def _best(judged: Judged) -> Statistic | None:
@@ -161,14 +137,20 @@ METRICS: tuple[Metric, ...] = (
         statistic=_image("tactile_object", "skill"),
         compared="higher",
     ),
-    _millimetres("position", statistic=_mean("position"), interval=False),
-    _millimetres("position_median", heading="position, median", statistic=_median("position"), interval=False),
-    _millimetres("position_on_pad", statistic=_on_pad(_mean("position")), compared="lower"),
-    _millimetres("position_on_pad_median", heading="position on pad, median", statistic=_on_pad(_median("position"))),
+    _millimetres("position", statistic=_of("position"), interval=False),
+    _millimetres(
+        "position_median", heading="position, median", statistic=_of("position", metrics.median), interval=False
+    ),
+    _millimetres("position_on_pad", statistic=_of("position", on_pad=True), compared="lower"),
+    _millimetres(
+        "position_on_pad_median",
+        heading="position on pad, median",
+        statistic=_of("position", metrics.median, on_pad=True),
+    ),
     _millimetres(
         "energy",
         heading="energy score",
-        statistic=_mean("energy"),
+        statistic=_of("energy"),
         compared="lower",
         note="The energy score is a distance that a predicted distribution scores, and the error of a single "
         "prediction.",
@@ -176,21 +158,21 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "coverage",
         heading=f"coverage of {100 * metrics.LEVEL:g} %",
-        statistic=_mean("coverage"),
+        statistic=_of("coverage"),
         note=f"Coverage counts how often the true position is among the inner {100 * metrics.LEVEL:g} % of itself and "
         "the samples, ranked by their mean distance from each other.",
     ),
-    _degrees("angle", statistic=_mean("angle")),
-    _degrees("angle_on_pad", statistic=_on_pad(_mean("angle"))),
-    _degrees("axis", statistic=_mean("axis")),
-    _degrees("axis_on_pad", statistic=_on_pad(_mean("axis")), compared="lower"),
-    _degrees("axis_on_pad_median", heading="axis on pad, median", statistic=_on_pad(_median("axis"))),
+    _degrees("angle", statistic=_of("angle")),
+    _degrees("angle_on_pad", statistic=_of("angle", on_pad=True)),
+    _degrees("axis", statistic=_of("axis")),
+    _degrees("axis_on_pad", statistic=_of("axis", on_pad=True), compared="lower"),
+    _degrees("axis_on_pad_median", heading="axis on pad, median", statistic=_of("axis", metrics.median, on_pad=True)),
     Metric("outcome_balanced_accuracy", heading="outcome, balanced accuracy", statistic=_accuracy),
     Metric(
         "outcome_log_loss",
         heading="log loss",
         unit="nats",
-        statistic=_mean("log_loss"),
+        statistic=_of("log_loss"),
         compared="lower",
         note=f"The log loss counts probabilities below {metrics.FLOOR} as {metrics.FLOOR}.",
     ),
@@ -206,7 +188,7 @@ METRICS: tuple[Metric, ...] = (
     *(
         Metric(f"{stream}_{kind}_object", statistic=_image(f"{stream}_object", kind), column=False)
         for stream in ("visual", "tactile")
-        for kind in _KINDS
+        for kind in ("bce", "excess")
     ),
 )
 

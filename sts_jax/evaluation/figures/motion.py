@@ -119,15 +119,13 @@ def animation(
     axes = [_axes(figure, column * side, _HEAD, side, side) for column in range(3)]
     pictures = [_picture(axis, name, images[0]) for axis, (name, images) in zip(axes, streams.items(), strict=True)]
     arrow, label = _gravity(axes[1])
+    force, moment = wrench[:, :3], 1e3 * wrench[:, 3:]
     curves = [
-        (_panel(figure, 0, "force (N)", "F", time, wrench[:, :3]), wrench[:, :3]),
-        (
-            _panel(figure, 1, "moment about the sensor's origin (mN m)", "M", time, 1e3 * wrench[:, 3:]),
-            1e3 * wrench[:, 3:],
-        ),
+        (_panel(figure, 0, "force (N)", "F", time, force), force),
+        (_panel(figure, 1, "moment about the sensor's origin (mN m)", "M", time, moment), moment),
     ]
 
-    def turn_to(t: int) -> None:
+    def draw_page(t: int) -> None:
         last = f": {outcome}" if t == len(time) - 1 else ""
         clock.set_text(f"{time[t]:.2f} s, at 1/{SLOWER:g} of its speed{last}")
         for picture, images in zip(pictures, streams.values(), strict=True):
@@ -139,13 +137,13 @@ def animation(
             for line, own in zip(lines, values.T, strict=True):
                 line.set_data(time[: t + 1], own[: t + 1])
 
-    # A GIF counts hundredths of a second.
+    # A GIF counts hundredths of a second, and its writer rounds down to whole milliseconds.
     step = 10 * max(round(100 * SLOWER * float(np.mean(np.diff(time)))), 2) if len(time) > 1 else 100
     pages = [*range(len(time)), *[len(time) - 1] * max(round(_HOLD / step) - 1, 0)]
     try:
         film = FuncAnimation(
-            figure, turn_to, pages, init_func=lambda: None, interval=step + 0.5, cache_frame_data=False
-        )  # a writer rounds the interval down to whole ms
+            figure, draw_page, pages, init_func=lambda: None, interval=step + 0.5, cache_frame_data=False
+        )
         with tempfile.TemporaryDirectory() as folder:
             temporary = Path(folder) / "film.gif"
             film.save(temporary, "pillow", dpi=_DPI)
