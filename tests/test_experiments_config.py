@@ -47,7 +47,7 @@ def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, si
         (
             {"image_size": 48},
             r"image_size must be one of 16, 32, 64, 128 for collection\.resolution 128 128 and model 'statespace', "
-            r"got 48: give --image-size 128",
+            r"got 48: give --image-size 32, or",
         ),
         ({"image_size": 16, "model": "paper"}, r"image_size must be one of 32, 64, 128 .* model 'paper', got 16"),
         (

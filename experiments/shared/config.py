@@ -143,10 +143,10 @@ def check(config: Config) -> None:
             "give --collection.resolution 64 64 or 128 128"
         )
     if config.image_size not in allowed:
-        listed = ", ".join(map(str, allowed))
+        listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
         raise ValueError(
             f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {allowed[-1]}, or a resolution that is a "
+            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or a resolution that is a "
             "multiple of the image size"
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
