@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import pytest
 import trimesh
@@ -110,7 +110,6 @@ def test_any_field_of_a_preset_can_be_changed(monkeypatch, capsys):
 
 
 def test_a_scenario_that_is_declared_as_a_protocol_has_the_options_of_its_class(monkeypatch):
-    @runtime_checkable
     class Scenario(Protocol):
         steps: int
 
