@@ -47,9 +47,7 @@ def draw(
         if scenario.condition_scale:
             title += "\nred: direction and strength of the jerk's effect on the object"
         drawn.append(figures / f"{name}.png")
-        evaluation.figures.predictions(
-            drawn[-1], test, found, num=config.num_shown, title=title, outcomes=scenario.outcomes
-        )
+        evaluation.figures.predictions(drawn[-1], test, found, num=config.num_shown, title=title, scenario=scenario)
         if found.samples is not None and found.samples.pose is not None:
             drawn.append(figures / f"{name.replace('predictions', 'ends')}.png")
             head = f"{workdir.name}, from {given}"

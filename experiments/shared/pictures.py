@@ -11,14 +11,14 @@ from sts_jax import dataset, evaluation
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
-    """Draw the first of the fully rendered trajectories, at least one, that has the most informative outcome."""
+    """Draw the first fully rendered trajectory with the most informative outcome. There must be one."""
     full = data.full_trajectories()
     rank = [collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
     index = int(full[np.argmin(rank)])
     one, hidden = ({name: leaf[index] for name, leaf in x.items()} for x in (data.trajectory, data.hidden))
     images = data.strip(index)
     body = dataset.make_bodies(collection, np.array([one["body"]]))[0]
-    description = describe(dataset.class_names(collection)[one["body"]], one, hidden)
+    what = describe(dataset.class_names(collection)[one["body"]], one, hidden)
     evaluation.figures.strip(
         path,
         one["time"],
@@ -26,7 +26,7 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
         images.visual / 255,
         images.tactile / 255,
         one["wrench"],
-        title=f"trajectory {index}: {description}",
+        title=f"trajectory {index}: {what}",
     )
 
 

@@ -46,7 +46,7 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
 
 
 def outcome_of_image(
-    visual: np.ndarray, blank: np.ndarray, threshold: float, *, stays: int = physics.Outcome.RESTS
+    visual: np.ndarray, blank: np.ndarray, threshold: float, stays: int = int(physics.Outcome.RESTS)
 ) -> np.ndarray:
     """The outcome from an image: `FELL_OFF` if its distance from the empty image is at most a threshold.
 
@@ -59,7 +59,7 @@ def outcome_of_image(
         stays: The outcome of the other images.
     """
     empty = emptiness(visual, blank) <= threshold
-    return np.where(empty, int(physics.Outcome.FELL_OFF), int(stays))
+    return np.where(empty, int(physics.Outcome.FELL_OFF), stays)
 
 
 def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:

@@ -1,6 +1,5 @@
 """Figures of predictions of held-out trajectories, each written to one file."""
 
-import enum
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 
+from sts_jax import physics
 from sts_jax.dataset import Pairs
 from sts_jax.evaluation import metrics
 from sts_jax.evaluation.figures import drawing
@@ -26,7 +26,7 @@ def predictions(
     *,
     num: int,
     title: str,
-    outcomes: Sequence[enum.IntEnum] = OUTCOMES,
+    scenario: physics.Scenario | None = None,
 ) -> None:
     """Draw input, truth, prediction and samples of the first `num` held-out trajectories, with a row for each stream.
 
@@ -39,10 +39,10 @@ def predictions(
         predicted: Predictions of these, or of the first ones. A stream that is not predicted has no rows.
         num: Number of trajectories.
         title: Title of the figure.
-        outcomes: `scenario.outcomes`, for their names.
+        scenario: The scenario of the trajectories, for the names of its outcomes (None: those of `physics.Outcome`).
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
-    samples = predicted.samples or Predicted()
+    samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
     num = min(num, *(len(getattr(predicted, name)) for name in streams))
     drawn = 0 if samples.visual is None and samples.tactile is None else SAMPLES
     heads = ["input", "truth", "mean of samples" if drawn else "prediction", *(f"sample {k + 1}" for k in range(drawn))]
@@ -62,7 +62,8 @@ def predictions(
                 axis.set_title(heads[column], fontsize=10)
         label = stream
         if row % len(streams) == 0:
-            label = f"#{test.trajectory[item]}: {named(int(test.outcome[item]), outcomes).replace('_', ' ')}\n{stream}"
+            outcome = named(int(test.outcome[item]), outcomes).replace("_", " ")
+            label = f"#{test.trajectory[item]}: {outcome}\n{stream}"
         axes[row, 0].set_ylabel(label, fontsize=9)
         if stream == streams[0] and test.condition.shape[1]:
             height, width = test.visual.shape[2:4]
