@@ -18,7 +18,8 @@ import numpy as np
 from tqdm import tqdm
 
 import sts_jax as sts
-from experiments import ceilings, freefall, inclined, perturbed, stages
+from experiments import freefall, inclined, perturbed
+from experiments.shared import rerolls, stages
 from sts_jax import _files, dataset, evaluation
 
 CONFIGS = {"freefall": freefall.DEFAULT, "perturbed": perturbed.DEFAULT, "inclined": inclined.DEFAULT}
@@ -57,12 +58,12 @@ def main(name: str, times: int, workdir: Path | None) -> None:
         folder = workdir or Path(temporary)
         stages.claim(config, folder)
         data = stages.collect(config, folder, sensor)
-        rows = stages.rows_of(data, config.splits[0])
+        rows = evaluation.rows_of(data, config.splits[0])
         pairs = data.pairs(rows["train"]), data.pairs(rows["test"][: config.num_rerolled])
     train, test = (dataset.reduced(part, config.image_size) for part in pairs)
-    judge = stages.judge_of(config.collection.scenario, train)
+    judge = evaluation.scorer(config.collection.scenario, train)
     with tqdm(total=times * len(test.object), desc="re-roll", unit="trajectories") as bar:
-        made = ceilings.reroll(config.collection, sensor, test, times, judge, lambda done: bar.update(done - bar.n))
+        made = rerolls.reroll(config.collection, sensor, test, times, judge, lambda done: bar.update(done - bar.n))
     scores = dict(made.scores)
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
         scores[title] = judge(row, test)

@@ -24,7 +24,8 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 import sts_jax as sts
-from experiments import command, freefall, inclined, perturbed, stages
+from experiments import freefall, inclined, perturbed
+from experiments.shared import command, stages
 from sts_jax import _files, dataset, evaluation, statespace, training
 
 EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed}
@@ -157,7 +158,7 @@ def main(args: Args) -> str:
     with _files.lock(args.workdir):
         stages.claim(config, args.workdir)
         data = stages.collect(config, args.workdir, sensor)
-    rows, scenario = stages.rows_of(data, config.splits[0]), config.collection.scenario
+    rows, scenario = evaluation.rows_of(data, config.splits[0]), config.collection.scenario
     train, given = data.pairs(rows["train"]), data.pairs(rows["test"])
     job = next(stages.jobs(config, sensor, train))
     assert isinstance(job.model, statespace.Config)
@@ -169,7 +170,7 @@ def main(args: Args) -> str:
     train, test = (dataset.reduced(pairs, config.image_size) for pairs in (train, given))
     predictions = evaluation.baselines(scenario, train, test)
     predictions[TITLE] = predict(network, params, job, held_out)
-    judge = stages.judge_of(scenario, train)
+    judge = evaluation.scorer(scenario, train)
     scores = {title: judge(row, test) for title, row in predictions.items()}
     size = sum(x.size for x in jax.tree.leaves(params))
     note = f"{steps} gradient steps of {BATCH} in {args.seconds:g} s, {size:,} parameters."

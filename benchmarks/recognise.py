@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import command
+from experiments.shared import command
 from sts_jax import dataset
 
 NUMBER = 10

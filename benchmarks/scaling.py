@@ -19,9 +19,10 @@ import tyro
 
 import sts_jax as sts
 from benchmarks.deterministic import EXPERIMENTS
-from experiments import command, stages
-from experiments.progress import say
-from sts_jax import _files, dataset, evaluation, training
+from experiments.shared import command, stages
+from experiments.shared.config import Config
+from experiments.shared.progress import say
+from sts_jax import _files, dataset, evaluation
 from sts_jax.evaluation.figures import Trained, scaling
 
 Part = TypeVar("Part", dataset.Pairs, dataset.Views, dataset.Ends)
@@ -47,7 +48,7 @@ def some(part: Part, objects: np.ndarray) -> Part:
 
 
 def train(
-    config: stages.Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
+    config: Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
 ) -> tuple[int, float]:
     """Train a model on a share of the objects for so many steps. Returns the number of trajectories and minutes."""
     pairs, views = data.pairs(data.members("train")), data.views("train")
@@ -76,17 +77,17 @@ def main(args: Args) -> str:
         given = data.pairs(data.members("test"))
         test, scenario = dataset.reduced(given, config.image_size), config.collection.scenario
         train_pairs = dataset.reduced(data.pairs(data.members("train")), config.image_size)
-        judge = stages.judge_of(scenario, train_pairs)
+        judge = evaluation.scorer(scenario, train_pairs)
         scores = {name: judge(row, test) for name, row in evaluation.baselines(scenario, train_pairs, test).items()}
         points = {}
         for (share, steps), seed in itertools.product(sizes, args.seeds):
             folder = args.workdir / "scaling" / f"{share:.4f}-{steps}-{seed}"
             trajectories, minutes = train(config, data, folder, share, steps, seed)
-            predictor, blank = sts.Predictor.load(folder), training.load_blank(folder)[0] / 255
+            predictor = sts.Predictor.load(folder)
             for subset in SUBSETS:
                 title = f"{' and '.join(subset)}: {trajectories} trajectories, {steps} steps, seed {seed}"
                 say(title)
-                found = stages.predict(scenario, predictor, subset, given, given, blank, num_samples=config.num_samples)
+                found = evaluation.predict(predictor, subset, given, scenario, num_samples=config.num_samples)
                 scores[title] = judge(found, test)
                 points[title] = (" and ".join(subset), trajectories, round(minutes, 1))
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)

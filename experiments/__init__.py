@@ -1,4 +1,4 @@
-"""The paper's experiments: one short file each, run by `python -m experiments.NAME`."""
+"""The experiments of the paper and further commands, run by `python -m experiments.NAME`. `shared` has common parts."""
 
 import os
 

@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 
 import sts_jax as sts
 from experiments import sense
-from experiments.errors import on_one_line
+from experiments.shared.errors import on_one_line
 from sts_jax import tactile
 
 # m, standard deviations of the Gaussian blur under which images are compared. The first is about the distance by which
@@ -126,8 +126,8 @@ def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> li
     """Minimise the loss by Levenberg-Marquardt steps, with less and less blur.
 
     Args:
-        look: function that returns the slope at (x, y, yaw) under a blur (m).
-        start: (x, y, yaw): m, m, rad.
+        look: Function that returns the slope at (x, y, yaw) under a blur (m).
+        start: (x, y, yaw), m and rad.
 
     Returns:
         The accepted (x, y, yaw) and their slopes, beginning with the start. Each blur begins with the last ones again.
@@ -185,7 +185,7 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
         points = axes[5].scatter(ways[:, 0], ways[:, 1], c=turns, s=14, vmin=0, vmax=OFF[1], cmap="viridis")
     figure.colorbar(points, ax=axes[5], label="yaw off by (degrees)")
     axes[5].set(
-        title=f"the ways of {len(paths)} starts", xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal"
+        title=f"the paths of {len(paths)} starts", xlabel="x off by (mm)", ylabel="y off by (mm)", aspect="equal"
     )
     figure.savefig(config.out, dpi=100)
 
@@ -194,7 +194,7 @@ def main(config: Config) -> None:
     """Place the object on the pad, render the target, fit it from every start, and draw the result.
 
     Raises:
-        ValueError: see `sense.check`, or nothing presses on the pad, or there is no start.
+        ValueError: An option is out of range, there is no start, or the object leaves no imprint.
     """
     sense.check(config)
     if config.starts < 1:

@@ -7,13 +7,14 @@
     python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours, a GPU helps
     python -m experiments.inclined --plan             # seconds per stage, measured on a little of each
 
-Leaves `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md, figures/*.png. Started again on
-the same --workdir it goes on where it stopped, and touches nothing where all is done.
+Results go to `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
+run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs
+one stage. Every field of the configuration is an option too, such as `--collection.num-objects 1000`, see `--help`.
 """
 
 import dataclasses
 
-from experiments import command, stages
+from experiments.shared import command, config
 from sts_jax import dataset, physics
 from sts_jax.training import TrainConfig
 
@@ -29,20 +30,20 @@ COLLECTION = dataset.Collection(
     shares=(0.9, 0.04, 0.06),
     seed=2,
 )
-DEFAULT = stages.Config(
+DEFAULT = config.Config(
     collection=COLLECTION,
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=2000),
+    state_training=dataclasses.replace(config.STATE_TRAINING, steps=2000),
     training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(750, 350, 400, 200),
 )
 LONG = dataclasses.replace(
     DEFAULT,
     collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
-    state_training=dataclasses.replace(stages.STATE_TRAINING, steps=8000),
+    state_training=dataclasses.replace(config.STATE_TRAINING, steps=8000),
 )
-SMOKE = stages.smoke(DEFAULT)
-PAPER = stages.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories
+SMOKE = config.smoke(DEFAULT)
+PAPER = config.paper(COLLECTION, num_objects=480, num_per_object=5)  # 2,400 trajectories
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
-    command.run(PRESETS, "runs/inclined", __doc__)  # collect, train, evaluate: stages.main
+    command.run(PRESETS, "runs/inclined", __doc__)  # collect, train, evaluate: shared.stages.main

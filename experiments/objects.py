@@ -20,7 +20,7 @@ import tyro
 from matplotlib import pyplot
 
 import sts_jax as sts
-from experiments import errors, output
+from experiments.shared import errors, output
 from sts_jax import optics
 
 DISTANCE = 0.42  # m, from the camera to the object

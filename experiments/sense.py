@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 import sts_jax as sts
-from experiments import errors, output
+from experiments.shared import errors, output
 from sts_jax import tactile
 
 G = 9.81  # m/s^2
@@ -65,11 +65,11 @@ class Config:
 
 
 def check(config: Config) -> None:
-    """Check that an object can be shown as configured.
+    """Check the options before any work.
 
     Raises:
-        ValueError: an option is out of range. The message names it.
-        OSError: the picture cannot be written.
+        ValueError: An option is out of range.
+        OSError: The picture cannot be written.
     """
     if min(config.resolution) < 1:
         raise ValueError(f"resolution is {config.resolution}, but height and width must be at least 1 pixel")
@@ -94,8 +94,8 @@ def read(config: Config, name: str) -> sts.objects.Body:
     """Load the object from a file, or make one of a class.
 
     Raises:
-        FileNotFoundError: the name is neither a file nor a class.
-        ValueError: see `objects.load`, or an option for files is given for a class.
+        FileNotFoundError: The name is neither a file nor a class.
+        ValueError: An option for files is given for a class, or `objects.load` refuses the file.
     """
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
@@ -128,7 +128,7 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     The object is placed at rest by `physics.place`, then tilted, turned and moved as configured.
 
     Raises:
-        ValueError: the object has no such face to rest on.
+        ValueError: The object has no such face to rest on.
     """
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
@@ -169,7 +169,7 @@ def see(
 
 
 def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[sts.Frame, np.ndarray, str]:
-    """The frame, the image between its streams, and a description."""
+    """Render the object at rest. Returns the frame, the image between its streams, and a description."""
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     seconds = []

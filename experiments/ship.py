@@ -1,4 +1,4 @@
-"""Put the trained model of a work directory into the library, where `sts.Predictor.load` finds it by its name.
+"""Copy the trained model of a work directory into the library, so that `sts.Predictor.load` finds it by its name.
 
     python -m experiments.ship runs/freefall                    # writes sts_jax/models/freefall
     python -m experiments.ship runs/long --name freefall
@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import command, errors
+from experiments.shared import command, errors
 from sts_jax.predict import MODELS
 
 LIMIT = 12e6  # bytes, of a model's folder
@@ -28,18 +28,18 @@ LIFT = 0.04  # m, of every second bottle: models of freefall predict from object
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Which model is shipped."""
+    """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment
     name: str | None = None  # of the model (default: the name of the work directory)
 
 
 def ship(workdir: Path, name: str) -> str:
-    """Write the model to `sts_jax/models/NAME` and return a line on its size and on how its predictions differ.
+    """Write the model to `sts_jax/models/NAME` and return a line with its size and the differences of its predictions.
 
     Raises:
-        ValueError: the model is too large, or the name is no word.
-        OSError: a file of the model is damaged or missing, or the library is not writable.
+        ValueError: The model is too large, or the name has other characters than letters, digits and underscores.
+        OSError: A file of the model is damaged or missing, or the library is not writable.
     """
     if not name.isidentifier():
         raise ValueError(f"name is {name!r}, but it takes only letters, digits and underscores: give --name freefall")
@@ -62,7 +62,7 @@ def ship(workdir: Path, name: str) -> str:
 
 
 def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
-    """Differences between the predictions of two models from vision, in words."""
+    """A line with the differences between the predictions of two models from vision."""
     visual = bottles(original.preprocessing)
     half = np.array(original.preprocessing.condition_scale, np.float32) / 2
     condition = np.tile(half, (len(visual), 1)) if half.size else None

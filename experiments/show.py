@@ -15,7 +15,8 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import errors, freefall, inclined, output, perturbed, pictures
+from experiments import freefall, inclined, perturbed
+from experiments.shared import errors, output, pictures
 from sts_jax import dataset, evaluation
 
 SCENARIOS = {

@@ -101,7 +101,8 @@ def claim(path: Path, content: dict) -> None:
     """Write a JSON file, or check that an existing one has the same content.
 
     Raises:
-        ValueError: the content differs. The message names the first field that differs, both values, and the remedy.
+        ValueError: the content differs. The message names the fields that differ, both values of the first ones, and
+            the remedy.
         TornFileError: the existing file is not JSON.
     """
     content = json.loads(json.dumps(content))
@@ -109,23 +110,27 @@ def claim(path: Path, content: dict) -> None:
         write_json(path, content)
         return
     there = read_json(path, f"choose another folder than {path.parent}, or delete it")
-    difference = _first_difference(there, content)
-    if difference is not None:
-        field, old, new = difference
+    found = list(_differences(there, content))
+    if found:
+        made = ", ".join(f"{field or 'content'} = {old!r}" for field, old, _ in found[:_SHOWN])
+        asked = ", ".join(repr(new) for _, _, new in found[:_SHOWN])
+        more = f" ({', '.join(field for field, _, _ in found[_SHOWN:])} differ too)" if found[_SHOWN:] else ""
         raise ValueError(
-            f"{path} was made with {field or 'content'} = {old!r}, but the current settings have {new!r}: "
+            f"{path} was made with {made}, but the current settings have {asked}{more}: "
             f"choose another folder than {path.parent}, or delete it to start anew."
         )
 
 
-def _first_difference(old: object, new: object, field: str = "") -> tuple[str, object, object] | None:
+_SHOWN = 3  # differing fields whose values a message shows
+
+
+def _differences(old: object, new: object, field: str = "") -> Iterator[tuple[str, object, object]]:
+    """The fields in which two contents differ, with both values."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old)]:
-            inner = _first_difference(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
-            if inner is not None:
-                return inner
-        return None
-    return None if old == new else (field, old, new)
+            yield from _differences(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
+    elif old != new:
+        yield field, old, new
 
 
 def sha256(path: Path) -> str:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from experiments import stages
-from sts_jax import _files, dataset, geometry
+from sts_jax import _files, dataset, evaluation, geometry
 from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
 SMALL = dataset.Collection(
@@ -95,7 +94,7 @@ def test_a_trajectory_without_images_is_that_of_a_collection_with_all_images(fol
         np.testing.assert_array_equal(one, other)
     with pytest.raises(ValueError, match=r"trajectories holds 3, which has no images \(num_rendered=1\): use `ends`"):
         data.pairs(np.array([2, 3]))
-    rows = stages.rows_of(data, "trajectory")
+    rows = evaluation.rows_of(data, "trajectory")
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), data.rendered())
     ends = data.ends(np.array([3, 0]))
     np.testing.assert_array_equal(ends.pose, whole.trajectory["pose"][[3, 0]][:, [0, -1]])

@@ -4,10 +4,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
-from test_evaluation_report import judged
+from test_evaluation_scores import judged
 
 from sts_jax import evaluation
 from sts_jax.evaluation import figures
+from sts_jax.evaluation.figures import drawing, motion
 
 FRAMES = 5
 TIME = np.linspace(0, 1, FRAMES)
@@ -18,7 +19,7 @@ STREAMS = [np.full((FRAMES, size, size, 3), 0.5) for size in (16, 8, 8)]
 
 def test_a_strip_has_the_force_in_n_and_the_moment_in_mn_m(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(figures, "_save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(drawing, "save", lambda figure, path: drawn.append(figure))
     figures.strip(tmp_path / "a.png", TIME, *STREAMS, WRENCH, num=3)
     force, moment = drawn[0].axes[-2:]
     assert force.get_ylabel() == "force (N)"
@@ -42,8 +43,8 @@ def test_an_animation_draws_the_moment_below_the_force(tmp_path, sign):
             pages.append(np.asarray(film.convert("RGB")).astype(int))
 
     def blue_rows(page, panel):  # of the curve, not of its name above it
-        top = 44 + side + panel * figures._PANEL
-        part = page[top + 20 : top + figures._PANEL, 55:]
+        top = motion._HEAD + side + panel * motion._PANEL
+        part = page[top + 20 : top + motion._PANEL, 55:]
         return np.flatnonzero(((part[..., 2] - part[..., 0]) > 80).any(1))
 
     assert np.ptp(blue_rows(pages[-1], 1)) > 60  # from 0 to 20 mN m
@@ -55,7 +56,7 @@ def test_an_animation_draws_the_moment_below_the_force(tmp_path, sign):
 def drawn(monkeypatch):
     """The figures that are drawn, instead of files."""
     found = []
-    monkeypatch.setattr(figures, "_save", lambda figure, path: found.append(figure))
+    monkeypatch.setattr(drawing, "save", lambda figure, path: found.append(figure))
     yield found
     for figure in found:
         plt.close(figure)
@@ -139,7 +140,7 @@ def test_a_scaling_figure_joins_models_of_one_training_time_or_one_number_of_tra
 
 
 @pytest.mark.parametrize(("last", "scale"), [(0.5, "log"), (-3.0, "linear")])
-def test_a_loss_that_becomes_negative_is_drawn_whole(tmp_path, drawn, last, scale):
+def test_a_loss_that_becomes_negative_is_drawn_on_a_linear_axis(tmp_path, drawn, last, scale):
     log = [{"step": step, "loss": loss} for step, loss in ((10, 100.0), (20, last))]
     figures.training_curves(tmp_path / "a.png", {"model": log})
     axis = drawn[0].axes[0]

@@ -50,7 +50,7 @@ def test_black_and_white_targets_keep_everything_finite():
     np.testing.assert_allclose(error.bce, 12 * math.log(510))
 
 
-def test_angle_knows_that_a_quaternion_and_its_negative_are_one_rotation():
+def test_the_angle_of_a_quaternion_and_its_negative_is_zero():
     pose = np.zeros((2, 7))
     pose[:, 3] = 1
     turned = pose.copy()
@@ -59,7 +59,7 @@ def test_angle_knows_that_a_quaternion_and_its_negative_are_one_rotation():
     np.testing.assert_allclose(metrics.geodesic_angle(turned, pose), [0, math.pi / 3], atol=1e-7)
 
 
-def test_the_up_axis_knows_no_turn_about_itself():
+def test_the_axis_angle_ignores_a_turn_about_the_axis():
     half = math.pi / 6
     pose = np.zeros((3, 7))
     pose[:, 3] = 1
@@ -78,7 +78,7 @@ def test_balanced_accuracy_weighs_classes_alike():
     assert metrics.balanced_accuracy(np.array([0] * 8 + [1, 1]), target) == pytest.approx((8 / 9 + 1) / 2)
 
 
-def test_threshold_separates_what_can_be_separated():
+def test_the_threshold_separates_separable_scores():
     score = np.array([0.01, 0.02, 0.4, 0.5])
     threshold = metrics.best_threshold(score, score > 0.1)
     assert 0.02 < threshold < 0.4

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_evaluation_report import pairs
+from test_evaluation_scores import pairs
 
 import sts_jax as sts
 from sts_jax import dataset, evaluation, physics
@@ -29,9 +29,9 @@ def starts():
 
 @pytest.fixture
 def engine(monkeypatch):
-    """What starts `simulate` draws; the ends lie above or below them. Pictures show which object is drawn, and z.
+    """Replace the simulation by ends above or below the starts that `simulate` draws.
 
-    They are twice as large as those of the items.
+    The grey value of a picture depends on the object and on z. Pictures are twice as large as those of the items.
     """
     seen = {}
 
@@ -56,7 +56,7 @@ def engine(monkeypatch):
     return seen
 
 
-def test_every_re_roll_begins_at_its_items_start_and_ends_are_samples(engine):
+def test_every_reroll_begins_at_the_start_of_its_item_and_its_end_is_a_sample(engine):
     test = starts()
     found = evaluation.ceiling(COLLECTION, sts.Sensor(), test, TIMES, jax.random.key(0))
     assert found.samples.pose.shape == (TIMES, 3, 7)
@@ -72,19 +72,19 @@ def test_every_re_roll_begins_at_its_items_start_and_ends_are_samples(engine):
     ends = 100 + 50 * found.samples.pose[..., 2]
     np.testing.assert_allclose(found.samples.visual[..., 0, 0, 0], ends + np.array([10, 10, 0]), atol=0.51)
     np.testing.assert_allclose(found.visual, found.samples.visual.mean(0) / 255, rtol=1e-6)
-    # Two of three stay, one falls off; one more re-roll is spread evenly.
+    # Two of three stay, and one falls off. One more re-roll is spread evenly.
     rests = [outcome == physics.Outcome.RESTS for outcome in COLLECTION.scenario.outcomes]
     np.testing.assert_allclose(found.outcome_probability[:, rests.index(True)], 2.5 / 4)
     assert found.outcome.tolist() == [physics.Outcome.RESTS] * 3
 
 
-def test_a_start_that_the_engine_draws_otherwise_is_refused(engine, monkeypatch):
+def test_another_start_than_that_of_the_item_is_refused(engine, monkeypatch):
     real = rerolls.physics.simulate
     monkeypatch.setattr(rerolls.physics, "simulate", lambda key, *rest, **k: real(jax.random.key(9), *rest, **k))
     with pytest.raises(RuntimeError, match="simulate changed its keys"):
         evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), TIMES, jax.random.key(0))
 
 
-def test_nothing_is_rolled_no_times():
+def test_at_least_one_reroll_is_required():
     with pytest.raises(ValueError, match="times must be >= 1, got 0"):
         evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), 0, jax.random.key(0))

@@ -1,10 +1,11 @@
-"""The figures of a summary against means written out by hand, and the size of the tables."""
+"""The metrics of a summary, compared with means written out by hand, and the columns of the tables."""
 
+import enum
 import json
 
 import numpy as np
 import pytest
-from test_evaluation_report import FELL, judged
+from test_evaluation_scores import FELL, judged
 
 from sts_jax import evaluation, physics
 
@@ -26,12 +27,10 @@ def summary(scored):
     return evaluation.summarise(scores, test, num=50)
 
 
-def test_figures_are_those_of_all_items_or_of_those_that_stay(scored, summary):
+def test_metrics_are_over_all_items_or_over_those_that_stay(scored, summary):
     test, scores = scored
-    own, found = (
-        scores["model"],
-        {name: cell and cell["value"] for name, cell in summary["predictors"]["model"].items()},
-    )
+    own = scores["model"]
+    found = {name: cell and cell["value"] for name, cell in summary["predictors"]["model"].items()}
     stayed = test.outcome != FELL
     assert found["position"] == pytest.approx(own.position.mean())
     assert found["position_on_pad"] == pytest.approx(own.position[stayed].mean())
@@ -48,7 +47,7 @@ def test_figures_are_those_of_all_items_or_of_those_that_stay(scored, summary):
     json.dumps(summary)
 
 
-def test_a_figure_lies_in_its_interval_and_a_missing_one_is_none(summary):
+def test_a_metric_lies_in_its_interval_and_a_missing_one_is_none(summary):
     cell = summary["predictors"]["model"]["position"]
     assert cell["low"] <= cell["value"] <= cell["high"]
     rule = summary["predictors"]["rests below its start"]
@@ -67,7 +66,38 @@ def test_a_ceiling_of_the_first_items_is_compared_with_the_constant_on_these(sco
     assert f"{evaluation.CEILING}: the first 2 of them." in text
 
 
-def test_the_short_table_has_eight_columns_and_the_rows_asked_for(summary):
+def test_both_tables_have_their_columns(summary):
+    def heads(text):
+        lines = [line for line in text.splitlines() if line.startswith("| predictor")]
+        return [line.strip("| ").split(" | ") for line in lines]
+
+    (short,) = heads(evaluation.table(summary, title="t"))
+    assert short == [
+        *("predictor", "visual skill", "on object", "tactile skill", "position on pad, mean / median (mm)"),
+        *("axis on pad (deg)", "outcome, balanced accuracy / log loss (nats)", "energy score (mm) / coverage of 90 %"),
+    ]
+    complete, differences = heads(evaluation.full_table(summary, title="t"))
+    assert complete == [
+        *("predictor", "visual BCE", "visual excess x1e-4", "visual skill", "visual on object"),
+        *("visual skill, best sample", "sharpness", "tactile BCE", "tactile excess x1e-4", "tactile skill"),
+        *("tactile on object", "position (mm)", "position, median (mm)", "position on pad (mm)"),
+        *("position on pad, median (mm)", "energy score (mm)", "coverage of 90 %", "angle (deg)", "angle on pad (deg)"),
+        *("axis (deg)", "axis on pad (deg)", "axis on pad, median (deg)", "outcome, balanced accuracy"),
+        *("log loss (nats)", "calibration error", "ROC area of falling off"),
+    ]
+    assert differences == [
+        *("predictor", "against", "visual skill", "visual on object", "tactile skill", "tactile on object"),
+        *("position on pad (mm)", "energy score (mm)", "axis on pad (deg)", "log loss (nats)"),
+    ]
+    hidden = {f"{stream}_{kind}_object" for stream in ("visual", "tactile") for kind in ("bce", "excess")}
+    assert (
+        {metric.name for metric in evaluation.METRICS if not metric.column}
+        == hidden
+        <= set(summary["predictors"]["model"])
+    )
+
+
+def test_the_short_table_has_the_requested_rows(summary):
     chosen = [evaluation.CEILING, "rests below its start", "model"]
     lines = evaluation.table(summary, title="t", rows=chosen, notes=["A note."]).splitlines()
     rows = [line for line in lines if line.startswith("|")]
@@ -83,14 +113,30 @@ def test_the_full_table_has_every_predictor_and_leaves_out_empty_differences(sum
     lines = evaluation.full_table(summary, title="t").splitlines()
     whole = [line for line in lines if line.startswith("| model |")]
     assert len([line for line in lines if line.startswith("|") and line.count("|") == whole[0].count("|")]) >= 8
-    assert len(whole) == 1 + len(evaluation.BASELINES)  # its figures, and a line against each baseline
+    assert len(whole) == 1 + len(evaluation.BASELINES)  # its metrics, and a line against each baseline
     assert all(name in "\n".join(lines) for name in summary["predictors"])
 
 
-def test_the_gain_is_the_share_of_the_log_loss_that_is_gone(scored):
+def test_the_gain_is_the_removed_share_of_the_log_loss(scored):
     test, scores = scored
     model = scores["model"]
     half = model._replace(log_loss=model.log_loss / 2)
     gain = evaluation.gain(model, half, test, num=50)
     np.testing.assert_allclose([gain[key] for key in ("value", "low", "high")], 0.5)
     assert evaluation.gain(model, scores["copy of the input"], test) is None
+
+
+def test_a_summary_needs_every_baseline(scored):
+    test, scores = scored
+    few = {name: own for name, own in scores.items() if name != "nearest neighbour"}
+    with pytest.raises(ValueError, match=r"scores lacks nearest neighbour: add the scores of each of evaluation\.base"):
+        evaluation.summarise(few, test, num=2)
+
+
+def test_outcomes_are_named_by_the_scenario(scored):
+    class Ends(enum.IntEnum):
+        FELL_OFF = 1
+        LIES = 0
+
+    test, scores = scored
+    assert evaluation.summarise(scores, test, outcomes=tuple(Ends), num=2)["outcomes"] == {"lies": 3, "fell_off": 3}

@@ -1,14 +1,17 @@
-"""What the command line makes of a preset, and what presets hold; nothing of it is run."""
+"""Presets, and the effect of the options of the command line on them. No experiment is run."""
 
 import dataclasses
 import json
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 import trimesh
+import tyro
 
 import sts_jax as sts
-from experiments import command, errors, freefall, inclined, perturbed, pictures, results, stages
+from experiments import freefall, inclined, perturbed
+from experiments.shared import command, config, errors, judging, pictures, results, stages
 from sts_jax import _files, compilation, dataset, physics, training
 
 BOTTLES = ("bottle",)
@@ -16,7 +19,7 @@ BOTTLES = ("bottle",)
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Four bottles and three boxes; four objects are enough."""
+    """Four bottles and three boxes. Four objects are enough."""
     for label, count in (("bottle", 4), ("box", 3)):
         (tmp_path / "meshes" / label).mkdir(parents=True)
         for i in range(count):
@@ -32,7 +35,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("experiment", "classes", "trajectories"),
     [(freefall, sts.objects.CATEGORIES, 1700), (inclined, sts.objects.CATEGORIES, 2400), (perturbed, BOTTLES, 2500)],
 )
-def test_presets_hold_out_what_they_should_and_the_paper_s_has_its_counts(experiment, classes, trajectories):
+def test_presets_hold_out_enough_objects_and_that_of_the_paper_has_its_counts(experiment, classes, trajectories):
     default, paper = experiment.DEFAULT.collection, experiment.PAPER.collection
     for one, num, held_out in ((default, 120, 24), (experiment.LONG.collection, 120, 24), (paper, 300, 60)):
         assert one.num_objects >= num
@@ -45,14 +48,14 @@ def test_presets_hold_out_what_they_should_and_the_paper_s_has_its_counts(experi
     assert (schedule.epochs, schedule.batch_size, schedule.beta_warmup) == (200, 64, 50 / 200)
     assert (experiment.PAPER.targets, experiment.PAPER.splits) == ("own", ("trajectory", "object"))
     assert not experiment.PAPER.mask_blank_touch
-    model = training.paper_model(stages.MODELS["paper"]["mvae"], stages.preprocessing_of(experiment.PAPER))
+    model = training.paper_model(config.MODELS["paper"]["mvae"], stages.preprocessing_of(experiment.PAPER))
     assert [m.weight for m in model.modalities] == [1, 1, 1000]
     assert [m.shape for m in model.modalities] == [(64, 64, 3), (64, 64, 3), (7,)]
 
 
-def test_flags_reach_the_experiment(tmp_path, monkeypatch, capsys):
+def test_options_reach_the_experiment(tmp_path, monkeypatch, capsys):
     ran = []
-    monkeypatch.setattr(stages, "main", lambda config, workdir: ran.append((config, workdir)))
+    monkeypatch.setattr(stages, "main", lambda config, workdir, only: ran.append((config, workdir)))
     monkeypatch.setattr(command, "plan", lambda config: f"plan of {config.collection.num_objects} objects")
     monkeypatch.setattr("sys.argv", ["freefall", "--hidden", "off", "--classes", "fork", "bottle", "--parts"])
     command.run(freefall.PRESETS, str(tmp_path), "What it does.")
@@ -73,11 +76,121 @@ def test_flags_reach_the_experiment(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def parsed(monkeypatch, *options: str, presets=freefall.PRESETS) -> command.Args:
+    monkeypatch.setattr("sys.argv", ["experiment", *options])
+    return command.parse(presets, "runs/experiment", None)
+
+
+def test_any_field_of_a_preset_can_be_changed(monkeypatch, capsys):
+    options = (
+        *("--collection.num-objects", "1000", "--state-training.learning-rate", "1e-3", "--image-size", "32"),
+        *("--collection.scenario.height", "0.07", "--collection.scenario.contact.soft", "0.1"),
+        *("--collection.symmetries", "--collection.num-rendered", "None", "--splits", "trajectory", "object"),
+        *("--preset", "smoke"),
+    )
+    found = parsed(monkeypatch, *options)
+    smoke = freefall.SMOKE
+    contact = dataclasses.replace(smoke.collection.scenario.contact, soft=0.1)
+    expected = dataclasses.replace(
+        smoke,
+        collection=dataclasses.replace(
+            smoke.collection,
+            num_objects=1000,
+            scenario=dataclasses.replace(smoke.collection.scenario, height=0.07, contact=contact),
+            symmetries=True,
+            num_rendered=None,
+        ),
+        state_training=dataclasses.replace(smoke.state_training, learning_rate=1e-3),
+        image_size=32,
+        splits=("trajectory", "object"),
+    )
+    assert (found.config, found.preset) == (expected, "smoke")
+    assert parsed(monkeypatch).config == freefall.DEFAULT
+    assert capsys.readouterr().err == ""
+
+
+def test_a_scenario_that_is_declared_as_a_protocol_has_the_options_of_its_class(monkeypatch):
+    class Scenario(Protocol):
+        steps: int
+
+    @dataclasses.dataclass(frozen=True)
+    class Collection:
+        scenario: Scenario
+
+    @dataclasses.dataclass(frozen=True)
+    class Throw:
+        steps: int = 1
+        speed: float = 2.0
+
+    monkeypatch.setattr("sys.argv", ["experiment", "--scenario.speed", "3"])
+    with command._concrete():
+        found = tyro.cli(Collection, default=Collection(Throw()), config=(tyro.conf.AvoidSubcommands,))
+    assert found == Collection(Throw(speed=3.0))
+
+
+def test_options_of_a_model_that_is_not_trained_are_noted(monkeypatch, capsys):
+    parsed(monkeypatch, "--training.learning-rate", "1e-3")
+    assert capsys.readouterr().err == "note: --training.* has no effect, because --model statespace is trained\n"
+    parsed(monkeypatch, "--training.learning-rate", "1e-3", "--model", "paper")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("options", [("--preset", "tiny"), ("--only", "draw"), ("--collection.num-object", "x")])
+def test_an_unknown_option_is_refused(options, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        parsed(monkeypatch, *options)
+    assert stopped.value.code == 2
+    assert options[0] in "".join(capsys.readouterr())
+
+
+def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeypatch):
+    ran = []
+    monkeypatch.setattr(stages, "collect", lambda *_: ran.append("collect"))
+    monkeypatch.setattr(stages, "train", lambda *_: ran.append("train"))
+    monkeypatch.setattr(stages, "evaluate", lambda *_: ran.append("evaluate"))
+    monkeypatch.setattr(dataset, "load", lambda folder: None)
+    stages.main(freefall.SMOKE, tmp_path, only="collect")
+    assert ran == ["collect"]
+    with pytest.raises(FileNotFoundError, match="dataset is not a collected dataset: run with --only collect first"):
+        stages.main(freefall.SMOKE, tmp_path, only="train")
+    (tmp_path / "dataset").mkdir()
+    (tmp_path / "dataset" / "collection.json").write_text("{}")
+    stages.main(freefall.SMOKE, tmp_path, only="train")
+    assert ran == ["collect", "train"]
+    with pytest.raises(FileNotFoundError, match="statespace is not a trained model: run with --only train first"):
+        stages.main(freefall.SMOKE, tmp_path, only="evaluate")
+    (tmp_path / "models" / "statespace").mkdir(parents=True)
+    (tmp_path / "models" / "statespace" / "config.json").write_text("{}")
+    stages.main(freefall.SMOKE, tmp_path, only="evaluate")
+    assert ran == ["collect", "train", "evaluate"]
+    stages.main(freefall.SMOKE, tmp_path)
+    assert ran[3:] == ["collect", "train", "evaluate"]
+
+
+def test_a_work_directory_of_another_configuration_names_the_fields_that_differ(tmp_path):
+    stages.claim(freefall.SMOKE, tmp_path)
+    other = dataclasses.replace(
+        freefall.SMOKE,
+        image_size=32,
+        collection=dataclasses.replace(freefall.SMOKE.collection, num_objects=20),
+        state_training=dataclasses.replace(freefall.SMOKE.state_training, steps=9),
+        rerolls=2,
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"config\.json was made with collection\.num_objects = 16, state_training\.steps = 8, image_size = 64, "
+        r"but the current settings have 20, 9, 32 \(rerolls differ too\): choose another folder",
+    ):
+        stages.claim(other, tmp_path)
+
+
 @pytest.mark.parametrize("experiment", [freefall, perturbed])
 @pytest.mark.parametrize("asked", [(), ("box", "bottle")])
-def test_of_a_folder_the_experiment_s_classes_are_taken_or_those_asked_for(experiment, asked, folder, tmp_path, capsys):
-    args = command.Args(tmp_path / "run", objects=folder, classes=asked)
-    one = command.configure(experiment.SMOKE, args).collection
+def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_folder(
+    experiment, asked, folder, tmp_path, capsys
+):
+    args = command.Args(tmp_path / "run", experiment.SMOKE, objects=folder, classes=asked)
+    one = command.configure(args).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("bottle",) * 4 + ("box",) * (3 if asked else 0)
     assert one.num_objects == len(one.meshes.names)
@@ -91,35 +204,35 @@ def test_of_a_folder_the_experiment_s_classes_are_taken_or_those_asked_for(exper
 
     stages.note(listing, ["collect: left out object 0"])  # stays when the folder is read again
     before = listing.stat().st_mtime_ns
-    assert command.configure(experiment.SMOKE, args).collection == one
+    assert command.configure(args).collection == one
     assert listing.stat().st_mtime_ns == before
 
 
-def test_a_folder_of_other_classes_is_taken_whole(folder, tmp_path):
-    small = command.Args(tmp_path / "small", objects=folder, scale=0.5, up="y")
-    meshes = command.configure(freefall.SMOKE, small).collection.meshes
+def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(folder, tmp_path):
+    small = command.Args(tmp_path / "small", freefall.SMOKE, objects=folder, scale=0.5, up="y")
+    meshes = command.configure(small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
     with pytest.raises(ValueError, match="--scale and --up are for the files of a folder"):
-        command.configure(perturbed.SMOKE, command.Args(tmp_path, up="y"))
+        command.configure(command.Args(tmp_path, perturbed.SMOKE, up="y"))
 
     (folder / "bottle").rename(folder / "jar")
-    one = command.configure(perturbed.SMOKE, command.Args(tmp_path / "run", objects=folder)).collection
+    one = command.configure(command.Args(tmp_path / "run", perturbed.SMOKE, objects=folder)).collection
     assert one.meshes is not None
     assert one.meshes.labels == ("box",) * 3 + ("jar",) * 4
 
 
 def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
-    args = command.Args(tmp_path / "run", classes=("bottle", "teapot"))
+    args = command.Args(tmp_path / "run", freefall.SMOKE, classes=("bottle", "teapot"))
     with pytest.raises(ValueError, match=r"unknown classes teapot: choose among .*bottle"):
-        command.configure(freefall.SMOKE, args)
+        command.configure(args)
     with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
-        command.configure(freefall.SMOKE, dataclasses.replace(args, objects=folder))
-    with pytest.raises(ValueError, match="holding some out needs 4 usable objects, got 3"):
-        command.configure(freefall.SMOKE, dataclasses.replace(args, objects=folder, classes=("box",)))
+        command.configure(dataclasses.replace(args, objects=folder))
+    with pytest.raises(ValueError, match="a split needs at least 4 usable objects, got 3: add objects"):
+        command.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
 
 
-def test_what_collecting_left_out_is_listed_once(tmp_path, monkeypatch):
+def test_objects_left_out_by_the_collection_are_listed_once(tmp_path, monkeypatch):
     made = dataset.Collected(0, ("object 1 (bottle): sank", "object 11 (bottle): sank"))
     monkeypatch.setattr(dataset, "collect", lambda *args, **kwargs: made)
     monkeypatch.setattr(dataset, "load", lambda folder: None)
@@ -130,7 +243,7 @@ def test_what_collecting_left_out_is_listed_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("told", ["", None])
-def test_without_xdg_cache_home_things_are_kept_at_home(told, monkeypatch):
+def test_the_cache_is_in_the_home_folder_without_xdg_cache_home(told, monkeypatch):
     monkeypatch.setenv("HOME", "/home/somebody")
     if told is None:
         monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
@@ -151,7 +264,7 @@ def test_an_empty_name_of_a_folder_is_refused(flag, name, tmp_path, monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_the_user_can_mend_is_one_line_and_debug_shows_more(tmp_path, monkeypatch):
+def test_an_error_that_the_user_can_correct_is_one_line_unless_debug_is_set(tmp_path, monkeypatch):
     path = tmp_path / "a.txt"
     path.write_text("")
     monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(path)])
@@ -179,7 +292,7 @@ def locked_twice(folder: Path) -> None:
         locked_twice,
     ],
 )
-def test_what_is_refused_is_one_line(refused, tmp_path):
+def test_a_refusal_is_one_line(refused, tmp_path):
     with pytest.raises(SystemExit, match=r"^error: ") as raised, errors.on_one_line():
         refused(tmp_path)
     assert raised.value.__suppress_context__
@@ -188,11 +301,11 @@ def test_what_is_refused_is_one_line(refused, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "kind"),
     [
-        (lambda: command.configure(freefall.SMOKE, None), AttributeError),
+        (lambda: command.configure(None), AttributeError),
         (lambda: pictures.describe(sts.physics.Freefall(), "cup", {}, {}), KeyError),
     ],
 )
-def test_a_fault_of_the_program_keeps_its_traceback(fault, kind):
+def test_an_error_of_the_program_keeps_its_traceback(fault, kind):
     with pytest.raises(kind), errors.on_one_line():
         fault()
 
@@ -207,15 +320,15 @@ def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "objects.txt").write_text("of the first\n")
     with _files.lock(tmp_path / "run"), pytest.raises(_files.LockedError):
-        command.configure(freefall.SMOKE, command.Args(tmp_path / "run", objects=folder))
+        command.configure(command.Args(tmp_path / "run", freefall.SMOKE, objects=folder))
     assert (tmp_path / "run" / "objects.txt").read_text() == "of the first\n"
 
 
 def test_a_damaged_log_of_a_training_is_named(tmp_path):
     (tmp_path / "metrics.jsonl").write_bytes(b'{"step": 1}\n{"st')
     with pytest.raises(dataset.TornFileError, match=r"metrics\.jsonl is damaged .*delete .* and train again"):
-        stages._read_log(tmp_path)
-    assert stages._read_log(tmp_path / "none") == []
+        judging.read_log(tmp_path)
+    assert judging.read_log(tmp_path / "none") == []
 
 
 @pytest.fixture
@@ -232,7 +345,7 @@ def evaluated(tmp_path: Path) -> Path:
 INPUTS = {"dataset": "d" * 64, "models/mvae": "m" * 64}
 
 
-def test_results_hold_as_long_as_nothing_changes(evaluated):
+def test_results_are_valid_while_nothing_changes(evaluated):
     assert results.stale(evaluated / "metrics.json", INPUTS) is None
     content = json.loads((evaluated / "metrics.json").read_text())
     assert (content["split"], content["inputs"]) == ("object", INPUTS)
@@ -269,13 +382,13 @@ def test_results_that_are_missing_or_changed_are_stale(evaluated, name, content,
     assert results.stale(evaluated / "metrics.json", INPUTS) == reason
 
 
-def test_a_changed_number_is_found(evaluated):
+def test_a_changed_number_makes_results_stale(evaluated):
     path = evaluated / "metrics.json"
     path.write_text(path.read_text().replace('"object"', '"trajectory"'))
     assert results.stale(path, INPUTS) == "metrics.json was changed"
 
 
-def test_the_identity_of_a_model_is_that_of_all_its_files(tmp_path):
+def test_the_identity_of_a_model_depends_on_all_its_files(tmp_path):
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     weights = tmp_path / "checkpoints" / "1" / "weights"
     weights.write_bytes(b"1234")

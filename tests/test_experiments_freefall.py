@@ -1,4 +1,4 @@
-"""The whole line with the paper's models at the smallest size: from drops to a table, resumed, refused and called."""
+"""All stages with the paper's models at the smallest size, resumed and with errors, and the resulting predictors."""
 
 import dataclasses
 import json
@@ -10,8 +10,9 @@ import pytest
 from optics_bodies import public_meshes
 
 import sts_jax as sts
-from experiments import ceilings, freefall, stages
-from sts_jax import dataset, physics
+from experiments import freefall
+from experiments.shared import config, rerolls, stages
+from sts_jax import dataset, evaluation, physics
 
 pytestmark = pytest.mark.slow
 
@@ -35,11 +36,11 @@ def workdir(tmp_path_factory):
     return workdir
 
 
-def test_the_workdir_holds_what_is_promised(workdir):
+def test_the_work_directory_has_the_documented_files(workdir):
     names = {path.relative_to(workdir).as_posix() for path in workdir.rglob("*")}
     assert {"config.json", "dataset", "metrics.json", "table.md", "table-full.md"} <= names
     assert {"ceiling.json", "ceiling.npz"} <= names
-    assert {f"models/{name}/metrics.jsonl" for name in stages.MODELS["paper"]} <= names
+    assert {f"models/{name}/metrics.jsonl" for name in config.MODELS["paper"]} <= names
     assert {f"figures/{name}.png" for name in ("predictions", "predictions-all", "training", "strip")} <= names
     metrics = json.loads((workdir / "metrics.json").read_text())
     predictors = metrics["predictors"]
@@ -72,11 +73,11 @@ def test_the_workdir_holds_what_is_promised(workdir):
     ]
 
 
-def test_the_ceilings_are_scored_once_and_kept(workdir, monkeypatch):
+def test_the_ceilings_are_computed_once(workdir, monkeypatch):
     sensor, data = sts.Sensor(), dataset.load(workdir / "dataset")
-    test = dataset.reduced(data.pairs(stages.rows_of(data, "object")["test"]), 64)
-    monkeypatch.setattr(ceilings, "reroll", lambda *_: pytest.fail("rolled again"))
-    found = ceilings.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
+    test = dataset.reduced(data.pairs(evaluation.rows_of(data, "object")["test"]), 64)
+    monkeypatch.setattr(rerolls, "reroll", lambda *_: pytest.fail("computed again"))
+    found = rerolls.ceilings(workdir, "", TINY.collection, sensor, data, test, times=2, num=256, judge=None)
     metrics = json.loads((workdir / "metrics.json").read_text())["predictors"]["ceiling (mean of re-rolls)"]
     own = found.scores["ceiling (mean of re-rolls)"]
     assert own.position.mean() == pytest.approx(metrics["position"]["value"])
@@ -85,13 +86,13 @@ def test_the_ceilings_are_scored_once_and_kept(workdir, monkeypatch):
     assert found.scores["one re-roll"].log_loss is None
 
 
-def test_started_again_it_touches_nothing(workdir):
+def test_a_second_run_leaves_finished_results_unchanged(workdir):
     stamps = {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
     stages.main(TINY, workdir)
     assert stamps == {path: path.stat().st_mtime_ns for path in workdir.rglob("*") if path.is_file()}
 
 
-def test_results_that_no_longer_hold_are_made_again(workdir, capsys):
+def test_stale_results_are_computed_again(workdir, capsys):
     metrics, table = workdir / "metrics.json", workdir / "table.md"
     before = metrics.read_text(), table.read_text()
     table.write_text("rubbish")
@@ -119,7 +120,7 @@ def test_another_configuration_is_refused(workdir):
         stages.main(other, workdir)
 
 
-def test_what_is_promised_to_callers_runs(workdir):
+def test_the_documented_calls_run(workdir):
     key = jax.random.key(1)
     body = sts.objects.make(jax.random.key(0), "bottle")
     sensor = sts.Sensor()
@@ -134,7 +135,7 @@ def test_what_is_promised_to_callers_runs(workdir):
         predict(tactile=frame.tactile)
 
 
-def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
+def test_a_textured_mesh_falls_and_is_visible_and_leaves_an_imprint():
     meshes = public_meshes()
     body = sts.objects.load(meshes / "potion.obj", longest_side=0.08, up="y", texture=meshes / "potion.png")
     sensor = sts.Sensor()
@@ -154,8 +155,8 @@ def test_a_public_textured_mesh_falls_is_seen_and_leaves_an_imprint():
     assert float(frame.pressure.sum() * area) == pytest.approx(float(traj.wrench[one, -1, 2]), rel=0.01)
 
 
-def test_the_papers_split_is_a_fifth_of_shuffled_trajectories(workdir):
+def test_the_split_of_the_paper_holds_out_a_fifth_of_the_trajectories(workdir):
     data = dataset.load(workdir / "dataset")
-    rows = stages.rows_of(data, "trajectory")
+    rows = evaluation.rows_of(data, "trajectory")
     assert len(rows["test"]) == round(0.2 * 16)
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), np.arange(16))

@@ -11,7 +11,7 @@ from experiments import objects
 pytestmark = pytest.mark.slow
 
 
-def test_contact_sheet(tmp_path):
+def test_the_contact_sheet_shows_the_objects(tmp_path):
     out = tmp_path / "sheet.png"
     objects.main(objects.Config(out=out, num=2, categories=("bottle", "fork"), size=40))
     image = matplotlib.image.imread(out)[..., :3]
@@ -20,18 +20,18 @@ def test_contact_sheet(tmp_path):
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_shuffled_sheet_has_its_answers_beside_it(tmp_path):
+def test_a_shuffled_sheet_comes_with_its_answers(tmp_path):
     out = tmp_path / "sheet.png"
     objects.main(objects.Config(out=out, num=2, categories=("watch", "spoon"), size=20, view="below", shuffle=True))
     lines = (tmp_path / "sheet.txt").read_text().split("\n")
     assert sorted(line.split()[1] for line in lines if line) == ["spoon", "spoon", "watch", "watch"]
 
 
-def test_each_object_s_gaps_are_printed(tmp_path, capsys, monkeypatch):
+def test_the_gaps_of_each_object_are_printed(tmp_path, capsys, monkeypatch):
     def decompose(body):
         return dataclasses.replace(body, hulls=jnp.concatenate([body.hulls, 0.9 * body.hulls]))
 
-    monkeypatch.setattr(sts.objects, "decompose", decompose)  # seconds an object; has its own tests
+    monkeypatch.setattr(sts.objects, "decompose", decompose)  # it takes seconds per object and has its own tests
     config = objects.Config(out=tmp_path / "sheet.png", num=2, categories=("bottle", "fork"), size=20)
     objects.main(config)
     lines = capsys.readouterr().out.splitlines()[1:]
@@ -47,7 +47,7 @@ def test_each_object_s_gaps_are_printed(tmp_path, capsys, monkeypatch):
         assert ("in 2 parts" in line) == apart
 
 
-def test_errors(tmp_path):
+def test_unknown_classes_and_zero_objects_are_refused(tmp_path):
     with pytest.raises(ValueError, match="teapot"):
         objects.main(objects.Config(out=tmp_path / "a.png", categories=("teapot",)))
     with pytest.raises(ValueError, match="num is 0"):

@@ -1,11 +1,12 @@
-"""An output path that cannot be written is found before any work."""
+"""An output path that cannot be written is an error before any work."""
 
 import tempfile
 
 import pytest
 
 import sts_jax as sts
-from experiments import fit, objects, output, sense, show
+from experiments import fit, objects, sense, show
+from experiments.shared import output
 
 
 def forbidden(*_, **__):
@@ -30,7 +31,7 @@ MAINS = {
 
 @pytest.mark.parametrize("name", MAINS)
 @pytest.mark.usefixtures("no_work")
-def test_a_picture_that_cannot_be_written_is_named_before_any_work(name, tmp_path, monkeypatch):
+def test_a_picture_that_cannot_be_written_is_refused_before_any_work(name, tmp_path, monkeypatch):
     for path, kind, message in (
         (tmp_path, IsADirectoryError, "is a folder: give the name of a picture"),
         (tmp_path / "nowhere" / "a.png", FileNotFoundError, r"nowhere does not exist: make it for a\.png"),
@@ -45,7 +46,7 @@ def test_a_picture_that_cannot_be_written_is_named_before_any_work(name, tmp_pat
 
 
 @pytest.mark.usefixtures("no_work")
-def test_a_folder_that_cannot_be_written_is_named_before_any_work(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_written_is_refused_before_any_work(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "inner"):
         with pytest.raises(OSError, match=r"cannot be made \(.*\): give another --out"):

@@ -1,4 +1,4 @@
-"""The jerked pad through the whole line at the smallest size; and what is shown of it."""
+"""All stages of the jerked pad at the smallest size, and the pictures of `show` and of benchmarks."""
 
 import dataclasses
 import json
@@ -10,8 +10,9 @@ from PIL import Image
 
 import sts_jax as sts
 from benchmarks import deterministic, recognise, scaling
-from experiments import perturbed, show, stages
-from sts_jax import dataset, physics
+from experiments import perturbed, show
+from experiments.shared import stages
+from sts_jax import dataset, evaluation, physics
 
 pytestmark = pytest.mark.slow
 
@@ -41,12 +42,12 @@ def workdir(tmp_path_factory):
     return workdir
 
 
-def test_touch_is_there_and_every_subset_is_asked(workdir):
+def test_the_model_predicts_from_every_subset_of_its_inputs(workdir):
     predictors = json.loads((workdir / "metrics.json").read_text())["predictors"]
     given = {name.partition(", ")[2] for name in predictors if name.startswith("state-space model")}
     inputs = ("visual", "tactile", "pose")
     pairs = ("visual and tactile", "visual and pose", "tactile and pose")
-    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs", stages.KNOWN)}
+    assert given == {f"from {names}" for names in (*inputs, *pairs, "all inputs", evaluation.TRUE_STATE)}
     assert predictors["state-space model, from tactile"]["outcome_balanced_accuracy"]["value"] >= 0
     rows = [line for line in (workdir / "table.md").read_text().splitlines() if line.startswith("| ")][1:]
     assert len(rows) == 10
@@ -54,7 +55,7 @@ def test_touch_is_there_and_every_subset_is_asked(workdir):
     assert {path.stem for path in (workdir / "figures").glob("*.png")} == expected
 
 
-def test_views_and_falls_are_trained_on(workdir):
+def test_views_and_falls_are_used_in_training(workdir):
     data = dataset.load(workdir / "dataset")
     samples = json.loads((workdir / "models/statespace/config.json").read_text())["data"]["samples"]
     assert samples == 8 * len(data.members("train")) == 4 * len(data.members("train", rendered=False))
@@ -63,17 +64,17 @@ def test_views_and_falls_are_trained_on(workdir):
     assert all(np.isfinite(value) for value in record.values())
 
 
-def test_distributions_are_judged_where_samples_are_drawn(workdir):
+def test_sampled_predictions_have_the_metrics_of_distributions(workdir):
     predictors = json.loads((workdir / "metrics.json").read_text())["predictors"]
     own = predictors["state-space model, from visual and tactile"]
-    assert predictors[f"state-space model, from {stages.KNOWN}"]["outcome_log_loss"]["value"] > 0
+    assert predictors[f"state-space model, from {evaluation.TRUE_STATE}"]["outcome_log_loss"]["value"] > 0
     assert own["outcome_log_loss"]["value"] > 0
     assert 0 <= own["coverage"]["value"] <= 1
     assert own["visual_skill_best"] is not None
     assert "Touch removes " in (workdir / "table.md").read_text()
 
 
-def test_pairs_have_the_condition_turned_like_the_pose(workdir):
+def test_the_condition_is_turned_with_the_pose(workdir):
     data = dataset.load(workdir / "dataset")
     rows = data.rendered()[[1, 0]]
     pairs = data.pairs(rows, symmetries=True)
@@ -89,7 +90,7 @@ def test_pairs_have_the_condition_turned_like_the_pose(workdir):
     assert len(np.unique(np.round(np.angle(along[:8]), 3))) == 8
 
 
-def test_a_model_answers_a_jerk_in_si_units(workdir):
+def test_a_model_takes_a_jerk_in_si_units(workdir):
     data = dataset.load(workdir / "dataset")
     pairs = data.pairs(np.array([0]))
     predictor = sts.Predictor.load(workdir / "models/statespace")
@@ -102,7 +103,7 @@ def test_a_model_answers_a_jerk_in_si_units(workdir):
 
 
 @pytest.mark.parametrize(("name", "scenario"), [("perturbed", physics.Perturbed), ("inclined", physics.Inclined)])
-def test_what_is_shown_is_a_strip_and_an_animation(name, scenario, tmp_path, monkeypatch):
+def test_show_writes_a_strip_and_an_animation(name, scenario, tmp_path, monkeypatch):
     monkeypatch.setitem(show.SCENARIOS, name, dataclasses.replace(show.SCENARIOS[name], scenario=scenario(frames=4)))
     show.main(show.Config(name, num=1, out=tmp_path, size=32))
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{name}-0.gif", f"{name}-0.png"]
@@ -115,7 +116,8 @@ def test_what_is_shown_is_a_strip_and_an_animation(name, scenario, tmp_path, mon
     def red(page):
         return int(((page[..., 0] > 200) & (page[..., 1:].max(-1) < 60)).sum())
 
-    assert red(later) > 50 + (red(first) if name == "perturbed" else 0)  # the jerk is on; the slope is always there
+    # Gravity has a component along a slope in every frame, and along a jerked pad during the jerk.
+    assert red(later) > 50 + (red(first) if name == "perturbed" else 0)
 
 
 def test_an_unknown_scenario_cannot_be_shown(tmp_path):
@@ -123,7 +125,7 @@ def test_an_unknown_scenario_cannot_be_shown(tmp_path):
         show.main(show.Config("sideways", out=tmp_path))
 
 
-def test_pictures_to_be_recognised_come_with_their_answers(workdir, tmp_path, monkeypatch):
+def test_pictures_for_recognition_come_with_their_answers(workdir, tmp_path, monkeypatch):
     monkeypatch.setattr(recognise, "NUMBER", 2)
     found = [recognise.main(recognise.Args(workdir, tmp_path / f"{seed}.png", seed=seed)) for seed in range(6)]
     assert {text.splitlines()[1] for text in found} == {"answers: A1 B2", "answers: A2 B1"}
@@ -140,7 +142,7 @@ def tiny_preset(monkeypatch):
 
 
 @pytest.mark.usefixtures("tiny_preset")
-def test_a_scaling_curve_is_made_of_models_that_are_kept(workdir, tmp_path):
+def test_a_scaling_curve_reuses_trained_models(workdir, tmp_path):
     args = scaling.Args(workdir, "perturbed", "smoke", shares=(0.5,), steps=(4,), seeds=(0, 1), out=tmp_path / "a.png")
     text = scaling.main(args)
     rows = [line for line in text.splitlines() if line.startswith(("| visual", "| visual and pose"))]

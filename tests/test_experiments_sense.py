@@ -70,7 +70,7 @@ def test_a_file_is_pressed_by_its_weight(box, tmp_path, capsys):
     assert float(sense.look(harder, sensor, body)[0].pressure.sum()) * 1e-6 == pytest.approx(3.0, rel=0.005)
 
 
-def test_where_it_lies_is_where_it_was_told(box):
+def test_the_object_lies_at_the_configured_place(box):
     config = sense.Config(str(box), mass=0.1, position=(0.02, -0.01), turn=90.0)
     body = sense.read(config, str(box))
 
@@ -97,7 +97,7 @@ def test_where_it_lies_is_where_it_was_told(box):
     assert np.ptp(corners(dataclasses.replace(config, tilt=(10.0, 0.0), turn=0.0))[0][:, 2]) == pytest.approx(height)
 
 
-def test_a_round_thing_lies_as_its_file_has_it(tmp_path):
+def test_a_round_object_keeps_the_orientation_of_its_file(tmp_path):
     path = tmp_path / "ball.stl"
     trimesh.creation.icosphere(subdivisions=3, radius=0.02).export(path)
     config = sense.Config(str(path))
@@ -106,7 +106,7 @@ def test_a_round_thing_lies_as_its_file_has_it(tmp_path):
     assert "that it can rest on" in words
 
 
-def test_sheet_of_all_classes(tmp_path, monkeypatch, capsys):
+def test_a_sheet_shows_all_classes(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sts.objects, "CATEGORIES", ("fork", "watch"))
     out = tmp_path / "classes.png"
     sense.main(sense.Config("classes", out=out, resolution=TINY))
@@ -151,7 +151,7 @@ def test_a_sensor_of_a_file_is_used(box, tmp_path):
         ({"sensor": "none.json"}, r"none\.json"),
     ],
 )
-def test_what_cannot_be_shown_is_named(box, tmp_path, monkeypatch, changes, message):
+def test_an_invalid_option_is_refused_before_a_picture_is_written(box, tmp_path, monkeypatch, changes, message):
     monkeypatch.chdir(tmp_path)
     changes = {"mesh": str(box), "out": tmp_path / "a.png", "resolution": TINY} | changes
     config = sense.Config(**{**changes, "out": sense.Path(changes["out"])})
@@ -160,7 +160,7 @@ def test_what_cannot_be_shown_is_named(box, tmp_path, monkeypatch, changes, mess
     assert not (tmp_path / "a.png").exists()
 
 
-def test_meshes_that_are_broken_or_too_many_faces(tmp_path):
+def test_broken_meshes_are_refused_and_large_ones_are_decimated(tmp_path):
     bad = trimesh.creation.box((0.04, 0.03, 0.02))
     bad.vertices[3] = np.nan
     (tmp_path / "nan.obj").write_text(trimesh.exchange.obj.export_obj(bad))

@@ -1,4 +1,4 @@
-"""A model of a work directory becomes one of the library. An earlier one stays where the new one is refused."""
+"""A model of a work directory becomes a model of the library and replaces an earlier one, unless it is refused."""
 
 import re
 import shutil
@@ -57,7 +57,7 @@ def test_a_shipped_model_is_loaded_by_its_name_and_replaced_by_the_next(models, 
 
 
 @pytest.mark.parametrize("fault", ["size", "damage", "absence"])
-def test_an_earlier_model_stays_where_the_new_one_is_refused(models, workdir, monkeypatch, fault):
+def test_an_earlier_model_stays_if_the_new_one_is_refused(models, workdir, monkeypatch, fault):
     (models / "falls").mkdir(parents=True)
     (models / "falls" / "config.json").write_text("earlier")
     model = workdir / "models/statespace"
@@ -77,7 +77,7 @@ def test_an_earlier_model_stays_where_the_new_one_is_refused(models, workdir, mo
 
 
 @pytest.mark.parametrize("name", ["", "..", "runs/falls", "free fall"])
-def test_a_name_that_is_no_word_is_refused(models, workdir, name):
+def test_a_name_with_other_characters_is_refused(models, workdir, name):
     with pytest.raises(ValueError, match="it takes only letters, digits and underscores"):
         ship.ship(workdir, name)
 

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from sts_jax import dataset, physics
 from sts_jax.evaluation import metrics
-from sts_jax.evaluation.report import Predicted, shares
+from sts_jax.evaluation.outcomes import shares
+from sts_jax.evaluation.predictions import Predicted
 from sts_jax.physics.scenario import Shape, Start
 from sts_jax.physics.simulation import ATTEMPTS
 from sts_jax.sensor import Sensor

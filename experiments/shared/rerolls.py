@@ -8,17 +8,18 @@ import jax
 import numpy as np
 
 import sts_jax as sts
-from experiments import results
-from experiments.progress import Bar, say
+from experiments.shared import results
+from experiments.shared.progress import Bar, say
 from sts_jax import _files, dataset, evaluation
 from sts_jax.dataset.records import read_arrays
 
+Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
 SEED = 20  # of the re-rolls
 FORMAT = 2  # of the files (2: outcomes are decided by the ratio of probability to frequency)
 
 
 class Ceilings(NamedTuple):
-    """What re-rolls of the first held-out starts show."""
+    """Re-rolls of the first held-out starts, and their scores."""
 
     scores: dict[str, evaluation.Scores]  # of their mean, and of a single re-roll
     pose: np.ndarray  # (times, n, 7), last poses
@@ -35,7 +36,7 @@ def ceilings(
     *,
     times: int,
     num: int,
-    judge: Callable[..., evaluation.Scores],
+    judge: Judge,
 ) -> Ceilings:
     """The ceilings of the first `num` held-out items: read, or computed and written to `ceiling{suffix}.npz`.
 
@@ -43,15 +44,14 @@ def ceilings(
 
     Args:
         workdir: The work directory.
-        suffix: Of the files' names, for a second split.
-        collection: Of the experiment.
-        sensor: What sees the ends.
+        suffix: Suffix of the names of the files, for a second split.
+        collection: The collection of the experiment.
+        sensor: The sensor that renders the ends.
         data: The dataset of the items.
         test: The held-out items.
-        times: Re-rolls of each.
-        num: How many of the items.
-        judge: the scores of a prediction for some items: `evaluation.score` with the scenario's outcomes and their
-            frequencies, see `stages.judge_of`.
+        times: Number of re-rolls per item.
+        num: Number of items.
+        judge: Scores the prediction of some items, see `evaluation.scorer`.
     """
     few = dataset.Pairs(*(leaf[:num] for leaf in test))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
@@ -77,10 +77,10 @@ def reroll(
     sensor: sts.Sensor,
     test: dataset.Pairs,
     times: int,
-    judge: Callable[..., evaluation.Scores],
+    judge: Judge,
     progress: Callable[[int], object] | None = None,
 ) -> Ceilings:
-    """The ceilings of some items: their mean and a single one, scored."""
+    """Re-roll some items, and score the mean of the re-rolls and a single one."""
     mean = evaluation.ceiling(collection, sensor, test, times, jax.random.key(SEED), progress=progress)
     samples = mean.samples
     if samples is None or samples.pose is None or samples.outcome is None:
@@ -94,17 +94,19 @@ def reroll(
 
 
 def _flat(made: Ceilings) -> dict[str, np.ndarray]:
+    """All arrays by a path such as `one re-roll/visual/bce`."""
     arrays = {"pose": made.pose, "outcome": made.outcome}
     for name, scores in made.scores.items():
         for field, value in scores._asdict().items():
             if isinstance(value, evaluation.metrics.ImageError):
                 arrays |= {f"{name}/{field}/{part}": leaf for part, leaf in value._asdict().items()}
-            elif value is not None:
+            elif isinstance(value, np.ndarray):
                 arrays[f"{name}/{field}"] = value
     return arrays
 
 
 def _restored(arrays: dict[str, np.ndarray]) -> Ceilings:
+    """The inverse of `_flat`."""
     scores = {}
     for name in evaluation.CEILINGS:
         own = {key.removeprefix(f"{name}/"): leaf for key, leaf in arrays.items() if key.startswith(f"{name}/")}

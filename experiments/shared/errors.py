@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 from sts_jax.dataset import LockedError
 
-# The types of errors that the library raises on purpose.
-MENDABLE = (
+# The types of errors that the library raises for input that the user can correct
+CORRECTABLE = (
     OSError,
     ValueError,
     ImportError,
@@ -20,14 +20,14 @@ def on_one_line(*, debug: bool = False) -> Iterator[None]:
     """Show an error that the user can correct as `error: ...` without a traceback, and exit with code 1.
 
     Args:
-        debug: keep every traceback.
+        debug: Keep every traceback.
 
     Raises:
-        SystemExit: an error of one of the types in MENDABLE occurred.
+        SystemExit: An error of one of the types in CORRECTABLE occurred.
     """
     try:
         yield
-    except MENDABLE as error:
+    except CORRECTABLE as error:
         if debug:
             raise
         raise SystemExit(f"error: {error}") from None

@@ -22,7 +22,7 @@ class Bar:
             self._bar.close()
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show that `done` of `total` are done."""
+        """Show the progress of a stage."""
         if sys.stderr.isatty():
             if stage != self._stage or self._bar is None:
                 if self._bar is not None:

@@ -1,4 +1,4 @@
-"""Baselines: what the nearest neighbour takes into account."""
+"""Baselines, and the errors of predictions, compared with values written out by hand."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ SIDE = 4
 
 
 def pairs(grey, condition):
-    """One pair a grey value of the first image; the outcome counts them."""
+    """One pair per grey value of the first image. The outcomes count the pairs."""
     grey = np.asarray(grey, np.uint8)
     num = len(grey)
     images = np.broadcast_to(grey[:, None, None, None, None], (num, 2, SIDE, SIDE, 3))
@@ -45,13 +45,13 @@ def test_without_a_condition_the_nearest_image_decides():
 def test_image_and_condition_count_alike_whatever_their_units(unit):
     corners = np.array([[0.0, 0, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1]]) * [1, 1, unit]
     train = pairs([0, 200, 0, 200], corners)
-    # The image says item 1 or 3, clearly; the condition decides between the two.
+    # The image selects items 1 and 3, and the condition decides between them.
     assert nearest(train, pairs([190, 190], [[0.1, 0.1, unit], [0.9, 0.9, unit]]), physics.Perturbed()) == [1, 3]
-    # The image is undecided: the condition alone decides.
+    # The distance of the image is the same for all items, and the condition decides.
     assert nearest(train, pairs([100] * 4, corners), physics.Perturbed()) == [0, 1, 2, 3]
 
 
-def test_the_rule_keeps_the_start_at_the_median_height_of_what_stays():
+def test_the_rule_keeps_the_start_at_the_median_height_of_objects_that_stay():
     train, test = (pairs([0] * size, np.zeros((size, 0))) for size in (4, 2))
     train = train._replace(outcome=np.array([0, 1, 0, 0], np.int32))  # 1: fell off
     train.pose[:, 1, 2] = [0.01, -0.5, 0.05, 0.02]
@@ -74,7 +74,7 @@ def test_the_constants_probabilities_are_the_outcomes_shares():
 
 def test_shares_count_the_samples_and_one_more_spread_over_all_outcomes():
     outcomes = physics.Perturbed.outcomes
-    drawn = np.array([[4, 1], [4, 2], [2, 1]])  # topples, topples, stands; fell off, stands, fell off
+    drawn = np.array([[4, 1], [4, 2], [2, 1]])  # columns: topples, topples, stands, and fell off, stands, fell off
     shares = evaluation.shares(drawn, outcomes)
     assert [outcome.name for outcome in outcomes] == ["TOPPLES", "SLIDES", "STANDS", "FELL_OFF"]
     np.testing.assert_allclose(shares * 4, [[2.25, 0.25, 1.25, 0.25], [0.25, 0.25, 1.25, 2.25]])

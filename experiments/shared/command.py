@@ -1,16 +1,18 @@
 """The command line of an experiment."""
 
+import argparse
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 import sts_jax as sts
-from experiments import errors, stages
-from experiments.plan import plan
-from experiments.progress import say
+from experiments.shared import errors, stages
+from experiments.shared.config import Config, check
+from experiments.shared.duration import plan
+from experiments.shared.progress import say
 from sts_jax import _files, dataset
 from sts_jax.compilation import cache_folder
 
@@ -40,10 +42,11 @@ Folder = Annotated[
 class Args:
     """Options of the command line of an experiment."""
 
-    workdir: Folder
-    preset: Literal["smoke", "default", "long", "paper"] = "default"
-    # the state-space model or the paper's models (the preset "paper" has only the latter)
-    model: Literal["statespace", "paper"] | None = None
+    workdir: Folder  # for results
+    # the configuration of the preset, every field of which can be changed
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    preset: Literal["smoke", "default", "long", "paper"] = "default"  # the configuration that other options change
+    only: stages.Stage | None = None  # run this stage only
     plan: bool = False  # print the expected seconds of each stage, from a short measurement, and stop
     hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
     objects: Folder | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
@@ -56,41 +59,72 @@ class Args:
     debug: bool = False  # show the traceback of every error
 
 
-def run(presets: Mapping[str, stages.Config], workdir: str, description: str | None) -> None:
+def run(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
     """Run an experiment from the command line."""
-    args = tyro.cli(Args, default=Args(Path(workdir)), description=description)
+    args = parse(presets, workdir, description)
     with errors.on_one_line(debug=args.debug):
         sts.enable_compilation_cache()
-        config = configure(presets[args.preset], args)
+        config = configure(args)
         if args.plan:
             print(plan(config))
         else:
-            stages.main(config, args.workdir)
+            stages.main(config, args.workdir, only=args.only)
 
 
-def configure(config: stages.Config, args: Args) -> stages.Config:
-    """Apply the options to a preset. The objects of a folder are read, and listed in the work directory.
+def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
+    """Read the options. A field of the configuration that is not given keeps the value of the preset."""
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?")
+    name = first.parse_known_args()[0].preset
+    preset = presets.get(name, presets["default"])  # tyro reports an unknown name
+    default = Args(Path(workdir), preset)
+    with _concrete():
+        args = tyro.cli(Args, default=default, description=description, config=(tyro.conf.AvoidSubcommands,))
+    for model, field in (("paper", "training"), ("statespace", "state_training")):
+        if args.config.model != model and getattr(args.config, field) != getattr(preset, field):
+            option = f"--{field.replace('_', '-')}"
+            say(f"note: {option}.* has no effect, because --model {args.config.model} is trained")
+    return args
+
+
+def _concrete() -> tyro.constructors.ConstructorRegistry:
+    """A rule of tyro: a field whose type is a Protocol has the options of the dataclass that is its default."""
+    registry = tyro.constructors.ConstructorRegistry()
+
+    @registry.struct_rule
+    def rule(info: tyro.constructors.StructTypeInfo) -> Any:
+        kind = type(info.default)
+        if not (getattr(info.type, "_is_protocol", False) and dataclasses.is_dataclass(kind)):
+            return None
+        concrete = tyro.constructors.StructTypeInfo.make(kind, info.default, in_union_context=False)
+        return tyro.constructors.ConstructorRegistry.get_struct_spec(concrete)
+
+    return registry
+
+
+def configure(args: Args) -> Config:
+    """Apply the options to the configuration. The objects of a folder are read, and listed in the work directory.
 
     Raises:
         FileNotFoundError: The folder of objects does not exist.
-        ValueError: A class is unknown, two options do not fit together, or the folder has too few usable objects.
+        ValueError: A class is unknown, a field of the configuration is out of range, two options contradict each other,
+            or the folder has too few usable objects.
     """
-    scenario = sts.physics.variant(config.collection.scenario, args.hidden)
-    collection = dataclasses.replace(config.collection, scenario=scenario, parts=args.parts)
+    check(args.config)
+    collection = args.config.collection
+    scenario = sts.physics.variant(collection.scenario, args.hidden)
+    collection = dataclasses.replace(collection, scenario=scenario, parts=args.parts or collection.parts)
     if args.objects is None and (args.scale is not None or args.up is not None):
         raise ValueError("--scale and --up are for the files of a folder: give it with --objects")
     if args.objects is not None:
         collection = with_meshes(collection, args.objects, args.workdir, args.classes, scale=args.scale, up=args.up)
     elif args.classes:
-        unknown = sorted(set(args.classes) - set(sts.objects.CATEGORIES))
+        collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
+    if collection.meshes is None:
+        unknown = sorted(set(collection.categories) - set(sts.objects.CATEGORIES))
         if unknown:
             raise ValueError(f"unknown classes {', '.join(unknown)}: choose among {', '.join(sts.objects.CATEGORIES)}")
-        collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
-    if args.model is not None:
-        if config.model == "paper" and args.model != "paper":
-            raise ValueError("--preset paper trains the paper's models: leave --model out, or choose another preset")
-        config = dataclasses.replace(config, model=args.model)
-    return dataclasses.replace(config, collection=collection)
+    return dataclasses.replace(args.config, collection=collection)
 
 
 def with_meshes(
@@ -110,7 +144,8 @@ def with_meshes(
         workdir: Folder for the listing.
         classes: The classes to use. Empty means the classes of the collection that the folder has, or all classes of
             the folder if it has none of them.
-        scale, up: See `objects.library`.
+        scale: See `objects.library`.
+        up: See `objects.library`.
     """
     there = dataset.mesh_classes(folder)
     taken = classes or tuple(name for name in there if name in collection.categories) or there
@@ -135,7 +170,9 @@ def with_meshes(
     say(f"classes taken: {', '.join(taken)}" + (f"; left out: {', '.join(others)}" if others else ""))
     say(f"{len(meshes.names)} objects can be used. {path} lists them and the objects left out")
     if len(meshes.names) < LEAST_OBJECTS:
-        raise ValueError(f"{folder}: holding some out needs {LEAST_OBJECTS} usable objects, got {len(meshes.names)}")
+        raise ValueError(
+            f"{folder}: a split needs at least {LEAST_OBJECTS} usable objects, got {len(meshes.names)}: add objects"
+        )
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))
         for count in (collection.num_per_object, collection.rendered_per_object)

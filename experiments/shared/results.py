@@ -1,4 +1,4 @@
-"""Checksums of the inputs of results: while they hold, the results are up to date."""
+"""Checksums of the inputs and outputs of results, which show whether the results are up to date."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from sts_jax import _files
 
 
 def identity(folder: Path) -> str:
-    """SHA-256 over the names and contents of all files of a model's folder, hidden ones left out."""
+    """SHA-256 of the names and contents of all files in a model's folder, without hidden files."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     return _files.digest({path.relative_to(folder).as_posix(): _files.sha256(path) for path in files})
 
@@ -19,8 +19,8 @@ def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], out
     Args:
         path: The JSON file. It is written last and marks the results as complete.
         content: The results.
-        inputs: A checksum for each input, by a name that a user understands.
-        outputs: The other files, all below the folder of `path`.
+        inputs: The checksum of each input, by a name for messages.
+        outputs: The other files, in the folder of `path` or below it.
     """
     record = {
         **content,
@@ -31,7 +31,7 @@ def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], out
 
 
 def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
-    """Why results must be made again, or None if they need not.
+    """The reason why results must be computed again, or None if they are up to date.
 
     Args:
         path: The file that `write` wrote.

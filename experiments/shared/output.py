@@ -10,8 +10,8 @@ def check_picture(path: Path) -> None:
     """Raise an error unless a picture can be written.
 
     Raises:
-        OSError: its folder does not exist or is not writable, or the path is a folder.
-        ValueError: the suffix is not that of a known format.
+        OSError: Its folder does not exist or is not writable, or the path is a folder.
+        ValueError: The suffix is not that of a known format.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give the name of a picture, such as {path / 'picture.png'}")
@@ -31,7 +31,7 @@ def make_folder(path: Path) -> None:
     """Make a folder if it does not exist, and check that it can be written to.
 
     Raises:
-        OSError: the folder cannot be made or written to.
+        OSError: The folder cannot be made or written to.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,77 @@
+"""The figures of an evaluation."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+import sts_jax as sts
+from experiments.shared.config import TITLES, Config, main_model
+from experiments.shared.rerolls import Ceilings
+from sts_jax import dataset, evaluation
+
+JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # whose outcome probabilities are drawn
+
+
+def draw(
+    config: Config,
+    workdir: Path,
+    figures: Path,
+    sensor: sts.Sensor,
+    test: dataset.Pairs,
+    scores: Mapping[str, evaluation.Scores],
+    shown: Mapping[str, evaluation.Predicted],
+    possible: Ceilings,
+) -> list[Path]:
+    """Draw the predictions of two queries, and the calibration and some ends of predicted distributions.
+
+    Args:
+        config: The experiment.
+        workdir: Its work directory, for titles.
+        figures: The folder for the figures.
+        sensor: The sensor of the collection.
+        test: The held-out moments.
+        scores: Scores by title.
+        shown: The first predictions of each query, by title.
+        possible: The re-rolls of the first held-out starts.
+
+    Returns:
+        The files.
+    """
+    drawn, model, scenario = [], TITLES[main_model(config)], config.collection.scenario
+    for given, name in (("visual", "predictions"), ("all inputs", "predictions-all")):
+        found = shown.get(f"{model}, from {given}")
+        if found is None:
+            continue
+        title = f"{workdir.name}, from {given}: the first {config.num_shown} of the held-out list"
+        drawn.append(figures / f"{name}.png")
+        evaluation.figures.predictions(drawn[-1], test, found, num=config.num_shown, title=title, scenario=scenario)
+        if found.samples is not None and found.samples.pose is not None:
+            drawn.append(figures / f"{name.replace('predictions', 'ends')}.png")
+            head = f"{workdir.name}, from {given}"
+            _ends(drawn[-1], head, sensor, test, found.samples.pose, possible.pose[:, : config.num_shown])
+    judged = {f"from {given}": scores.get(f"{model}, from {given}") for given in JUDGED_SUBSETS}
+    known = {given: own for given, own in judged.items() if own is not None and own.confidence is not None}
+    if known:
+        drawn.append(figures / "calibration.png")
+        title = f"{workdir.name}: outcome probabilities of {model}"
+        evaluation.figures.calibration(drawn[-1], known, title=title)
+    return drawn
+
+
+def _ends(
+    path: Path, head: str, sensor: sts.Sensor, test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
+) -> None:
+    """Draw the ends of the start whose re-rolls spread most widely."""
+    spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
+    item = int(spread.argmax())
+    evaluation.figures.ends(
+        path,
+        (float(sensor.gel.size[0]), float(sensor.gel.size[1])),
+        test.pose[item, 0],
+        test.pose[item, 1],
+        rerolled[:, item],
+        sampled[:, item],
+        title=f"{head}: ends of #{test.trajectory[item]}, the start with the widest spread among the first "
+        f"{len(spread)}",
+    )

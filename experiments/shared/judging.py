@@ -1,0 +1,175 @@
+"""The evaluation of an experiment: every model with every subset of its inputs, as tables and figures."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import sts_jax as sts
+from experiments.shared import drawing, pictures, results
+from experiments.shared.config import MODELS, TITLES, Config, main_model, model_folder, schedule
+from experiments.shared.progress import Bar, say
+from experiments.shared.rerolls import ceilings
+from sts_jax import _files, dataset, evaluation, training
+
+# The main table shows the main model from the first five of these inputs that it can be given.
+MAIN_SUBSETS = (
+    *("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose"),
+    evaluation.TRUE_STATE,
+)
+
+
+class Moments(NamedTuple):
+    """The moments of a split. The models' inputs have the resolution of the collection, or are as small as the rest."""
+
+    train: dataset.Pairs
+    validation: dataset.Pairs  # as inputs
+    given: dataset.Pairs  # held out, as inputs
+    test: dataset.Pairs  # the same with images of `image_size`
+
+
+def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
+    """Score every model on held-out trajectories and return the main table.
+
+    Writes `metrics.json`, `table.md`, `table-full.md` and `figures/`. `metrics.json` records the checksums of
+    everything that was evaluated and written. Nothing is done again while they hold.
+    """
+    suffix = "" if split == config.splits[0] else f"-by-{split}"
+    done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
+    table, complete = workdir / f"table{suffix}.md", workdir / f"table-full{suffix}.md"
+    inputs = _inputs(config, data, workdir, split)
+    reason = results.stale(done, inputs)
+    if reason is None:
+        return table.read_text()
+    if done.exists() or table.exists():
+        say(f"evaluate: again, because {reason}")
+    moments, scenario = _moments(config, data, split), config.collection.scenario
+    judge = evaluation.scorer(scenario, moments.train)
+    test, times, num = moments.test, config.rerolls, config.num_rerolled
+    possible = ceilings(workdir, suffix, config.collection, sensor, data, test, times=times, num=num, judge=judge)
+    references = evaluation.baselines(scenario, moments.train, test)
+    scores = {**possible.scores, **{title: judge(row, test) for title, row in references.items()}}
+    with Bar() as bar:
+        own, shown = _scored(config, workdir, split, moments, judge, bar)
+        scores |= own
+        summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
+        bar("evaluate", len(own), len(own), "intervals done")
+
+    logs = {TITLES[name]: read_log(model_folder(workdir, name, config, split)) for name in MODELS[config.model]}
+    drawn = drawing.draw(config, workdir, figures, sensor, test, scores, shown, possible)
+    drawn.append(figures / "training.png")
+    evaluation.figures.training_curves(drawn[-1], logs)
+    if split == config.splits[0] and len(data.full_trajectories()):
+        drawn.append(figures / "strip.png")
+        pictures.draw_strip(drawn[-1], config.collection, sensor, data)
+
+    title, notes = (
+        f"{workdir.name}: the last moment predicted from the first, held out by {split}",
+        _notes(config, logs),
+    )
+    notes += _gains(TITLES[main_model(config)], scores, test)
+    text = evaluation.table(summary, title=title, rows=main_rows(TITLES[main_model(config)], list(shown)), notes=notes)
+    _files.write_bytes(table, text.encode())
+    _files.write_bytes(complete, evaluation.full_table(summary, title=title, notes=notes).encode())
+    results.write(done, {"split": split, **summary}, inputs, [table, complete, *drawn])
+    return text
+
+
+def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str) -> dict[str, str]:
+    """The checksums of everything that is evaluated."""
+    inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
+    for folder in (model_folder(workdir, name, config, split) for name in MODELS[config.model]):
+        inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
+    return inputs
+
+
+def _moments(config: Config, data: dataset.Dataset, split: str) -> Moments:
+    rows = evaluation.rows_of(data, split)
+    train = dataset.reduced(data.pairs(rows["train"], symmetries=True), config.image_size)
+    validation, given = data.pairs(rows["validation"]), data.pairs(rows["test"])
+    test = dataset.reduced(given, config.image_size)
+    if config.model == "paper":
+        validation, given = dataset.reduced(validation, config.image_size), test
+    return Moments(train, validation, given, test)
+
+
+def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
+    """Every model with every subset of the inputs that it can be given, as title, model and subset."""
+    for name in MODELS[config.model]:
+        predictor = sts.Predictor.load(model_folder(workdir, name, config, split))
+        subsets = evaluation.subsets(predictor.modalities, state=config.model == "statespace")
+        for given, subset in subsets.items():
+            yield f"{TITLES[name]}, {given}", predictor, subset
+
+
+def _scored(
+    config: Config,
+    workdir: Path,
+    split: str,
+    moments: Moments,
+    judge: Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores],
+    bar: Bar,
+) -> tuple[dict[str, evaluation.Scores], dict[str, evaluation.Predicted]]:
+    """The scores of each query, and its first predictions for the figures."""
+    blank = training.load_blank(model_folder(workdir, main_model(config), config, split))[0] / 255
+    num_samples = config.num_samples if config.model == "statespace" else 0
+    scores, shown = {}, {}
+    jobs = list(queries(config, workdir, split))
+    for number, (title, predictor, subset) in enumerate(jobs):
+        bar("evaluate", number, len(jobs), title)
+        row = evaluation.predict(
+            predictor,
+            subset,
+            moments.given,
+            config.collection.scenario,
+            validation=moments.validation,
+            blank=blank,
+            num_samples=num_samples,
+        )
+        scores[title] = judge(row, moments.test)
+        shown[title] = evaluation.first(row, config.num_shown)
+    return scores, shown
+
+
+def main_rows(model: str, titles: Sequence[str]) -> list[str]:
+    """The rows of the main table, ten at most: the ceiling, the baselines, and the main model from five subsets.
+
+    Args:
+        model: Title of the main model.
+        titles: Of the models' rows, in the order of `queries`.
+    """
+    wanted = [f"{model}, from {given}" for given in MAIN_SUBSETS]
+    return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in wanted if title in titles][:5]]
+
+
+def _notes(config: Config, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> list[str]:
+    steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
+    return [
+        f"Gradient steps: {steps}, batch {schedule(config).batch_size}.",
+        f"Ceiling: {config.rerolls} re-rolls of the hidden values of each start. Touch can reveal a part of these "
+        "values, and a model from touch can exceed it.",
+    ]
+
+
+def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
+    """A line on the share of the outcome's log loss from vision that touch removes, if both were predicted."""
+    before, after = (f"{model}, from {given}" for given in ("visual", "visual and tactile"))
+    if before not in scores or after not in scores:
+        return []
+    found = evaluation.gain(scores[before], scores[after], test)
+    if found is None:
+        return []
+    value, low, high = (found[key] for key in ("value", "low", "high"))
+    return [f"Touch removes {value:.3f} [{low:.3f}, {high:.3f}] of the outcome's log loss from vision."]
+
+
+def read_log(folder: Path) -> list[dict[str, float]]:
+    """The training log of a model, empty if it has none."""
+    path = folder / "metrics.jsonl"
+    try:
+        return [json.loads(line) for line in path.read_bytes().splitlines()]
+    except FileNotFoundError:
+        return []
+    except ValueError as error:  # invalid UTF-8 or no JSON
+        raise dataset.TornFileError(f"{path} is damaged ({error}): delete {folder} and train again.") from error

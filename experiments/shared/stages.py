@@ -1,0 +1,184 @@
+"""The stages of an experiment: collect, train, evaluate. Each resumes and shows its progress."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+import sts_jax as sts
+from experiments.shared.config import MODELS, Config, check, model_folder
+from experiments.shared.judging import evaluate
+from experiments.shared.progress import Bar, say
+from sts_jax import _files, dataset, evaluation, mvae, statespace, training
+from sts_jax.training import TrainConfig
+
+Stage = Literal["collect", "train", "evaluate"]
+
+
+def main(config: Config, workdir: Path, *, only: Stage | None = None) -> None:
+    """Collect, train, evaluate.
+
+    Args:
+        config: The experiment.
+        workdir: The work directory.
+        only: Run this stage only, on the results of the stages before it.
+
+    Raises:
+        ValueError: A field of the configuration is out of range, or the work directory has another configuration.
+        FileNotFoundError: A stage before `only` has not been run.
+        LockedError: Another process works in the work directory.
+    """
+    check(config)
+    sensor = sts.Sensor()
+    with _files.lock(workdir):
+        claim(config, workdir)
+        data = collect(config, workdir, sensor) if only in (None, "collect") else _collected(workdir)
+        if only == "collect":
+            return
+        for split in config.splits:
+            if only in (None, "train"):
+                train(config, data, workdir, sensor, split)
+            if only in (None, "evaluate"):
+                _check_trained(config, workdir, split)
+                print(evaluate(config, data, workdir, sensor, split))
+
+
+def claim(config: Config, workdir: Path) -> None:
+    """Write `config.json`, or raise an error that names the fields in which an existing one differs."""
+    _files.claim(workdir / "config.json", dataclasses.asdict(config))
+
+
+def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
+    """Make the missing shards of the dataset and open it."""
+    with Bar() as bar:
+        made = dataset.collect(
+            config.collection,
+            sensor,
+            workdir / "dataset",
+            progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total),
+        )
+    left_out = [f"collect: left out {line}" for line in made.left_out]
+    for line in left_out:
+        say(line)
+    note(workdir / "objects.txt", left_out)
+    if made.resampled:
+        say(f"collect: {made.resampled} trajectories went non-finite or sank and were drawn again")
+    return dataset.load(workdir / "dataset")
+
+
+def _collected(workdir: Path) -> dataset.Dataset:
+    """Open the dataset of an earlier run."""
+    if not (workdir / "dataset" / "collection.json").exists():
+        raise FileNotFoundError(f"{workdir / 'dataset'} is not a collected dataset: run with --only collect first")
+    return dataset.load(workdir / "dataset")
+
+
+def _check_trained(config: Config, workdir: Path, split: str) -> None:
+    for name in MODELS[config.model]:
+        folder = model_folder(workdir, name, config, split)
+        if not (folder / "config.json").exists():
+            raise FileNotFoundError(f"{folder} is not a trained model: run with --only train first")
+
+
+def note(path: Path, lines: Sequence[str]) -> None:
+    """Add to a text file those of some lines that it does not have."""
+    there = path.read_text(errors="replace") if path.exists() else ""
+    new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in there)
+    if new:
+        _files.write_bytes(path, (there + new).encode())
+
+
+class Job(NamedTuple):
+    """One training of an experiment."""
+
+    name: str  # of the model
+    schedule: TrainConfig
+    model: mvae.Config | statespace.Config
+    arrays: training.Arrays
+    preprocessing: training.Preprocessing
+    empty: dict[str, np.ndarray]  # images of the untouched sensor, uint8
+
+
+def jobs(
+    config: Config,
+    sensor: sts.Sensor,
+    pairs: dataset.Pairs,
+    views: dataset.Views | None = None,
+    falls: dataset.Ends | None = None,
+) -> Iterator[Job]:
+    """The trainings of an experiment.
+
+    Args:
+        config: The experiment.
+        sensor: That of the collection.
+        pairs: The training trajectories, with images as they were collected.
+        views: Further pictures of the training objects, for the state-space model.
+        falls: Trajectories of the training objects that are used without their images, for the state-space model.
+    """
+    preprocessing, scenario = preprocessing_of(config), config.collection.scenario
+    frame = dataset.empty_frame(sensor, config.collection)
+    empty = {"visual": frame.visual, "tactile": frame.tactile}
+    if config.model == "statespace":
+        state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty)
+        state = dataclasses.replace(state, image_size=config.image_size)
+        arrays = training.state_moments(pairs, state, scenario, own, empty, views=views, falls=falls)
+        del pairs  # as large as the arrays, which hold copies
+        yield Job("statespace", config.state_training, state, arrays, own, empty)
+        return
+    pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
+    for number, (name, modalities) in enumerate(MODELS["paper"].items()):
+        arrays, own = training.moments(pairs, modalities, preprocessing, empty["tactile"])
+        schedule = config.training
+        if config.steps is not None:
+            schedule = dataclasses.replace(schedule, steps=config.steps[number])
+        yield Job(name, schedule, training.paper_model(modalities, own), arrays, own, empty)
+
+
+def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
+    """Train the models of an experiment on one split, each with a progress bar."""
+    rows, more = evaluation.rows_of(data, split)["train"], config.model == "statespace"
+    views = data.views("train") if more else None
+    falls = data.ends(data.members("train", rendered=False)) if more else None
+    # The trajectories have no name here, so that `jobs` can free their memory.
+    for job in jobs(config, sensor, data.pairs(rows, symmetries=True), views, falls):
+        with Bar() as bar:
+
+            def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = job.name) -> None:
+                bar(f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else "")
+
+            run(job, model_folder(workdir, job.name, config, split), config.targets, show)
+
+
+def run(
+    job: Job,
+    folder: Path,
+    targets: Literal["all", "own"],
+    progress: Callable[[int, int, dict[str, float]], None],
+) -> None:
+    """Train one model in a folder, or go on where an earlier call on it stopped."""
+    training.save_blank(folder, job.empty["visual"], job.empty["tactile"])
+    training.train(
+        job.schedule,
+        job.model,
+        job.arrays,
+        workdir=folder,
+        absent=job.preprocessing.absent,
+        targets=targets,
+        preprocessing=dataclasses.asdict(job.preprocessing),
+        progress=progress,
+    )
+
+
+def preprocessing_of(config: Config) -> training.Preprocessing:
+    """How an experiment's measurements are made ready for the networks."""
+    collection = config.collection
+    small = (config.image_size, config.image_size)
+    return training.Preprocessing(
+        collection.resolution if config.model == "statespace" else small,
+        collection.crop,
+        rotation=config.rotation,
+        mask_blank_touch=config.mask_blank_touch,
+        condition_scale=collection.scenario.condition_scale,
+    )

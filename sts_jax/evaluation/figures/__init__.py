@@ -1,0 +1,18 @@
+"""Figures of predictions, training and simulation, each written to one file."""
+
+from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves
+from sts_jax.evaluation.figures.held_out import SAMPLES, calibration, ends, predictions
+from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
+
+__all__ = [
+    "SAMPLES",
+    "SLOWER",
+    "Trained",
+    "animation",
+    "calibration",
+    "ends",
+    "predictions",
+    "scaling",
+    "strip",
+    "training_curves",
+]

@@ -1,0 +1,25 @@
+"""Drawing and saving that all figures share."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from sts_jax._files import write_whole
+
+
+def show(axis: Axes, image: np.ndarray) -> None:
+    """Draw an image in [0, 1] without ticks."""
+    axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
+def save(figure: plt.Figure, path: Path) -> None:
+    """Write a figure as PNG and close it."""
+    figure.set_layout_engine("constrained")
+    try:
+        write_whole(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))
+    finally:
+        plt.close(figure)

@@ -1,0 +1,200 @@
+"""One trajectory over time, as a strip of pictures and as an animation."""
+
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.animation import FuncAnimation
+from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.text import Annotation, Text
+
+from sts_jax._files import write_bytes
+from sts_jax.evaluation.figures import drawing
+
+SLOWER = 2  # factor by which an animation is slower than the motion
+_HEAD, _PANEL = 44, 104  # pixels, height of the lines above the pictures and of one panel of curves below them
+_MARGINS = (50, 12, 22, 10)  # pixels, of the curves in a panel: left, right, top, bottom
+_DPI = 100  # pixels per inch of an animation
+_HOLD = 1500  # ms, how long the last page is shown
+_REACH = 0.035  # s^2/m, length of gravity's arrow per unit of gravity, as a share of the picture
+_VISIBLE = 0.1  # m/s^2, smallest component of gravity along the pad that has an arrow
+
+
+def strip(
+    path: Path,
+    time: np.ndarray,
+    view: np.ndarray,
+    visual: np.ndarray,
+    tactile: np.ndarray,
+    wrench: np.ndarray,
+    *,
+    num: int = 10,
+    title: str = "",
+) -> None:
+    """Draw one trajectory over time: a view from outside, both streams, and the wrench of the pad on the object.
+
+    The force is below the pictures, and its moment about the sensor's origin is below the force.
+
+    Args:
+        path: The PNG to write.
+        time: Time of every frame (s), `(frames,)`.
+        view: The scene from outside, `(frames, h, w, 3)`.
+        visual: `(frames, height, width, 3)` in [0, 1].
+        tactile: `(frames, height, width, 3)` in [0, 1].
+        wrench: `(frames, 6)`, N and N m.
+        num: Number of frames that are shown, from the first to the last, denser at the beginning.
+        title: Title of the figure.
+    """
+    last = len(time) - 1
+    chosen = np.unique(np.round(last * np.linspace(0, 1, num) ** 1.8).astype(int))
+    figure, axes = plt.subplots(
+        5, len(chosen), figsize=(1.5 * len(chosen), 7.8), height_ratios=[1, 1, 1, 0.8, 0.8], squeeze=False
+    )
+    for column, t in enumerate(chosen):
+        for row, (name, images) in enumerate({"outside": view, "visual": visual, "tactile": tactile}.items()):
+            drawing.show(axes[row, column], images[t])
+            if column == 0:
+                axes[row, column].set_ylabel(name, fontsize=8)
+        axes[0, column].set_title(f"{time[t]:.2f} s", fontsize=8)
+        axes[3, column].remove()
+        axes[4, column].remove()
+    grid = axes[0, 0].get_gridspec()
+    force = figure.add_subplot(grid[3, :])
+    moment = figure.add_subplot(grid[4, :], sharex=force)
+    for axis, symbol, values, unit in (
+        (force, "F", wrench[:, :3], "force (N)"),
+        (moment, "M", 1e3 * wrench[:, 3:], "moment about\norigin (mN m)"),
+    ):
+        for k, direction in enumerate("xyz"):
+            axis.plot(time, values[:, k], label=f"${symbol}_{direction}$", linewidth=1)
+        axis.set_ylabel(unit, fontsize=8)
+        axis.tick_params(labelsize=8)
+        axis.legend(fontsize=7, ncols=3)
+        axis.grid(alpha=0.3)
+    force.tick_params(labelbottom=False)
+    moment.set_xlabel("time (s)", fontsize=8)
+    figure.align_ylabels([force, moment])
+    figure.suptitle(title, fontsize=9)
+    drawing.save(figure, path)
+
+
+def animation(
+    path: Path,
+    time: np.ndarray,
+    view: np.ndarray,
+    visual: np.ndarray,
+    tactile: np.ndarray,
+    wrench: np.ndarray,
+    gravity: np.ndarray,
+    *,
+    title: str = "",
+    outcome: str = "",
+    side: int = 240,
+) -> None:
+    """Write an animation of one trajectory: a view from outside, both streams, force and moment so far.
+
+    An arrow on the visual stream is the component of gravity along the pad, which is due to the slope or to the jerk of
+    the pad. The animation is SLOWER times slower than the motion.
+
+    Args:
+        path: The GIF to write.
+        time: Time of every frame (s), `(frames,)`.
+        view: The scene from outside, `(frames, h, w, 3)` in [0, 1].
+        visual: `(frames, height, width, 3)` in [0, 1].
+        tactile: `(frames, height, width, 3)` in [0, 1].
+        wrench: `(frames, 6)`, N and N m.
+        gravity: `(frames, 3)`, m/s^2, sensor frame.
+        title: Title above the pictures.
+        outcome: Text that is shown at the end.
+        side: Side of each of the three pictures (pixels).
+    """
+    width, height = 3 * side, _HEAD + side + 2 * _PANEL
+    figure = plt.figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+    figure.text(6 / width, 1 - 5 / height, title, va="top", fontsize=8)
+    clock = figure.text(6 / width, 1 - 23 / height, "", va="top", fontsize=8.6)
+    streams = {"outside": view, "visual": visual, "tactile": tactile}
+    axes = [_axes(figure, column * side, _HEAD, side, side) for column in range(3)]
+    pictures = [_picture(axis, name, images[0]) for axis, (name, images) in zip(axes, streams.items(), strict=True)]
+    arrow, label = _gravity(axes[1])
+    force, moment = wrench[:, :3], 1e3 * wrench[:, 3:]
+    curves = [
+        (_panel(figure, 0, "force (N)", "F", time, force), force),
+        (_panel(figure, 1, "moment about the sensor's origin (mN m)", "M", time, moment), moment),
+    ]
+
+    def draw_page(t: int) -> None:
+        last = f": {outcome}" if t == len(time) - 1 else ""
+        clock.set_text(f"{time[t]:.2f} s, at 1/{SLOWER:g} of its speed{last}")
+        for picture, images in zip(pictures, streams.values(), strict=True):
+            picture.set_data(np.clip(images[t], 0, 1))
+        arrow.xy = tuple(0.5 + _REACH * gravity[t, :2])
+        for artist in (arrow, label):
+            artist.set_visible(bool(np.linalg.norm(gravity[t, :2]) > _VISIBLE))
+        for lines, values in curves:
+            for line, own in zip(lines, values.T, strict=True):
+                line.set_data(time[: t + 1], own[: t + 1])
+
+    # A GIF counts hundredths of a second, and its writer rounds down to whole milliseconds.
+    step = 10 * max(round(100 * SLOWER * float(np.mean(np.diff(time)))), 2) if len(time) > 1 else 100
+    pages = [*range(len(time)), *[len(time) - 1] * max(round(_HOLD / step) - 1, 0)]
+    try:
+        film = FuncAnimation(
+            figure, draw_page, pages, init_func=lambda: None, interval=step + 0.5, cache_frame_data=False
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            temporary = Path(folder) / "film.gif"
+            film.save(temporary, "pillow", dpi=_DPI)
+            write_bytes(path, temporary.read_bytes())
+    finally:
+        plt.close(figure)
+
+
+def _axes(figure: plt.Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Axes at a place that is given in pixels, from the upper left corner of the figure."""
+    across, down = figure.get_size_inches() * _DPI
+    return figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
+
+
+def _picture(axis: Axes, name: str, image: np.ndarray) -> AxesImage:
+    """Draw the first page of a stream. The axes range from 0 to 1, and y points down."""
+    axis.set_axis_off()
+    axis.text(0.02, 0.98, name, fontsize=8)
+    return axis.imshow(np.clip(image, 0, 1), extent=(0, 1, 1, 0), interpolation="bicubic")
+
+
+def _gravity(axis: Axes) -> tuple[Annotation, Text]:
+    """An arrow from the middle of the picture, and its label."""
+    look = {"arrowstyle": "-|>", "color": "red", "linewidth": 2, "mutation_scale": 12, "shrinkA": 0, "shrinkB": 0}
+    arrow = axis.annotate("", (0.5, 0.5), (0.5, 0.5), arrowprops=look)
+    return arrow, axis.text(0.02, 0.02, "gravity's part along the pad", color="red", fontsize=8, va="top")
+
+
+def _panel(
+    figure: plt.Figure, place: int, title: str, symbol: str, time: np.ndarray, values: np.ndarray
+) -> list[Line2D]:
+    """The axes of three curves below the pictures, and the curves, which are empty."""
+    across, down = figure.get_size_inches() * _DPI
+    left, right, top, bottom = _MARGINS
+    upper = down - (2 - place) * _PANEL
+    axis = _axes(figure, left, upper + top, across - left - right, _PANEL - top - bottom)
+    low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+    axis.set_xlim(time[0], max(time[-1], time[0] + 1e-6))
+    axis.set_ylim(low, max(high, low + 1e-3))
+    axis.axhline(0, color="lightgray", linewidth=1, zorder=0)
+    axis.set_xticks([])
+    axis.locator_params(axis="y", nbins=3)
+    axis.tick_params(labelsize=8)
+    axis.spines[["top", "right", "bottom"]].set_visible(False)
+    axis.set_title(title, loc="left", fontsize=8.6, pad=5)
+    colours = ("tab:blue", "tab:orange", "tab:green")
+    lines = []
+    for k, (direction, colour) in enumerate(zip("xyz", colours, strict=True)):
+        lines += axis.plot([], [], color=colour, linewidth=1.5, clip_on=False)
+        place_of_name = (1 - 0.04 * (2 - k), 1.05)
+        axis.text(
+            *place_of_name, f"{symbol}{direction}", color=colour, fontsize=8, ha="right", transform=axis.transAxes
+        )
+    return lines

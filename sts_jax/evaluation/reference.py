@@ -1,0 +1,69 @@
+"""Baselines, which predict without learning, and the names of the reference predictors."""
+
+import numpy as np
+
+from sts_jax import physics
+from sts_jax.dataset import Pairs
+from sts_jax.evaluation.outcomes import outcome_of_pose
+from sts_jax.evaluation.predictions import Predicted
+
+CONSTANT, COPY, NEIGHBOUR = "constant (mean training target)", "copy of the input", "nearest neighbour"
+BELOW = "rests below its start"
+BASELINES = (CONSTANT, COPY, NEIGHBOUR, BELOW)
+CEILING, ONE_REROLL = "ceiling (mean of re-rolls)", "one re-roll"
+CEILINGS = (CEILING, ONE_REROLL)
+
+
+def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
+    """Predictions without learning: the mean target, the input itself, the target of the nearest input, and a rule.
+
+    The neighbour is the training item whose first visual image is nearest in squared distance. The squared distance of
+    the condition, if there is one, has the same weight: both are divided by their variance in the training set, the
+    condition number by number.
+
+    The rule keeps x, y and the orientation of the start, at the median height of the training objects that stay on
+    the pad. It predicts no images.
+    """
+    inputs = train.visual[:, 0].reshape(len(train.visual), -1).astype(np.float32)
+    queries = test.visual[:, 0].reshape(len(test.visual), -1).astype(np.float32)
+    distance = (inputs**2).sum(1) - 2 * queries @ inputs.T
+    width = train.condition.shape[1]
+    if width:
+        variance = float(((inputs - inputs.mean(0)) ** 2).sum(1).mean())
+        gap = test.condition[:, None] - train.condition[None]
+        distance = distance / variance + (gap**2 / train.condition.var(0)).sum(-1) / width
+    nearest = distance.argmin(1)
+    num = len(test.visual)
+
+    def repeat(mean: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(mean, (num, *mean.shape))
+
+    mean_pose = train.pose[:, 1].mean(0)
+    mean_pose[3:] /= max(np.linalg.norm(mean_pose[3:]), 1e-6)
+    majority = np.bincount(train.outcome).argmax()
+    frequency = np.array([np.mean(train.outcome == outcome) for outcome in scenario.outcomes])
+    rests = train.outcome != int(physics.Outcome.FELL_OFF)
+    below = test.pose[:, 0].copy()
+    below[:, 2] = np.median(train.pose[rests if rests.any() else slice(None), 1, 2])
+    return {
+        CONSTANT: Predicted(
+            repeat(train.visual[:, 1].mean(0) / 255),
+            repeat(train.tactile[:, 1].mean(0) / 255),
+            repeat(mean_pose),
+            np.full(num, majority),
+            outcome_probability=repeat(frequency),
+        ),
+        COPY: Predicted(
+            test.visual[:, 0] / 255,
+            test.tactile[:, 0] / 255,
+            test.pose[:, 0],
+            outcome_of_pose(scenario, test.pose[:, 0], test.pose[:, 0]),
+        ),
+        NEIGHBOUR: Predicted(
+            train.visual[nearest, 1] / 255,
+            train.tactile[nearest, 1] / 255,
+            train.pose[nearest, 1],
+            train.outcome[nearest],
+        ),
+        BELOW: Predicted(pose=below, outcome=outcome_of_pose(scenario, test.pose[:, 0], below)),
+    }

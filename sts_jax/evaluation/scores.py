@@ -1,0 +1,167 @@
+"""Errors of predictions of the last moment, per item."""
+
+import enum
+import functools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sts_jax import physics
+from sts_jax.dataset import Pairs
+from sts_jax.evaluation.catalogue import METRICS
+from sts_jax.evaluation.metrics import (
+    ImageError,
+    axis_angle,
+    best_of,
+    coverage,
+    energy_score,
+    geodesic_angle,
+    gradient_energy,
+    image_error,
+    log_loss,
+    position_error,
+)
+from sts_jax.evaluation.outcomes import frequency as frequency_of
+from sts_jax.evaluation.predictions import Predicted, in_unit
+from sts_jax.evaluation.records import Metric, Scores
+
+
+def score(
+    predicted: Predicted,
+    test: Pairs,
+    *,
+    outcomes: Sequence[enum.IntEnum] = (),
+    frequency: np.ndarray | None = None,
+    metrics: Sequence[Metric] = METRICS,
+) -> Scores:
+    """Errors per item of a prediction of the last moment.
+
+    With `outcome_probability` and `frequency`, the outcome that is judged is the one with the largest ratio of
+    probability to frequency. This decision has the best expected balanced accuracy, in which a rare outcome counts as
+    much as a common one.
+
+    Args:
+        predicted: Prediction of all items, or of the first ones only.
+        test: The held-out items.
+        outcomes: `scenario.outcomes`, for predictions with `outcome_probability`.
+        frequency: Frequency of each outcome among training trajectories, from `frequency`.
+        metrics: The `errors` of these metrics are computed too.
+
+    Raises:
+        ValueError: `outcome_probability` has another number of columns than `outcomes`, or the `errors` of a metric
+            are not one number per item.
+    """
+    leaves = (predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability)
+    count = next((len(leaf) for leaf in leaves if leaf is not None), len(test.object))
+    test = Pairs(*(leaf[:count] for leaf in test))
+    scores = _with_samples(_of_point(predicted, test), predicted, test)
+    if predicted.outcome_probability is not None:
+        scores = _with_probability(scores, predicted.outcome_probability, test, outcomes, frequency)
+    return scores._replace(further=_further(predicted, test, metrics))
+
+
+def scorer(
+    scenario: physics.Scenario, train: Pairs, *, metrics: Sequence[Metric] = METRICS
+) -> Callable[[Predicted, Pairs], Scores]:
+    """`score` for the outcomes of a scenario, with their frequencies among some training trajectories.
+
+    Args:
+        scenario: The scenario of the trajectories.
+        train: Training trajectories.
+        metrics: See `score`.
+    """
+    return functools.partial(
+        score,
+        outcomes=scenario.outcomes,
+        frequency=frequency_of(train.outcome, scenario.outcomes),
+        metrics=metrics,
+    )
+
+
+def _of_point(predicted: Predicted, test: Pairs) -> Scores:
+    """Errors of the mean images, the pose and the outcome."""
+    inside = test.segmentation[:, 1]
+
+    def images(image: np.ndarray | None, target: np.ndarray, mask: np.ndarray | None) -> ImageError | None:
+        return None if image is None else image_error(in_unit(image), target[:, 1] / 255, mask)
+
+    pose, target = predicted.pose, test.pose[:, 1]
+    return Scores(
+        visual=images(predicted.visual, test.visual, None),
+        visual_object=images(predicted.visual, test.visual, inside),
+        tactile=images(predicted.tactile, test.tactile, None),
+        tactile_object=images(predicted.tactile, test.tactile, inside),
+        position=None if pose is None else position_error(pose, target),
+        angle=None if pose is None else geodesic_angle(pose, target),
+        axis=None if pose is None else axis_angle(pose, target),
+        outcome=predicted.outcome,
+    )
+
+
+def _with_samples(scores: Scores, predicted: Predicted, test: Pairs) -> Scores:
+    """Add the scores of the samples. A deterministic prediction has an energy score and a gradient too."""
+    samples, truth, place = predicted.samples or Predicted(), test.visual[:, 1] / 255, test.pose[:, 1, :3]
+    if samples.pose is not None:
+        scores = scores._replace(
+            energy=energy_score(samples.pose[..., :3], place),
+            coverage=coverage(samples.pose[..., :3], place),
+        )
+    elif predicted.pose is not None:
+        scores = scores._replace(energy=scores.position)
+    if samples.visual is not None:
+        scores = scores._replace(
+            best=best_of([image_error(in_unit(image), truth) for image in samples.visual]),
+            gradient=np.mean([gradient_energy(in_unit(image)) for image in samples.visual], axis=0),
+        )
+    elif predicted.visual is not None:
+        scores = scores._replace(gradient=gradient_energy(in_unit(predicted.visual)))
+    if predicted.visual is not None or samples.visual is not None:
+        scores = scores._replace(gradient_target=gradient_energy(truth))
+    return scores
+
+
+def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> dict[str, np.ndarray] | None:
+    """The `errors` of some metrics by their names, or None if there are none."""
+    found = {}
+    for metric in metrics:
+        values = None if metric.errors is None else metric.errors(predicted, test)
+        if values is None:
+            continue
+        found[metric.name] = np.asarray(values, np.float64)
+        if found[metric.name].shape != (len(test.object),):
+            raise ValueError(
+                f"metric {metric.name!r}: errors has shape {found[metric.name].shape}, but it must be one number per "
+                f"item, {(len(test.object),)}: reduce the other axes"
+            )
+    return found or None
+
+
+def _with_probability(
+    scores: Scores,
+    probability: np.ndarray,
+    test: Pairs,
+    outcomes: Sequence[enum.IntEnum],
+    frequency: np.ndarray | None,
+) -> Scores:
+    """Add the scores of the outcome probabilities."""
+    if probability.shape != (len(test.outcome), len(outcomes)):
+        raise ValueError(
+            f"outcome_probability has shape {probability.shape}, expected {(len(test.outcome), len(outcomes))} (one "
+            "column for each of `outcomes`): pass outcomes=scenario.outcomes"
+        )
+    number = np.array([int(outcome) for outcome in outcomes])
+    likeliest = number[probability.argmax(1)]
+    label = (test.outcome[:, None] == number).argmax(1)
+    outcome = scores.outcome
+    if frequency is not None:
+        outcome = number[(probability / frequency).argmax(1)]
+    elif outcome is None:
+        outcome = likeliest
+    fell_off = number.tolist().index(int(physics.Outcome.FELL_OFF))
+    return scores._replace(
+        outcome=outcome,
+        log_loss=log_loss(probability, label),
+        confidence=probability.max(1),
+        right=likeliest == test.outcome,
+        fell_off=probability[:, fell_off],
+    )
