@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
 import sts_jax as sts
 from experiments import stages
 from sts_jax import _files, dataset, geometry
-from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
 
 SMALL = dataset.Collection(
     sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2

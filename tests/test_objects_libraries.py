@@ -10,7 +10,7 @@ from PIL import Image
 
 from sts_jax import objects
 from sts_jax.objects import libraries
-from sts_jax.objects.solids import linear
+from sts_jax.objects.colors import linear
 
 INCH = 0.0254
 

@@ -47,6 +47,11 @@ class Identity(NamedTuple):
     shard: int  # index of the shard
 
 
+def shard_path(folder: Path, count: int, index: int) -> Path:
+    """The record file of shard `index` of `count`."""
+    return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
+
+
 def check_format(content: Any, folder: Path) -> None:
     """Check that this version reads a dataset, given the content of its `collection.json`.
 

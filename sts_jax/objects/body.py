@@ -16,6 +16,8 @@ FACE_CLASSES = (1024, 4096, 16384, 131072)
 PART_CLASSES = (1, 8)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
+PAD = 0.15  # m, side of the sensor's pad, which larger objects do not fit
+SMALLEST = 0.005  # m, longest side of the smallest object: a shorter one probably has another unit
 LEVEL_STEPS = 30  # bisection steps for the level of the contents, beyond the resolution of float32
 
 Direction = Float[Array | np.ndarray, "3"] | tuple[float, float, float]

@@ -16,6 +16,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, Body
 
 WALL = 1.2  # kg/m^2, default shell of a hollow object: plastic about 1.2 mm thick
+STEEL = 5.9  # kg/m^2 of each face: stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301) x 1.5 mm, on two faces
 CONTENTS = 1000.0  # kg/m^3, water
 CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are computed
 HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less than this
@@ -37,11 +38,6 @@ def lattice(num: int) -> Float[np.ndarray, "n 3"]:
 DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3) unit vectors, at which `support` is evaluated
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-
-
-def linear(srgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def solid_moments(
