@@ -40,7 +40,7 @@ def twisted() -> trimesh.Trimesh:
     return mesh
 
 
-def test_box_fills():
+def test_fills_of_a_box_are_the_closed_form():
     mesh = trimesh.creation.box((0.06, 0.04, 0.1))
     mesh.apply_translation([0.01, 0.02, 0.03])
     table = filled(mesh)
@@ -48,7 +48,7 @@ def test_box_fills():
     np.testing.assert_allclose(table, truth, rtol=1e-5, atol=1e-12)
 
 
-def test_prism_lying_on_its_side_is_the_clipped_polygon():
+def test_fills_of_a_lying_prism_are_those_of_the_clipped_polygon():
     # A cylinder of 64 sides along y: the filled part is the segment of the polygon, cut here by trapezoids.
     mesh = trimesh.creation.cylinder(radius=0.02, height=0.08, sections=64)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
@@ -72,7 +72,7 @@ def test_prism_lying_on_its_side_is_the_clipped_polygon():
         np.testing.assert_allclose(table[:, column], truth, atol=3e-5 * np.abs(truth).max())
 
 
-def test_sphere_caps():
+def test_fills_of_a_sphere_are_its_caps():
     radius = 0.03
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
     table = filled(mesh)
@@ -84,7 +84,7 @@ def test_sphere_caps():
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.0, 0.0, -2.0), (0.3, -0.8, 0.5)])
-def test_fills_of_a_ring_against_samples(direction):
+def test_fills_of_a_ring_agree_with_samples(direction):
     mesh = twisted()
     up = np.array(direction) / np.linalg.norm(direction)
     table = filled(mesh, direction)
@@ -104,7 +104,7 @@ def test_fills_of_a_ring_against_samples(direction):
         assert (abs(table[k, 4:] / table[k, 0] - square.mean(0)) < noise * square.std(0)).all()
 
 
-def test_opposite_directions_share_the_whole():
+def test_fills_along_opposite_directions_add_up_to_the_whole():
     mesh = twisted()
     up, down = filled(mesh, (0.2, 0.3, 0.9)), filled(mesh, (-0.2, -0.3, -0.9))
     np.testing.assert_allclose(up + down[::-1], np.broadcast_to(up[-1], up.shape), rtol=1e-5, atol=1e-11)
@@ -121,7 +121,7 @@ def test_whole_solid_agrees_with_trimesh():
     np.testing.assert_allclose(central.sum() - central, np.diag(mesh.moment_inertia), rtol=1e-6)
 
 
-def test_surface_moments_against_samples():
+def test_surface_moments_agree_with_samples():
     mesh = twisted()
     total = surface_moments(mesh.triangles).sum(0)
     points = trimesh.sample.sample_surface(mesh, 200_000, seed=1)[0]
@@ -130,7 +130,7 @@ def test_surface_moments_against_samples():
     np.testing.assert_allclose(total[4:7] / total[0], (points**2).mean(0), atol=3e-5)
 
 
-def test_nothing_and_no_interior_weigh_nothing():
+def test_an_empty_and_a_missing_interior_weigh_nothing():
     for triangles in (trimesh.creation.box((0.1, 0.1, 0.1)).triangles, np.zeros((8, 3, 3))):
         volume, centre, second = fill_moments(jnp.asarray(triangles, jnp.float32), 0.0)
         assert volume == 0
@@ -164,14 +164,14 @@ def test_a_prism_of_many_sides_rests_on_each():
     assert share[~flat].sum() > 5 * share[flat].sum()
 
 
-def test_hull_is_exact_while_it_may_be():
+def test_a_hull_within_the_limit_is_exact():
     points = trimesh.creation.box((0.1, 0.05, 0.02)).subdivide().subdivide().vertices
     hull = convex_hull(points)
     assert len(hull) == 8
     assert outside_hull(points, hull).max() < 1e-12
 
 
-def test_hull_keeps_what_matters_and_the_rest_is_stated():
+def test_a_simplified_hull_keeps_the_outermost_vertices():
     points = trimesh.creation.icosphere(subdivisions=4, radius=0.05).vertices
     hull = convex_hull(points)
     assert len(hull) == 64

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from sts_jax._keys import check_key
-from sts_jax.objects.body import CATEGORIES, PAD, SMALLEST, Body
+from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, PAD, SMALLEST, Body
 from sts_jax.objects.families import bottle, camera, fork, mouse, scissors, spoon, watch, webcam
 from sts_jax.objects.shapes import Part
 from sts_jax.objects.solids import CONTENTS, assemble
@@ -105,7 +105,7 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
     Raises:
         TypeError: `key` is not a JAX key.
         ValueError: `category` is unknown, or its family made an object that is no body: without parts, not finite,
-            smaller than 5 mm or larger than the pad, or with more than one interior.
+            of too many faces, smaller than 5 mm or larger than the pad, or with more than one interior.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category
@@ -138,7 +138,12 @@ def _check(family: Family, parts: list[Part]) -> None:
     inner = sum(part.interior for part in parts)
     if inner > 1:
         raise ValueError(f"family {family.name}: one part may have interior=True, got {inner}")
-    points = np.concatenate([part.vertices for part in parts])
+    points, faces = np.concatenate([part.vertices for part in parts]), sum(len(part.faces) for part in parts)
+    if max(len(points), faces) > FACE_CLASSES[-1]:
+        raise ValueError(
+            f"family {family.name}: all parts have {faces:,} faces and {len(points):,} vertices, but at most "
+            f"{FACE_CLASSES[-1]:,} fit: give outlines and paths fewer points"
+        )
     if not np.isfinite(points).all():
         raise ValueError(f"family {family.name}: all vertices must be finite, got {points[~np.isfinite(points)][0]}")
     longest = float(np.ptp(points, axis=0).max())
