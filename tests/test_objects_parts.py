@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 from sts_jax import objects
-from sts_jax.objects.solids import convex_parts, outside_hull, surface_gaps
+from sts_jax.objects.hulls import outside_hull
+from sts_jax.objects.parts import convex_parts, surface_gaps
 
 pytestmark = pytest.mark.slow
 

@@ -131,7 +131,8 @@ def _simulated(
     report: Callable[[int], None],
 ) -> tuple[dict[int, objects.Body], physics.Trajectory | None, list[str]]:
     """The objects that can be simulated, their trajectories (None without objects), and a line for each other one."""
-    bodies, failed = dict(bodies), []
+    bodies = dict(bodies)
+    failed: list[str] = []
     while bodies:
         try:
             trajectory = physics.simulate(
@@ -158,9 +159,10 @@ def _arrays(
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
     arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
-    solid = _solid(bodies, trajectory.body, trajectory.hidden)
+    which = np.asarray(trajectory.body)
+    solid = _solid(bodies, which, trajectory.hidden)
     mirrored = np.stack([objects.support(objects.mirror(body)) for body in bodies])
-    arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()} | {"solid/mirrored": mirrored[trajectory.body]}
+    arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()} | {"solid/mirrored": mirrored[which]}
     arrays |= {f"view/{name}": leaf for name, leaf in views.items()}
     arrays["view/body"] = members[views["body"]].astype(np.int32)
     return arrays

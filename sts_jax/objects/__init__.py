@@ -12,11 +12,12 @@ from sts_jax.objects.body import (
     rigid,
     stack,
 )
+from sts_jax.objects.hulls import DIRECTIONS, lattice, rest_poses, support
 from sts_jax.objects.items import Entry, Item, Library
 from sts_jax.objects.libraries import HOLLOW, bodies, describe, facts, library, read, survey
 from sts_jax.objects.meshes import load
+from sts_jax.objects.parts import decompose, gaps, hull_gap
 from sts_jax.objects.procedural import Family, find_family, make
-from sts_jax.objects.solids import DIRECTIONS, decompose, gaps, hull_gap, lattice, rest_poses, support
 
 __all__ = [
     "CATEGORIES",

@@ -100,6 +100,17 @@ class Body:
         return f"Body({name}, {size} mm, {float(self.shell_mass):.3g} kg, {holds}, {faces:,} faces, {hull})"
 
 
+def size_class(count: int, classes: tuple[int, ...]) -> int:
+    """The smallest of some padding classes that holds `count` items."""
+    return next(size for size in classes if count <= size)
+
+
+def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
+    """Append a value until an array has `size` rows."""
+    padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
+    return np.concatenate([array, padding])
+
+
 def check_category(category: object) -> None:
     """Raise a ValueError unless a category is an index into `CATEGORIES`, or -1 for an object of no category."""
     number = np.asarray(category)

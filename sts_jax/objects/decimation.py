@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from sts_jax.objects.solids import surface_samples
-from sts_jax.objects.surface import Surface, proper
+from sts_jax.objects.surface import Surface, proper, surface_samples
 
 
 def decimate(path: Path, surface: Surface, target: int) -> Surface:

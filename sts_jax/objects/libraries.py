@@ -19,10 +19,11 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from sts_jax.objects import body_cache, shapenet
+from sts_jax.objects.assembly import STEEL, WALL
 from sts_jax.objects.body import CATEGORIES, PAD, Body
 from sts_jax.objects.items import LARGEST, NUM_FACES, Entry, Item, Library
 from sts_jax.objects.meshes import AXES, load
-from sts_jax.objects.solids import STEEL, WALL, decompose, gaps
+from sts_jax.objects.parts import decompose, gaps
 
 THINNEST = 0.0005  # m, a hull thinner than this is a sheet, which has no stable contacts
 HOLLOW = 0.002  # m, a hull that stands off the surface by more than this is worth decomposing

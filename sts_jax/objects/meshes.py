@@ -11,10 +11,12 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from sts_jax.objects.assembly import CONTENTS, WALL, assemble
 from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body, check_category
 from sts_jax.objects.decimation import decimate
+from sts_jax.objects.hulls import convex_hull
 from sts_jax.objects.materials import Resolver, albedo, check_materials, read_image
-from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose
+from sts_jax.objects.parts import decompose
 from sts_jax.objects.surface import Surface, is_closed, merge
 
 # Up and front of a file for which only the up axis is given. Front becomes -y. The front of a glTF is +z (glTF

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sts_jax.objects.assembly import WALL
 from sts_jax.objects.colors import Color, Number
-from sts_jax.objects.solids import WALL
 
 PAINT = 0.04  # mm, height of a painted mark, so that it is drawn in front of the surface below it
 

@@ -1,9 +1,10 @@
-"""The surface of a mesh file: all its meshes merged into one."""
+"""Triangulated surfaces: the merged surface of a mesh file, its boundary, and samples of it."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 
 class Surface(NamedTuple):
@@ -65,3 +66,15 @@ def is_closed(faces: np.ndarray) -> bool:
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
     _, place = np.unique(edge, return_inverse=True)
     return not np.bincount(place.reshape(-1), np.where(start < end, 1, -1)).any()
+
+
+def surface_samples(
+    triangles: Float[np.ndarray, "f 3 3"], num: int
+) -> tuple[Int[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
+    """Points spread evenly by area over triangles, with a fixed seed: the face and barycentric weights of each."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    share = np.cumsum(np.linalg.norm(cross, axis=1))
+    face = np.searchsorted(share, (np.arange(num) + 0.5) / num * share[-1])
+    u, v = np.random.default_rng(0).random((2, num))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return face, np.stack([1 - u - v, u, v], axis=1)

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from sts_jax.objects import colors, shapes
+from sts_jax.objects.assembly import STEEL
 from sts_jax.objects.colors import Color
 from sts_jax.objects.shapes import Part
-from sts_jax.objects.solids import STEEL
 
 SHEET = 1.5  # mm, thickness of the steel
 

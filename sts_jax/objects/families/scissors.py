@@ -3,8 +3,8 @@
 import numpy as np
 
 from sts_jax.objects import colors, shapes
+from sts_jax.objects.assembly import STEEL
 from sts_jax.objects.shapes import Part
-from sts_jax.objects.solids import STEEL
 
 
 def parts(rng: np.random.Generator) -> list[Part]:

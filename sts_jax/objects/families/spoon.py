@@ -3,9 +3,9 @@
 import numpy as np
 
 from sts_jax.objects import shapes
+from sts_jax.objects.assembly import STEEL
 from sts_jax.objects.families.cutlery import SHEET, handle
 from sts_jax.objects.shapes import Part
-from sts_jax.objects.solids import STEEL
 
 
 def parts(rng: np.random.Generator) -> list[Part]:

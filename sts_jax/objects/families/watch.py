@@ -3,9 +3,9 @@
 import numpy as np
 
 from sts_jax.objects import colors, shapes
+from sts_jax.objects.assembly import STEEL
 from sts_jax.objects.colors import Color
 from sts_jax.objects.shapes import Part
-from sts_jax.objects.solids import STEEL
 
 STRAP = 2.2  # mm, thickness of the strap before the watch is scaled to its length
 
