@@ -16,7 +16,10 @@ PARTS = ("train", "validation", "test")  # of the split of the objects
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """Description of a dataset. Together with a `Sensor` it determines every byte of it."""
+    """Description of a dataset. Together with a `Sensor` it determines every byte of it.
+
+    The one exception are classes from outside the library, whose code the description names but does not contain.
+    """
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
     categories: tuple[str, ...] = objects.CATEGORIES  # procedural classes, used in turn, see `objects.find_family`

@@ -74,7 +74,7 @@ def library(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of objects")
+        raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
     if scale is not None and longest_side is not None:
         raise ValueError(f"{folder}: give scale or longest_side, not both")
     for name, value, most in (

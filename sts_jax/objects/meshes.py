@@ -256,7 +256,7 @@ def _factor(
     """The factor that turns the file's units into metres."""
     extent = float(np.ptp(corners, axis=(0, 1)).max())
     if not extent > 0:
-        raise ValueError(f"{path}: all vertices lie at one point")
+        raise ValueError(f"{path}: all vertices lie at one point: repair the mesh")
     if longest_side is not None:
         return longest_side / extent
     factor = 1.0 if scale is None else scale
