@@ -41,9 +41,19 @@ def render(
     views: dict[str, np.ndarray],
     report: Callable[[int], None],
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Render `frames`, then `views`, in order, a fixed number per call.
+    """Render a shard in batches, with one thread per core, because one call keeps only one core busy.
 
-    There is one thread per core, because a call keeps only one core busy.
+    Args:
+        collection: The description of the dataset.
+        sensor: The sensor.
+        bodies: The objects of the shard.
+        trajectory: Their trajectories, as NumPy arrays, with bodies counted in the shard.
+        frames: Rows of (trajectory, frame, symmetry), sorted by object and then by mirror image, (m, 3).
+        views: The poses and bodies of the views, sorted by object.
+        report: Called with the number of finished images.
+
+    Yields:
+        The records in order: `Images` of the frames, then `(visual,)` of the views.
     """
     size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
     turned = {
