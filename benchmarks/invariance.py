@@ -37,7 +37,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax import geometry, objects, physics
-from sts_jax.dataset.collect import turn, turn_condition
+from sts_jax.dataset.symmetry import turn, turn_condition
 from sts_jax.physics import scene
 from sts_jax.physics.scenario import Shape, Start
 from sts_jax.sensor import Sensor

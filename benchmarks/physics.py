@@ -39,7 +39,7 @@ import numpy as np
 
 from benchmarks.starts import bodies, rigid_of
 from sts_jax import dataset, objects, physics
-from sts_jax.dataset.collect import RENDER_BATCH
+from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
 

@@ -13,7 +13,7 @@ COLUMNS += ["surfaceVolume", "solidVolume", "supportSurfaceArea", "weight", "sta
 
 
 def wedge() -> trimesh.Trimesh:
-    """A pyramid that no turn or mirror leaves as it is: X right, Y back, Z up, in metres; its tip leans to +x, -y."""
+    """A pyramid without symmetry, in metres, with X right, Y back and Z up. Its tip leans to +x, -y."""
     base = [[-0.02, -0.015, 0], [0.02, -0.015, 0], [0.02, 0.015, 0], [-0.02, 0.015, 0]]
     return trimesh.convex.convex_hull(np.array([*base, [0.012, -0.008, 0.09]]))
 
@@ -36,7 +36,7 @@ def build(
     meshes: dict[str, trimesh.Trimesh],
     images: dict[str, tuple[int, int, int]] | None = None,
 ) -> Path:
-    """Writes the folder; a mesh whose id has an image wears it, by the name alone, as the release's MTL files do."""
+    """Write the folder. The MTL file of a mesh whose id has an image names it without a path, as in the release."""
     models, textures = root / "models-OBJ" / "models", root / "models-textures" / "textures"
     models.mkdir(parents=True)
     textures.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Collections of mesh files: what is used, what is left out and said, and that nothing stops them."""
+"""Datasets of mesh files: usable objects are collected, and all others are left out with a reason."""
 
 import dataclasses
 from pathlib import Path
@@ -17,7 +17,7 @@ SCENARIO = physics.Perturbed(frames=3)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three boxes, three cans, a leaning one that falls over by itself, a torn file."""
+    """Three boxes, three cans, a leaning can that falls over by itself, and a torn file."""
     for i in range(3):
         for label, mesh in (
             ("box", trimesh.creation.box((0.03 + 0.01 * i, 0.04, 0.05))),
@@ -38,14 +38,14 @@ def collection(meshes: dataset.Meshes) -> dataset.Collection:
     )
 
 
-def test_what_can_be_used_is_collected_and_the_rest_is_said(folder: Path, tmp_path_factory: pytest.TempPathFactory):
-    said: list[str] = []
-    meshes, listing = dataset.survey_meshes(folder, SCENARIO, progress=said.append)
+def test_usable_objects_are_collected_and_others_are_listed(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+    lines: list[str] = []
+    meshes, listing = dataset.survey_meshes(folder, SCENARIO, progress=lines.append)
     assert meshes.names == tuple(f"{label}/{i}.stl" for label in ("box", "can") for i in range(3))
     assert meshes.labels == ("box",) * 3 + ("can",) * 3
     assert "box/torn.stl" in listing
     assert "can/leaning.stl: left out of Perturbed: it does not stand upright" in listing
-    assert len(said) == 8
+    assert len(lines) == 8
     on_slope, _ = dataset.survey_meshes(folder, physics.Inclined())
     assert "can/leaning.stl" in on_slope.names
 
@@ -89,7 +89,7 @@ def test_one_mesh_under_several_names_is_one_object(tmp_path: Path):
     assert "c.obj: the same mesh as a.stl, left out\n" in listing
 
 
-def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_go_on(
+def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_are_collected(
     folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ):
     one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
@@ -105,7 +105,7 @@ def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_go_on(
     out = tmp_path_factory.mktemp("out") / "dataset"
     made = dataset.collect(one, sts.Sensor(), out)
     assert made.left_out == ("object 1 (box/1.stl): trajectory 0 is non-finite",)
-    assert dataset.collect(one, sts.Sensor(), out) == made  # nothing to do: it is said again
+    assert dataset.collect(one, sts.Sensor(), out) == made  # nothing is left to do, and the result is the same
     data = dataset.load(out)
     np.testing.assert_array_equal(data.trajectory["body"], [0, 2, 3, 4, 5])
     pairs = data.pairs(np.arange(5))
@@ -117,7 +117,7 @@ def test_an_object_that_cannot_be_simulated_is_left_out_and_the_others_go_on(
         assert np.mean(np.asarray(shown[0][0]) != pairs.visual[row, 0]) < 0.01
 
 
-def test_a_file_that_is_gone_since_the_survey_is_left_out(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+def test_a_file_deleted_after_the_survey_is_left_out(folder: Path, tmp_path_factory: pytest.TempPathFactory):
     one = collection(dataset.survey_meshes(folder, SCENARIO)[0])
     out = tmp_path_factory.mktemp("out") / "dataset"
     (folder / "can" / "1.stl").unlink()
@@ -128,7 +128,7 @@ def test_a_file_that_is_gone_since_the_survey_is_left_out(folder: Path, tmp_path
     np.testing.assert_array_equal(dataset.load(out).trajectory["body"], [0, 1, 2, 3, 5])
 
 
-def test_a_folder_of_nothing_and_a_wrong_number_are_named(folder: Path, tmp_path: Path):
+def test_a_folder_without_usable_objects_and_a_wrong_number_are_refused(folder: Path, tmp_path: Path):
     for path in folder.rglob("*.stl"):
         if "leaning" not in path.name:
             path.unlink()

@@ -1,4 +1,4 @@
-"""Shards: what is written is read, torn files are named, a full disk loses nothing."""
+"""Shards are read as they were written, torn files are named, and a full disk loses nothing."""
 
 import resource
 
@@ -18,7 +18,7 @@ def some_images(num: int = 5) -> records.Images:
     )
 
 
-def test_frames_come_back_in_the_order_asked_for(tmp_path):
+def test_frames_are_read_in_the_given_order(tmp_path):
     images, path = some_images(), tmp_path / "a.array_record"
     records.write_images(
         path, [records.Images(*(leaf[:3] for leaf in images)), records.Images(*(x[3:] for x in images))]
@@ -28,7 +28,7 @@ def test_frames_come_back_in_the_order_asked_for(tmp_path):
         np.testing.assert_array_equal(there[[4, 0, 2]], here)
 
 
-def test_views_behind_frames_come_back_in_the_order_asked_for(tmp_path):
+def test_views_after_frames_are_read_in_the_given_order(tmp_path):
     images, path = some_images(), tmp_path / "a.array_record"
     views = np.random.default_rng(1).integers(0, 256, (3, 9, 7, 3), dtype=np.uint8)
     records.write_images(path, [images, (views,)])
@@ -38,7 +38,7 @@ def test_views_behind_frames_come_back_in_the_order_asked_for(tmp_path):
         records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
 
 
-def test_same_frames_same_bytes(tmp_path):
+def test_equal_frames_give_equal_bytes(tmp_path):
     for name in ("a", "b"):
         records.write_images(tmp_path / f"{name}.array_record", [some_images()])
         records.write_arrays(tmp_path / f"{name}.npz", {"x": np.arange(3)})
@@ -65,7 +65,7 @@ def test_a_missing_file_is_named(tmp_path):
         records.read_images(tmp_path / "b.array_record", np.arange(1), resolution=(9, 7), total=1)
 
 
-def test_a_kill_in_the_middle_of_writing_leaves_nothing(tmp_path):
+def test_an_interruption_while_writing_leaves_no_file(tmp_path):
     def frames():
         yield some_images()
         raise KeyboardInterrupt
@@ -82,7 +82,7 @@ def test_a_kill_in_the_middle_of_writing_leaves_nothing(tmp_path):
         ("a.npz", lambda path: records.write_arrays(path, {"x": np.zeros(10_000)})),
     ],
 )
-def test_a_full_disk_is_named_and_leaves_nothing(tmp_path, name, write):
+def test_a_full_disk_is_named_and_leaves_no_file(tmp_path, name, write):
     path = tmp_path / name
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # no file of this process may be longer
@@ -94,7 +94,7 @@ def test_a_full_disk_is_named_and_leaves_nothing(tmp_path, name, write):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_fault_while_rendering_is_not_taken_for_a_full_disk(tmp_path):
+def test_an_error_while_rendering_is_not_reported_as_a_full_disk(tmp_path):
     def frames():
         yield some_images()
         raise ValueError("no such colour")
@@ -124,7 +124,7 @@ def test_a_shard_is_read_as_it_was_written(tmp_path):
 
 def test_images_of_another_shard_are_refused(tmp_path):
     one, other = shard(tmp_path, 0, seed=1), shard(tmp_path, 1, seed=2)
-    assert one.stat().st_size == other.stat().st_size  # noise: the length gives nothing away
+    assert one.stat().st_size == other.stat().st_size  # both hold noise of equal length
     one.write_bytes(other.read_bytes())
     with pytest.raises(dataset.TornFileError, match=r"0\.array_record is damaged or belongs to another shard"):
         records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
@@ -146,7 +146,7 @@ def test_a_shard_of_another_collection_or_sensor_is_refused(tmp_path, changed):
         records.read_shard(shard(tmp_path, 0), wanted)
 
 
-def test_every_flipped_bit_is_found(tmp_path):
+def test_a_flipped_bit_is_found_or_changes_no_array(tmp_path):
     path, identity = shard(tmp_path, 0), records.Identity(COLLECTION, SENSOR, 0)
     before = records.read_shard(path, identity)
     rng = np.random.default_rng(0)
@@ -169,7 +169,7 @@ def test_every_flipped_bit_is_found(tmp_path):
         file.write_bytes(whole)
 
 
-def test_an_array_that_is_not_there_is_named(tmp_path):
+def test_a_missing_array_is_named(tmp_path):
     path = shard(tmp_path, 0)
     arrays = records.read_arrays(path.with_suffix(".npz"))
     del arrays["trajectory/pose"]
@@ -178,7 +178,7 @@ def test_an_array_that_is_not_there_is_named(tmp_path):
         records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
 
 
-def test_images_that_are_gone_are_named(tmp_path):
+def test_a_missing_record_file_is_named(tmp_path):
     path = shard(tmp_path, 0)
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"0\.array_record is missing: delete 0\.npz and collect again"):

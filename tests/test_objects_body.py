@@ -49,7 +49,7 @@ def jar(tmp_path_factory) -> tuple[objects.Body, trimesh.Trimesh]:
 
 @pytest.mark.parametrize("scale", [0.9, 1.1])
 @pytest.mark.parametrize("fill", [0.0, 0.13, 0.5, 0.87, 1.0])
-def test_rigid_against_samples(jar, fill, scale):
+def test_mass_properties_agree_with_samples(jar, fill, scale):
     body, solid = jar
     mass, com, inertia = jax.jit(objects.rigid)(body, fill, scale)
     true_mass, true_com, true_inertia = brute(body, solid, fill, scale)
@@ -58,7 +58,7 @@ def test_rigid_against_samples(jar, fill, scale):
     np.testing.assert_allclose(inertia, true_inertia, atol=0.015 * np.trace(true_inertia))
 
 
-def test_a_body_is_described_in_a_line_with_or_without_values(jar):
+def test_repr_describes_a_body_in_one_line_also_while_traced(jar):
     body, solid = jar
     size = " x ".join(f"{1e3 * side:.0f}" for side in solid.extents)
     held = rf"holds \S+ kg in {1e6 * solid.volume:.3g} ml"
@@ -86,7 +86,7 @@ def test_a_body_is_described_in_a_line_with_or_without_values(jar):
         ({"category": -2}, "category is -2"),
     ],
 )
-def test_a_body_that_cannot_be_is_named(changes, message):
+def test_check_refuses_an_invalid_body_and_names_the_field(changes, message):
     body = objects.make(jax.random.key(0), "fork")
     body.check()
     changes = {name: jnp.full_like(getattr(body, name), value) for name, value in changes.items()}
@@ -96,7 +96,7 @@ def test_a_body_that_cannot_be_is_named(changes, message):
         objects.stack([body, body]).check()
 
 
-def test_full_box_by_hand(tmp_path):
+def test_mass_properties_of_a_full_box_are_the_closed_form(tmp_path):
     a, b, c = 0.06, 0.04, 0.1
     path = tmp_path / "box.stl"
     trimesh.creation.box((a, b, c)).export(path)
@@ -119,14 +119,14 @@ def test_mass_and_inertia_grow_with_the_fill():
     assert (moments[:, 0] + moments[:, 1] > moments[:, 2] * (1 - 1e-5)).all()
 
 
-def test_solid_things_weigh_the_same_at_any_fill():
+def test_a_solid_body_weighs_the_same_at_any_fill():
     body = objects.make(jax.random.key(2), "fork")
     empty, full = objects.rigid(body, 0.0, 1.0), objects.rigid(body, 1.0, 1.0)
     for a, b in zip(empty, full, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_rigid_has_a_gradient_everywhere_and_the_right_one():
+def test_the_gradient_of_rigid_is_finite_and_equals_finite_differences():
     body = objects.make(jax.random.key(2), "camera")
     up = jnp.array([0.6, 0.0, 0.8])
     height = jax.jit(lambda fill: objects.rigid(body, fill, 1.0, up)[1] @ up)
@@ -136,7 +136,7 @@ def test_rigid_has_a_gradient_everywhere_and_the_right_one():
     np.testing.assert_allclose(grad(0.8), (height(0.82) - height(0.78)) / 0.04, rtol=0.02)
 
 
-def test_contents_that_settled_elsewhere_move_the_balance_there(jar):
+def test_contents_settle_against_the_direction_up(jar):
     body, solid = jar
     up = np.array([0.3, -0.8, 0.5]) / np.linalg.norm([0.3, -0.8, 0.5])
     mass, com, inertia = objects.rigid(body, 0.4, 1.0, up)
@@ -149,7 +149,7 @@ def test_contents_that_settled_elsewhere_move_the_balance_there(jar):
     np.testing.assert_allclose(turn[:3, :3] @ inertia @ turn[:3, :3].T, true_inertia, atol=0.015 * true_inertia.max())
 
 
-def test_stack_is_for_vmap_and_knows_classes():
+def test_stacked_bodies_can_be_mapped_over():
     bodies = [objects.make(jax.random.key(k), c) for k, c in enumerate(("bottle", "fork", "watch"))]
     several = objects.stack(bodies)
     mass, _, _ = jax.vmap(lambda body: objects.rigid(body, 0.5, 1.0))(several)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sts_jax import objects
 from sts_jax.objects import meshes
-from sts_jax.objects.solids import linear
+from sts_jax.objects.colors import linear
 
 
 def real_faces(body: objects.Body) -> np.ndarray:
@@ -59,7 +59,7 @@ def flag(folder: Path, *, material: bool = True, image: bool = True) -> Path:
     return folder / "flag.obj"
 
 
-def test_closed_box(box):
+def test_a_closed_box_has_the_mass_and_volume_of_its_dimensions(box):
     body = objects.load(box)
     area = 2 * (0.1 * 0.06 + 0.1 * 0.04 + 0.06 * 0.04)
     np.testing.assert_allclose(body.shell_mass, 1.2 * area, rtol=1e-5)
@@ -94,7 +94,7 @@ def test_parts_that_share_an_edge_are_closed(tmp_path):
         assert objects.load(path, mass=0.1).two_sided
 
 
-def test_given_mass_has_no_contents(box):
+def test_a_body_with_a_given_mass_has_no_contents(box):
     body = objects.load(box, mass=0.3)
     for fill in (0.0, 1.0):
         np.testing.assert_allclose(objects.rigid(body, fill, 1.0)[0], 0.3, rtol=1e-6)
@@ -133,7 +133,7 @@ def test_obj_texture_the_right_way_up(tmp_path):
     np.testing.assert_allclose(color[~high], np.broadcast_to([0, 0, level], color[~high].shape), atol=1e-3)
 
 
-def test_missing_material_is_named_once_and_texture_mends_it(tmp_path):
+def test_a_missing_material_is_named_once_and_texture_replaces_it(tmp_path):
     path = flag(tmp_path, material=False)
     with pytest.warns(UserWarning, match=r"flag\.mtl.*texture=") as caught:
         objects.load(path)
@@ -145,7 +145,7 @@ def test_missing_material_is_named_once_and_texture_mends_it(tmp_path):
     assert looked_up(body)[corners(body)[..., 2] > 0][:, 0].min() > 0.5
 
 
-def test_missing_and_torn_images(tmp_path):
+def test_missing_and_torn_images_are_named(tmp_path):
     path = flag(tmp_path, image=False)
     with pytest.warns(UserWarning, match=r"flag\.png"):
         objects.load(path)
@@ -156,7 +156,7 @@ def test_missing_and_torn_images(tmp_path):
         objects.load(path, texture=tmp_path / "none.png")
 
 
-def test_texture_needs_coordinates(box, tmp_path):
+def test_texture_needs_texture_coordinates(box, tmp_path):
     flag(tmp_path)
     with pytest.raises(ValueError, match="no texture coordinates"):
         objects.load(box, texture=tmp_path / "flag.png")
@@ -213,7 +213,7 @@ def test_several_textures_become_one(tmp_path):
         np.testing.assert_allclose(color[rows], np.broadcast_to(truth, color[rows].shape), atol=2e-2)
 
 
-def test_bowl_takes_its_hull_with_one_warning(tmp_path):
+def test_an_open_bowl_takes_the_volume_of_its_hull_with_one_warning(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.04)
     keep = ball.triangles_center[:, 2] < 0
     bowl = trimesh.Trimesh(ball.vertices, ball.faces[keep])
@@ -231,7 +231,7 @@ def test_bowl_takes_its_hull_with_one_warning(tmp_path):
         assert objects.load(path, mass=0.1).two_sided  # needs no volume
 
 
-def test_flat_mesh_fails(tmp_path):
+def test_a_flat_mesh_is_refused(tmp_path):
     sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], [[0, 1, 2], [0, 2, 3]])
     sheet.export(tmp_path / "sheet.stl")
     with pytest.raises(ValueError, match=r"sheet\.stl.*flat"):
@@ -248,7 +248,7 @@ def test_inside_out_mesh_is_turned(tmp_path):
     assert (outward > 0).all()
 
 
-def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
+def test_hull_gap_is_the_error_of_a_hull_of_64_vertices(tmp_path):
     trimesh.creation.icosphere(subdivisions=3, radius=0.04).export(tmp_path / "ball.stl")
     body = objects.load(tmp_path / "ball.stl")
     assert body.hulls.shape == (1, 64, 3)
@@ -275,12 +275,31 @@ def test_ball_keeps_64_hull_vertices_and_states_the_rest(tmp_path):
         ({"longest_side": "10 cm"}, "longest_side must be a positive number of metres, got '10 cm'"),
     ],
 )
-def test_bad_arguments(box, arguments, message):
+def test_arguments_out_of_range_are_refused(box, arguments, message):
     with pytest.raises(ValueError, match=message):
         inspect.unwrap(objects.load)(box, **arguments)
 
 
-def test_larger_than_the_pad(tmp_path):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scale": 0.0}, "scale must be a positive"),
+        ({"largest": -1.0}, "largest must be a positive"),
+        ({"largest": 0.2}, r"the pad is 0\.15 m"),
+        ({"density": 0.0}, "density must be a positive"),
+        ({"scale": 1.0, "longest_side": 0.1}, "not both"),
+        ({"faces": 2}, "faces must be a whole number, at least 4"),
+        ({"up": (0.0, 0.0, 0.0)}, "not all zero"),
+        ({"up": (0.0, 1.0, 0.0)}, "must not be parallel"),
+        ({"up": "z", "front": (0.0, -1.0, 0.0)}, "three numbers if front is given"),
+    ],
+)
+def test_sizes_and_directions_out_of_range_are_refused(box, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        objects.load(box, **arguments)
+
+
+def test_an_object_larger_than_the_pad_is_refused(tmp_path):
     trimesh.creation.box((100, 60, 40)).export(tmp_path / "millimetres.stl")
     with pytest.raises(ValueError, match=r"millimetres\.stl.*longest side is 100 m.*longest_side"):
         objects.load(tmp_path / "millimetres.stl")
@@ -288,7 +307,7 @@ def test_larger_than_the_pad(tmp_path):
     np.testing.assert_allclose(np.ptp(np.asarray(body.vertices), axis=0).max(), 0.1, rtol=1e-5)
 
 
-def test_missing_torn_and_empty_files(tmp_path):
+def test_missing_torn_and_empty_files_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nothing\.obj"):
         objects.load(tmp_path / "nothing.obj")
     trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(tmp_path / "whole.glb")
@@ -309,7 +328,7 @@ def test_missing_torn_and_empty_files(tmp_path):
 
 @pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
 @pytest.mark.parametrize("part", [0.01, 0.3, 0.98])
-def test_a_truncated_stl_is_said_to_be_truncated(tmp_path, kind, part):
+def test_a_truncated_stl_is_refused_as_truncated(tmp_path, kind, part):
     whole = trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(file_type=kind)
     whole = whole.encode() if isinstance(whole, str) else whole
     torn = tmp_path / "torn.stl"
@@ -320,7 +339,7 @@ def test_a_truncated_stl_is_said_to_be_truncated(tmp_path, kind, part):
         objects.load(torn)
 
 
-def test_an_off_of_random_bytes_is_said_to_be_damaged(tmp_path):
+def test_an_off_of_random_bytes_is_refused_as_damaged(tmp_path):
     path = tmp_path / "damaged.off"
     path.write_bytes(np.random.default_rng(0).integers(128, 256, 2000, np.uint8).tobytes())
     with pytest.raises(ValueError, match=r"damaged\.off: cannot be read as a mesh") as error:
@@ -344,7 +363,7 @@ def test_a_folder_an_empty_file_and_an_unreadable_one_are_named(tmp_path, box, m
         objects.load(box)
 
 
-def test_nan_vertices(tmp_path):
+def test_nan_vertices_are_refused(tmp_path):
     mesh = trimesh.creation.box((0.1, 0.06, 0.04))
     lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
     lines[3] = "v nan 0 0"
@@ -354,7 +373,7 @@ def test_nan_vertices(tmp_path):
         objects.load(tmp_path / "nan.obj")
 
 
-def test_too_many_faces(tmp_path, monkeypatch):
+def test_too_many_faces_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "FACE_CLASSES", (2048, 4096))
     trimesh.creation.icosphere(subdivisions=4, radius=0.04).export(tmp_path / "fine.stl")
     with pytest.raises(ValueError, match=r"fine\.stl: has 5,120 faces, but at most 4,096.*decimate"):
@@ -362,12 +381,12 @@ def test_too_many_faces(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("faces", [10.5, 3, True, "100"])
-def test_a_number_of_faces_that_cannot_be_is_named(tmp_path, faces):
+def test_an_invalid_number_of_faces_is_refused(tmp_path, faces):
     with pytest.raises(ValueError, match=rf"faces must be a whole number, at least 4, got {faces!r}"):
         inspect.unwrap(objects.load)(tmp_path / "none.stl", faces=faces)
 
 
-def test_public_textured_mesh():
+def test_a_public_textured_mesh_loads():
     # miniworld's potion bottle (Farama Foundation): made by nobody here, and its OBJ names a material nobody has.
     folder = public_meshes()
     body = objects.load(folder / "potion.obj", longest_side=0.08, up="y", texture=folder / "potion.png", strict=True)

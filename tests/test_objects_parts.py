@@ -1,4 +1,4 @@
-"""Convex parts and the gaps between what is seen and what collides."""
+"""Convex parts, and the gaps between the visible surface and the collision geometry."""
 
 import sys
 
@@ -8,13 +8,14 @@ import pytest
 import trimesh
 
 from sts_jax import objects
-from sts_jax.objects.solids import convex_parts, outside_hull, surface_gaps
+from sts_jax.objects.hulls import outside_hull
+from sts_jax.objects.parts import convex_parts, surface_gaps
 
 pytestmark = pytest.mark.slow
 
 
 def corner_piece() -> trimesh.Trimesh:
-    """An L of two arms, 100 and 80 mm long and 20 mm thick, in the plane y = 0; its cavity is x > 20 mm, z > 20 mm."""
+    """An L of two arms, 100 and 80 mm long and 20 mm thick, in the plane y = 0. Its cavity is x > 20 mm, z > 20 mm."""
     outline = np.array([[0, 0], [0.1, 0], [0.1, 0.02], [0.02, 0.02], [0.02, 0.08], [0, 0.08]])
     front = np.insert(outline, 1, -0.02, axis=1)
     back = np.insert(outline, 1, 0.02, axis=1)
@@ -34,7 +35,7 @@ def bowl(radius: float = 0.05, wall: float = 0.006) -> trimesh.Trimesh:
 
 
 def inside(points: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
-    """By linear programming's cousin: a point is inside where the hull of it and the part is the part."""
+    """Whether points are inside any part: the hull of a part and a point inside it has the volume of the part."""
     volumes = [trimesh.convex.convex_hull(part).volume for part in parts]
     grown = [[trimesh.convex.convex_hull(np.vstack([part, point])).volume for part in parts] for point in points]
     return (np.array(grown) <= np.array(volumes) * (1 + 1e-9)).any(axis=1)
@@ -88,14 +89,14 @@ def test_gaps_of_known_shapes():
 def test_gap_of_a_corner_is_that_of_its_cavity():
     mesh = corner_piece()
     gaps = surface_gaps(np.asarray(mesh.vertices), np.asarray(mesh.faces), [np.asarray(mesh.convex_hull.vertices)])
-    # The hull's slanted side from (100, 20) to (20, 80): furthest from both arms where it is as far from either.
+    # On the hull's slanted side from (100, 20) to (20, 80), the point furthest from both arms is equally far from them.
     along = np.linspace(0, 1, 100_001)
     x, z = 0.1 - 0.08 * along, 0.02 + 0.06 * along
     truth = np.minimum(z - 0.02, x - 0.02).max()
     assert gaps == pytest.approx((0, truth), rel=0.01, abs=1e-9)
 
 
-def test_a_sheet_encloses_nothing():
+def test_the_gap_of_an_open_sheet_is_measured_on_both_sides():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
     sheet = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0])
     for faces in (sheet.faces, sheet.faces[:, ::-1]):
@@ -111,14 +112,14 @@ def test_distance_from_a_hull_of_many_points_at_once():
     np.testing.assert_allclose(outside_hull(points, np.asarray(hull)), np.linalg.norm(beyond, axis=1), atol=1e-9)
 
 
-def test_parts_name_their_package(monkeypatch):
+def test_the_error_names_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "coacd", None)
     mesh = corner_piece()
     with pytest.raises(ImportError, match=r"coacd.*sts_jax\[meshes\]"):
         convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def test_a_decomposed_body_is_the_body_but_for_its_hulls(tmp_path):
+def test_decomposition_changes_only_the_hulls(tmp_path):
     corner_piece().export(tmp_path / "corner.stl")
     whole, body = objects.load(tmp_path / "corner.stl"), objects.load(tmp_path / "corner.stl", parts=True)
     assert body.hulls.shape == (objects.PART_CLASSES[1], objects.HULL_CLASSES[0], 3)
@@ -130,14 +131,14 @@ def test_a_decomposed_body_is_the_body_but_for_its_hulls(tmp_path):
     assert max(objects.gaps(body)) < 0.002
 
 
-def test_what_is_convex_stays_as_it_is(tmp_path):
+def test_a_convex_body_stays_unchanged(tmp_path):
     trimesh.creation.box((0.06, 0.04, 0.02)).export(tmp_path / "box.stl")
     body = objects.load(tmp_path / "box.stl")
     assert objects.decompose(body) is body
     assert objects.gaps(body) == pytest.approx((0, 0), abs=1e-6)
 
 
-def test_scissors_open_up():
+def test_decomposed_scissors_leave_the_space_between_the_blades_free():
     scissors = objects.make(jax.random.key(0), "scissors")
     body = objects.decompose(scissors)
     assert body.hulls.shape[0] == objects.PART_CLASSES[1]

@@ -7,6 +7,7 @@ from scipy.spatial import ConvexHull
 
 from sts_jax import objects
 from sts_jax._keys import check_key
+from sts_jax.objects.procedural import FAMILIES
 
 KEYS = [3, 17, 400]
 SOLID = ("scissors", "fork", "spoon")
@@ -22,8 +23,17 @@ def bodies() -> dict[str, list[objects.Body]]:
     return {c: [objects.make(jax.random.key(k), c) for k in KEYS] for c in objects.CATEGORIES}
 
 
+def test_each_category_has_a_family_whose_seed_never_changes():
+    # A body of one of these classes is the same in every version only if its seed is.
+    names = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon", "watch")
+    assert names == objects.CATEGORIES
+    assert [(name, family.name, family.seed) for name, family in FAMILIES.items()] == [
+        (name, name, seed) for seed, name in enumerate(names)
+    ]
+
+
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_fits_its_classes_and_the_pad(bodies, category):
+def test_a_body_fits_its_size_classes_and_the_pad(bodies, category):
     for body in bodies[category]:
         assert body.vertices.shape == (objects.FACE_CLASSES[0], 3)
         assert body.faces.shape == (objects.FACE_CLASSES[0], 3)
@@ -37,7 +47,7 @@ def test_fits_its_classes_and_the_pad(bodies, category):
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_what_collides_is_what_is_seen(bodies, category):
+def test_the_hull_consists_of_visible_vertices(bodies, category):
     for body in bodies[category]:
         assert objects.hull_gap(body) < 1e-4  # m: stated 0.1 mm, aim 0.2 mm
         seen = {tuple(p) for p in np.asarray(body.vertices)}
@@ -48,7 +58,7 @@ def test_what_collides_is_what_is_seen(bodies, category):
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_hull_suits_the_collider(bodies, category):
+def test_mjx_keeps_every_corner_of_the_hull(bodies, category):
     for body in bodies[category]:
         shape = ConvexHull(np.unique(np.asarray(body.hulls[0], float), axis=0))
         assert (shape.equations[:, 3] < -1e-3).all()  # the origin is inside, by a millimetre and more
@@ -58,7 +68,7 @@ def test_hull_suits_the_collider(bodies, category):
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_normals_and_colours(bodies, category):
+def test_normals_point_outwards_and_colours_are_in_range(bodies, category):
     for body in bodies[category]:
         faces = real_faces(body)
         vertices = np.asarray(body.vertices, float)
@@ -75,7 +85,7 @@ def test_normals_and_colours(bodies, category):
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_mass_is_that_of_the_surface(bodies, category):
+def test_the_mass_follows_from_the_area_of_the_surface(bodies, category):
     for body in bodies[category]:
         triangles = np.asarray(body.vertices, float)[real_faces(body)]
         area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
@@ -87,7 +97,7 @@ def test_mass_is_that_of_the_surface(bodies, category):
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_contents(bodies, category):
+def test_containers_hold_water_and_solid_objects_hold_nothing(bodies, category):
     for body in bodies[category]:
         if category in SOLID:
             assert not np.asarray(body.interior).any()
@@ -104,7 +114,7 @@ def test_contents(bodies, category):
         assert np.asarray(body.vertices)[:, 2].min() < height[0]
 
 
-def test_same_key_same_object_other_key_another():
+def test_equal_keys_give_equal_objects_and_other_keys_others():
     for category in objects.CATEGORIES:
         one = objects.make(jax.random.key(5), category)
         again = objects.make(jax.random.key(5), category)
@@ -113,7 +123,7 @@ def test_same_key_same_object_other_key_another():
         assert not np.array_equal(one.vertices, other.vertices)
 
 
-def test_bottles_are_those_of_the_shaken_scenario():
+def test_bottles_have_the_documented_ranges():
     bottles = [objects.make(jax.random.key(k), "bottle") for k in range(40)]
     height = np.array([np.ptp(np.asarray(b.vertices)[:, 2]) for b in bottles])
     foot = []
@@ -132,13 +142,13 @@ def test_bottles_are_those_of_the_shaken_scenario():
     np.testing.assert_allclose(axes, 0, atol=1e-5)  # the axis is z
 
 
-def test_unknown_category():
+def test_an_unknown_category_is_refused():
     with pytest.raises(ValueError, match=r"teapot.*bottle.*watch"):
         objects.make(jax.random.key(0), "teapot")
 
 
 @pytest.mark.parametrize("category", objects.CATEGORIES)
-def test_it_stands_or_lies_as_made(bodies, category):
+def test_a_body_is_stable_in_the_attitude_in_which_it_is_made(bodies, category):
     for body in bodies[category]:
         hull = np.asarray(body.hulls[0], float)
         foot = hull[hull[:, 2] < hull[:, 2].min() + 1.5e-3, :2]
@@ -149,12 +159,12 @@ def test_it_stands_or_lies_as_made(bodies, category):
 
 
 @pytest.mark.parametrize("key", [0, None, np.zeros(2, np.int64), [0, 1]])
-def test_a_key_that_is_none_is_named_with_the_remedy(key):
+def test_an_invalid_key_is_refused_with_the_remedy(key):
     with pytest.raises(TypeError, match=rf"key is {re.escape(repr(key))}; it takes a JAX key: jax\.random\.key\(0\)"):
         check_key(key)
 
 
-def test_keys_in_an_array_are_refused_and_those_of_the_older_kind_are_taken():
+def test_an_array_of_keys_is_refused_and_a_key_of_the_older_kind_is_accepted():
     with pytest.raises(TypeError, match=r"key has shape \(2,\); it takes one key"):
         check_key(jax.random.split(jax.random.key(0)))
     old, new = objects.make(jax.random.PRNGKey(3), "bottle"), objects.make(jax.random.key(3), "bottle")

@@ -47,6 +47,11 @@ class Identity(NamedTuple):
     shard: int  # index of the shard
 
 
+def shard_path(folder: Path, count: int, index: int) -> Path:
+    """The record file of shard `index` of `count`."""
+    return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
+
+
 def check_format(content: Any, folder: Path) -> None:
     """Check that this version reads a dataset, given the content of its `collection.json`.
 
@@ -201,16 +206,16 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
     """Read some records of equal length, `uint8 (n, length)`."""
     if not path.is_file():
         raise _missing(path)
-    torn = f"{path} is torn; delete it and {path.with_suffix('.npz').name} and start the collection again"
+    again = f"delete it and {path.with_suffix('.npz').name} and start the collection again"
     try:
         reader = ArrayRecordReader(str(path))
         count = reader.num_records()
         records = reader.read([int(i) for i in indices]) if count == total and len(indices) else []
         reader.close()
     except (RuntimeError, ValueError, IndexError) as error:
-        raise TornFileError(f"{torn} ({error}).") from error
+        raise TornFileError(f"{path} is torn ({error}): {again}.") from error
     if count != total:
-        raise TornFileError(f"{torn} (it holds {count} records instead of {total}).")
+        raise TornFileError(f"{path} is torn, because it holds {count} records instead of {total}: {again}.")
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
 
 

@@ -12,10 +12,12 @@ from sts_jax.objects.body import (
     rigid,
     stack,
 )
-from sts_jax.objects.libraries import HOLLOW, Entry, Item, Library, bodies, describe, facts, library, read, survey
+from sts_jax.objects.hulls import DIRECTIONS, lattice, rest_poses, support
+from sts_jax.objects.items import Entry, Item, Library
+from sts_jax.objects.libraries import HOLLOW, bodies, describe, facts, library, read, survey
 from sts_jax.objects.meshes import load
-from sts_jax.objects.procedural import make
-from sts_jax.objects.solids import DIRECTIONS, decompose, gaps, hull_gap, lattice, rest_poses, support
+from sts_jax.objects.parts import decompose, gaps, hull_gap
+from sts_jax.objects.procedural import Family, find_family, make
 
 __all__ = [
     "CATEGORIES",
@@ -27,6 +29,7 @@ __all__ = [
     "TEXTURE_CLASSES",
     "Body",
     "Entry",
+    "Family",
     "Item",
     "Library",
     "bodies",
@@ -34,6 +37,7 @@ __all__ = [
     "describe",
     "facts",
     "fill_moments",
+    "find_family",
     "gaps",
     "hull_gap",
     "lattice",

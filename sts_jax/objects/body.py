@@ -16,6 +16,8 @@ FACE_CLASSES = (1024, 4096, 16384, 131072)
 PART_CLASSES = (1, 8)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
+PAD = 0.15  # m, side of the sensor's pad, which larger objects do not fit
+SMALLEST = 0.005  # m, longest side of the smallest object: a shorter one probably has another unit
 LEVEL_STEPS = 30  # bisection steps for the level of the contents, beyond the resolution of float32
 
 Direction = Float[Array | np.ndarray, "3"] | tuple[float, float, float]
@@ -96,6 +98,17 @@ class Body:
         full = float(self.contents_density) * volume
         holds = f"holds {full:.3g} kg in {1e6 * volume:.3g} ml" if full > 0 else "solid"
         return f"Body({name}, {size} mm, {float(self.shell_mass):.3g} kg, {holds}, {faces:,} faces, {hull})"
+
+
+def size_class(count: int, classes: tuple[int, ...]) -> int:
+    """The smallest of some padding classes that holds `count` items."""
+    return next(size for size in classes if count <= size)
+
+
+def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
+    """Append a value until an array has `size` rows."""
+    padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
+    return np.concatenate([array, padding])
 
 
 def check_category(category: object) -> None:

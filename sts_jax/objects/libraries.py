@@ -5,107 +5,34 @@ fills the cache if there is one, and lists each object with its size or its erro
 collection.
 """
 
-import csv
 import dataclasses
-import hashlib
-import io
-import json
 import math
 import os
-import tempfile
 import warnings
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 import trimesh
 from scipy.spatial import ConvexHull
 
-from sts_jax.objects.body import CATEGORIES, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
-from sts_jax.objects.meshes import AXES, PAD, load, references, rotation
-from sts_jax.objects.procedural import STEEL
-from sts_jax.objects.solids import WALL, decompose, gaps
+from sts_jax.objects import body_cache, shapenet
+from sts_jax.objects.assembly import STEEL, WALL
+from sts_jax.objects.body import CATEGORIES, PAD, Body
+from sts_jax.objects.items import LARGEST, NUM_FACES, Entry, Item, Library
+from sts_jax.objects.meshes import AXES, load
+from sts_jax.objects.parts import decompose, gaps
 
-LARGEST = 0.12  # m, longest side: larger objects are scaled down to it, so that they can lie on the 0.15 m pad
 THINNEST = 0.0005  # m, a hull thinner than this is a sheet, which has no stable contacts
 HOLLOW = 0.002  # m, a hull that stands off the surface by more than this is worth decomposing
-NUM_FACES = 4096  # largest padding class for which rendering stays cheap
-
-# Class of each of ShapeNetSem's categories (the `category` column of its metadata.csv, named in its taxonomy.txt).
-# "Mouse" is left out because, unlike "ComputerMouse", it may be the animal.
-SHAPENET_CLASSES = {
-    "Bottle": "bottle",
-    "BeerBottle": "bottle",
-    "DrinkBottle": "bottle",
-    "PillBottle": "bottle",
-    "SoapBottle": "bottle",
-    "WineBottle": "bottle",
-    "Camera": "camera",
-    "DSLRCamera": "camera",
-    "WebCam": "webcam",
-    "ComputerMouse": "mouse",
-    "Scissors": "scissors",
-    "Fork": "fork",
-    "Spoon": "spoon",
-    "Watch": "watch",
-}
-# The required columns among those in ShapeNetSem's README: id, categories, directions, metres per unit.
-_COLUMNS = ("fullId", "category", "up", "front", "unit")
-# Defaults of ShapeNet's own viewer for missing directions (ShapeNet/shapenet-viewer, Constants.scala).
-_UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 
 _SOLID = ("scissors", "fork", "spoon")  # classes of solid steel objects
 # Formats other than meshes that trimesh reads: archives, points, drawings.
 _NO_MESH = {"zip", "gz", "tar.gz", "bz2", "tar.bz2", "xyz", "dxf", "svg", "json", "dict", "dict64", "msgpack", "xml"}
 # Mesh formats that trimesh reads only with further packages, or not at all.
 _OTHERS = {".3ds", ".3mf", ".blend", ".dae", ".fbx", ".step", ".stp", ".usd", ".usdz", ".wrl", ".x3d"}
-_FORMAT = 1  # version of cached objects, increased whenever the same file and settings give a different body
-
-Vector = tuple[float, float, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Item:
-    """One mesh file and the settings for loading it."""
-
-    path: Path
-    name: str  # path within the folder, or ShapeNetSem's model id
-    label: str  # class
-    up: Vector  # direction in the file that becomes +z
-    front: Vector  # direction in the file that becomes -y
-    scale: float | None = None  # m, length of one unit of the file
-    longest_side: float | None = None  # m, instead of a scale
-    textures: Path | None = None  # folder of images that are not beside the file
-    stated: float | None = None  # m, longest side according to ShapeNetSem's table
-    notes: tuple[str, ...] = ()
-
-
-@dataclasses.dataclass(frozen=True)
-class Library:
-    """The objects of a folder in a fixed order, and the skipped files with the reasons."""
-
-    folder: Path
-    items: tuple[Item, ...]
-    skipped: tuple[tuple[str, str], ...]  # (name, reason)
-    classes: tuple[str, ...]  # of the items, sorted
-    cache: Path | None = None  # folder of the cached bodies
-    faces: int = NUM_FACES  # meshes with more are decimated
-    largest: float = LARGEST  # m, longer objects are scaled down
-    parts: bool = False  # whether objects that their hull fits badly collide as convex parts
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """An item, loaded as a body."""
-
-    item: Item
-    body: Body
-    gaps: tuple[float, float]  # m, how far the surface sticks out of the collision parts, and the reverse
-    notes: tuple[str, ...]
 
 
 def library(
@@ -122,9 +49,9 @@ def library(
     """List the objects of a folder without opening a mesh.
 
     A folder with ShapeNetSem's metadata.csv is read by that table. `unit` gives the size, `up` and `front` the
-    attitude, and `category` one of CATEGORIES (see SHAPENET_CLASSES). Meshes are expected at models-OBJ/models/ID.obj,
-    images in models-textures/textures. In any other folder, every mesh file is an object. Its class is the first
-    sub-folder of its path, or the name of the folder for a file directly in it.
+    attitude, and `category` one of CATEGORIES. Meshes are expected at models-OBJ/models/ID.obj, images in
+    models-textures/textures. In any other folder, every mesh file is an object. Its class is the first sub-folder of
+    its path, or the name of the folder for a file directly in it.
 
     Args:
         folder: the folder of objects.
@@ -147,7 +74,7 @@ def library(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of objects")
+        raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
     if scale is not None and longest_side is not None:
         raise ValueError(f"{folder}: give scale or longest_side, not both")
     for name, value, most in (
@@ -162,8 +89,8 @@ def library(
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
     if faces < 4:
         raise ValueError(f"{folder}: faces must be at least 4, got {faces}")
-    root = _shapenet_root(folder)
-    items, skipped = _walked(folder) if root is None else _tabled(root)
+    root = shapenet.find_root(folder)
+    items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
         reasons = "".join(f"\n  {name}: {reason}" for name, reason in skipped[:5])
         raise ValueError(f"{folder}: holds no mesh that can be used: give a folder with mesh files in it{reasons}")
@@ -185,6 +112,7 @@ def library(
 
 
 def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
+    """The mesh files of any folder, and (name, reason) of each that trimesh cannot read."""
     suffixes = {f".{name}" for name in trimesh.available_formats() - _NO_MESH}
     items, skipped = [], []
     for path in sorted(folder.rglob("*")):
@@ -208,107 +136,6 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
     return items, skipped
 
 
-# ShapeNetSem.
-
-
-def _shapenet_root(folder: Path) -> Path | None:
-    """The folder with the table: the given folder, or a sub-folder as the archive unpacks it."""
-    for table in (folder / "metadata.csv", *sorted(folder.glob("*/metadata.csv"))):
-        if table.is_file():
-            with table.open(encoding="utf-8", errors="replace", newline="") as lines:
-                header = next(csv.reader(lines), [])
-            if "fullId" in header or len(set(_COLUMNS) & set(header)) > 2 or (table.parent / "models-OBJ").is_dir():
-                return table.parent
-    return None
-
-
-def _tabled(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
-    rows = _rows(root / "metadata.csv")
-    items: list[Item] = []
-    skipped: list[tuple[str, str]] = []
-    meshes = [root / "models-OBJ" / "models", root / "models-OBJ", root / "models"]
-    textures = [root / "models-textures" / "textures", root / "models-textures", root / "textures"]
-    images = next((place for place in textures if place.is_dir()), None)
-    others, seen = 0, set()
-    for row in rows:
-        name = row["fullId"].strip().rpartition(".")[2]  # "wss.<id>"
-        categories = [part.strip() for part in row["category"].split(",") if part.strip()]
-        labels = {SHAPENET_CLASSES[part] for part in categories if part in SHAPENET_CLASSES}
-        if "webcam" in labels:
-            labels.discard("camera")
-        if not labels or not name:
-            others += 1
-            continue
-        try:
-            if name in seen:
-                raise ValueError("its id is in the table twice, and the first row is used")
-            seen.add(name)
-            if "_BAD" in categories:
-                raise ValueError("marked _BAD in the table")
-            if len(labels) > 1:
-                raise ValueError(f"it has several classes ({', '.join(sorted(labels))})")
-            path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
-            if path is None:
-                raise ValueError(f"models-OBJ/models/{name}.obj does not exist")
-            items.append(_shapenet_item(row, path, name, labels.pop(), images))
-        except ValueError as error:
-            skipped.append((name, str(error)))
-    if others:
-        skipped.append(("metadata.csv", f"{others:,} of {len(rows):,} models are of none of the eight classes"))
-    return items, skipped
-
-
-def _rows(table: Path) -> list[dict[str, str]]:
-    text = table.read_text(encoding="utf-8", errors="replace")
-    for escape in (None, "\\"):  # commas inside a value are quoted, escaped or both
-        reader = csv.DictReader(io.StringIO(text), escapechar=escape, restkey="rest", restval="")
-        missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
-        if missing:
-            raise ValueError(
-                f"{table}: lacks the columns {', '.join(missing)} of ShapeNetSem's table: download it again"
-            )
-        try:
-            rows = list(reader)
-        except csv.Error as error:
-            raise ValueError(f"{table}: cannot be read as a table ({error}): download it again") from error
-        if not any("rest" in row for row in rows):
-            return rows
-    raise ValueError(f"{table}: has rows with more cells than columns: download it again")
-
-
-def _shapenet_item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:
-    unit = row["unit"].strip()
-    if not unit:
-        raise ValueError("its unit is missing, so its size is unknown")
-    try:
-        scale = float(unit)
-    except ValueError:
-        scale = float("nan")
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"its unit is {unit!r}, not a positive number of metres")
-    notes = [f"no {key} in the table: ShapeNet's default" for key in ("up", "front") if not row[key].strip()]
-    up, front = _vector(row["up"], "up") or _UP, _vector(row["front"], "front") or _FRONT
-    rotation(up, front)  # raises an error if they do not define a rotation
-    # ShapeNetSem's README gives these in metres, but the released table holds centimetres.
-    sides = _vector(row.get("aligned.dims", ""), "aligned.dims")
-    stated = None if sides is None else max(sides) / 100
-    return Item(path, name, label, up, front, scale=scale, textures=images, stated=stated, notes=tuple(notes))
-
-
-def _vector(text: str, key: str) -> Vector | None:
-    text = text.strip().strip('"')
-    if not text:
-        return None
-    try:
-        x, y, z = (float(part) for part in text.replace("\\", "").split(","))
-    except ValueError as error:
-        raise ValueError(f"its {key} is {text!r}, not three numbers") from error
-    return x, y, z
-
-
-# Bodies.
-
-
 def read(collection: Library, index: int) -> Entry:
     """Load one item as a body, through the cache if the library has one.
 
@@ -330,12 +157,12 @@ def read(collection: Library, index: int) -> Entry:
     item = collection.items[index]
     if collection.cache is None:
         return _made(collection, item)
-    place = collection.cache / f"{_key(collection, item)}.npz"
-    kept = _kept(place, item)
-    if kept is None:
-        kept = _made(collection, item)
-        _keep(place, kept)
-    return kept
+    path = body_cache.path_of(collection, item)
+    entry = body_cache.read(path, item)
+    if entry is None:
+        entry = _made(collection, item)
+        body_cache.write(path, entry)
+    return entry
 
 
 def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[list[Body], list[tuple[str, str]]]:
@@ -414,6 +241,7 @@ def facts(body: Body, apart: tuple[float, float]) -> list[str]:
 
 
 def _tried(collection: Library, index: int) -> Entry | str:
+    """An item as a body, or the reason why it cannot be loaded."""
     item = collection.items[index]
     try:
         return read(collection, index)
@@ -429,8 +257,9 @@ def _short(message: object, item: Item) -> str:
 
 
 def _made(collection: Library, item: Item) -> Entry:
+    """An item, loaded from its file. Warnings become notes."""
     solid = item.label in _SOLID
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         body = load(
             item.path,
@@ -445,7 +274,7 @@ def _made(collection: Library, item: Item) -> Entry:
             faces=collection.faces,
             category=CATEGORIES.index(item.label) if item.label in CATEGORIES else -1,
         )
-    notes = [_short(warning.message, item) for warning in said]
+    notes = [_short(warning.message, item) for warning in caught]
     vertices = np.asarray(body.vertices, float)
     longest = float(np.ptp(vertices, axis=0).max())
     if item.stated is not None and not 0.9 < longest / min(item.stated, collection.largest) < 1.1:
@@ -462,43 +291,3 @@ def _made(collection: Library, item: Item) -> Entry:
         except ValueError as error:
             notes.append(str(error))
     return Entry(item, body, apart, (*item.notes, *notes))
-
-
-# The cache has one file per object. Its name is a hash of everything that the body depends on.
-
-
-def _key(collection: Library, item: Item) -> str:
-    digest = hashlib.sha256()
-    fields = [field.name for field in dataclasses.fields(Body)]
-    settings = [item.scale, item.longest_side, item.up, item.front, item.label, item.notes]
-    layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
-    digest.update(json.dumps([layout, settings, collection.faces, collection.largest, collection.parts]).encode())
-    try:
-        named = references(item.path, item.textures)
-    except (OSError, ValueError):
-        named = {}  # `load` raises an error for it
-    if not item.path.is_file():
-        raise FileNotFoundError(f"{item.path}: no such mesh file")
-    for name, path in [(item.path.name, item.path), *sorted(named.items())]:
-        digest.update(name.encode() + b"\0" + (b"" if path is None else hashlib.sha256(path.read_bytes()).digest()))
-    return digest.hexdigest()[:32]
-
-
-def _keep(place: Path, entry: Entry) -> None:
-    """Write under a temporary name and rename, so that a reader sees a complete file or none."""
-    place.parent.mkdir(parents=True, exist_ok=True)
-    about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
-    leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
-    with tempfile.NamedTemporaryFile(dir=place.parent, prefix=".", suffix=".part", delete=False) as file:
-        np.savez(file, about=np.frombuffer(about.encode(), np.uint8), **leaves)
-    os.replace(file.name, place)
-
-
-def _kept(place: Path, item: Item) -> Entry | None:
-    try:
-        with place.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})
-            about = json.loads(data["about"].tobytes())
-        return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None  # missing or damaged: the body is loaded again

@@ -1,25 +1,23 @@
 """Mesh files as bodies, in any format that trimesh reads, with textures or colours."""
 
-import json
 import os
-import re
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from PIL import Image
-from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial import ConvexHull
 
-from sts_jax.objects.body import FACE_CLASSES, TEXTURE_CLASSES, Body, check_category
-from sts_jax.objects.solids import CONTENTS, WALL, assemble, convex_hull, decompose, linear, surface_samples
-
-PAD = 0.15  # m, side of the sensor's pad, which larger objects do not fit
-SMALLEST = 0.005  # m, longest side of the smallest object: a shorter file probably has another unit
-PLAIN = 0.7  # sRGB grey of a mesh without colours
+from sts_jax.objects.assembly import CONTENTS, WALL, assemble
+from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body, check_category
+from sts_jax.objects.decimation import decimate
+from sts_jax.objects.hulls import convex_hull
+from sts_jax.objects.materials import Resolver, albedo, check_materials, read_image
+from sts_jax.objects.parts import decompose
+from sts_jax.objects.surface import Surface, is_closed, merge
 
 # Up and front of a file for which only the up axis is given. Front becomes -y. The front of a glTF is +z (glTF
 # specification).
@@ -115,6 +113,43 @@ def load(
             is out of range.
     """
     path = Path(path)
+    _check_arguments(path, longest_side, scale, largest, mass, density, faces, category)
+    turn = _attitude(path, up, front)
+    _check_file(path)
+    images = None if textures is None else Path(textures)
+    if texture is None:
+        check_materials(path, images, strict)
+    pieces = _read(path, images, None if texture is None else Path(texture))
+    number = sum(len(piece.faces) for piece in pieces)
+    if faces is None and number > FACE_CLASSES[-1]:
+        raise ValueError(
+            f"{path}: has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: give faces= to decimate it"
+        )
+    corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
+    if not np.isfinite(corners).all():
+        bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
+        raise ValueError(f"{path}: {bad} faces have NaN or infinite vertices: repair the mesh")
+    surface = merge(path, corners * _factor(path, corners, longest_side, scale, largest), *albedo(path, pieces))
+    if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
+        surface = decimate(path, surface, faces)
+    body = _body(path, surface, mass, density, hollow, strict, category)
+    try:
+        return decompose(body) if parts else body
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _check_arguments(
+    path: Path,
+    longest_side: float | None,
+    scale: float | None,
+    largest: float | None,
+    mass: float | None,
+    density: float,
+    faces: int | None,
+    category: int,
+) -> None:
+    """Raise an error that names the first argument of `load` that is out of range."""
     for name, value, unit in (
         ("longest_side", longest_side, "metres"),
         ("scale", scale, "metres"),
@@ -141,23 +176,28 @@ def load(
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and (isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4):
         raise ValueError(f"{path}: faces must be a whole number, at least 4, got {faces!r}")
+
+
+def _attitude(
+    path: Path, up: Literal["x", "y", "z"] | tuple[float, float, float], front: tuple[float, float, float] | None
+) -> np.ndarray:
+    """The rotation of the arguments `up` and `front` of `load`."""
     if isinstance(up, str):
         if up not in AXES or front is not None:
             raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers if front is given, got {up!r}")
-        turn = rotation(*AXES[up])
-    else:
-        try:
-            turn = rotation(up, AXES["z"][1] if front is None else front)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-    _check_file(path)
-    sheet = None if texture is None else _image(Path(texture))
-    images = None if textures is None else Path(textures)
-    if sheet is None:
-        _check_materials(path, images, strict)
+        return rotation(*AXES[up])
+    try:
+        return rotation(up, AXES["z"][1] if front is None else front)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh.Trimesh]:
+    """The meshes of a file. The image `texture` replaces their textures."""
+    sheet = None if texture is None else read_image(texture)
     try:
         # trimesh opens the images itself, so only a resolver can make it look in a separate folder of images.
-        resolver = None if images is None else _Resolver(path, images)
+        resolver = None if images is None else Resolver(path, images)
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
@@ -177,23 +217,7 @@ def load(
             )
         material = trimesh.visual.material.PBRMaterial(baseColorTexture=sheet)
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
-    number = sum(len(piece.faces) for piece in pieces)
-    if faces is None and number > FACE_CLASSES[-1]:
-        raise ValueError(
-            f"{path}: has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: give faces= to decimate it"
-        )
-    corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
-    if not np.isfinite(corners).all():
-        bad = int((~np.isfinite(corners)).any(axis=(1, 2)).sum())
-        raise ValueError(f"{path}: {bad} faces have NaN or infinite vertices: repair the mesh")
-    surface = _surface(path, corners * _factor(path, corners, longest_side, scale, largest), *_albedo(path, pieces))
-    if faces is not None and max(len(surface.faces), len(surface.vertices)) > faces:
-        surface = _decimated(path, surface, faces)
-    body = _body(path, surface, mass, density, hollow, strict, category)
-    try:
-        return decompose(body) if parts else body
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return pieces
 
 
 def _check_file(path: Path) -> None:
@@ -226,20 +250,13 @@ def _check_file(path: Path) -> None:
         )
 
 
-class _Surface(NamedTuple):
-    vertices: np.ndarray  # (v, 3), m, without duplicates, even at seams of the colours
-    faces: np.ndarray  # (f, 3)
-    colors: np.ndarray  # (f, 3, 3)
-    uv: np.ndarray  # (f, 3, 2)
-    texture: np.ndarray | None  # (t, t, 3)
-
-
 def _factor(
     path: Path, corners: np.ndarray, longest_side: float | None, scale: float | None, largest: float | None
 ) -> float:
+    """The factor that turns the file's units into metres."""
     extent = float(np.ptp(corners, axis=(0, 1)).max())
     if not extent > 0:
-        raise ValueError(f"{path}: all vertices lie at one point")
+        raise ValueError(f"{path}: all vertices lie at one point: repair the mesh")
     if longest_side is not None:
         return longest_side / extent
     factor = 1.0 if scale is None else scale
@@ -260,90 +277,10 @@ def _factor(
     return factor
 
 
-def _surface(
-    path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None
-) -> _Surface:
-    grain = np.ptp(corners, axis=(0, 1)).max() * 1e-7
-    _, first, index = np.unique(
-        np.round(corners.reshape(-1, 3) / grain), axis=0, return_index=True, return_inverse=True
-    )
-    return _proper(path, _Surface(corners.reshape(-1, 3)[first], index.reshape(-1, 3), colors, uv, texture))
-
-
-def _proper(path: Path, surface: _Surface) -> _Surface:
-    """Remove faces without area and unused vertices."""
-    faces = surface.faces
-    proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    if not proper.any():
-        raise ValueError(f"{path}: no face has any area")
-    used, faces = np.unique(faces[proper], return_inverse=True)
-    return surface._replace(
-        vertices=surface.vertices[used],
-        faces=faces.reshape(-1, 3),
-        colors=surface.colors[proper],
-        uv=surface.uv[proper],
-    )
-
-
-def _decimated(path: Path, surface: _Surface, target: int) -> _Surface:
-    try:
-        import fast_simplification
-    except ImportError as error:
-        raise ImportError(
-            f"{path}: has {len(surface.faces):,} faces, and decimation needs the package fast-simplification, which is "
-            "not installed: pip install 'sts_jax[meshes]'"
-        ) from error
-    # Slivers can block the decimation. If so, vertices are welded first, on a grid of 1/1000 of the size or coarser.
-    for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
-        vertices, faces = _welded(surface, weld)
-        if len(faces) > target:
-            vertices, faces = fast_simplification.simplify(vertices, faces, target_count=target)
-        if 0 < len(faces) <= target and len(vertices) <= target:
-            break
-    else:
-        raise ValueError(
-            f"{path}: {len(surface.faces):,} faces cannot be decimated to {target:,}, because they form too many loose "
-            "parts: give a larger faces="
-        )
-    triangles, corners = surface.vertices[surface.faces], np.asarray(vertices, float)[faces]
-    # Each corner, moved a little towards its face's centre, takes the albedo of the nearest sample of similar normal.
-    face, weight = surface_samples(triangles, 20 * target)
-    albedo = np.einsum("nk,nkc->nc", weight, surface.colors[face])
-    if surface.texture is not None:
-        size = len(surface.texture)
-        column, row = (np.einsum("nk,nkc->nc", weight, surface.uv[face]) % 1 * size).astype(int).T % size
-        albedo = albedo * surface.texture[row, column]
-    facing = 0.05 * np.ptp(surface.vertices, axis=0).max()
-    tree = KDTree(np.hstack([np.einsum("nk,nkc->nc", weight, triangles[face]), facing * _normals(triangles)[face]]))
-    place = (0.8 * corners + 0.2 * corners.mean(axis=1, keepdims=True)).reshape(-1, 3)
-    nearest = tree.query(np.hstack([place, facing * np.repeat(_normals(corners), 3, axis=0)]))[1]
-    what = "" if surface.texture is None else ", and its texture to one colour per corner"
-    warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{what}", stacklevel=3)
-    colors = albedo[nearest].reshape(-1, 3, 3)
-    return _proper(
-        path,
-        _Surface(np.asarray(vertices, float), np.asarray(faces, int), colors, np.zeros((len(faces), 3, 2)), None),
-    )
-
-
-def _welded(surface: _Surface, share: float) -> tuple[np.ndarray, np.ndarray]:
-    if not share:
-        return surface.vertices, surface.faces.astype(np.int32)
-    cell = share * np.ptp(surface.vertices, axis=0).max()
-    _, first, index = np.unique(np.round(surface.vertices / cell), axis=0, return_index=True, return_inverse=True)
-    faces = index.reshape(-1)[surface.faces]
-    return surface.vertices[first], faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)].astype(np.int32)
-
-
-def _normals(triangles: np.ndarray) -> np.ndarray:
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    size = np.linalg.norm(cross, axis=1, keepdims=True)
-    return cross / np.where(size > 0, size, 1)
-
-
 def _body(
-    path: Path, surface: _Surface, mass: float | None, density: float, hollow: bool, strict: bool, category: int
+    path: Path, surface: Surface, mass: float | None, density: float, hollow: bool, strict: bool, category: int
 ) -> Body:
+    """The body of a surface. The volume of its hull stands in for that of a surface that encloses none."""
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
@@ -351,7 +288,7 @@ def _body(
             "give faces= to decimate it"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    closed = _is_closed(faces)
+    closed = is_closed(faces)
     if closed and mesh.volume < 0:
         faces, colors, uv = faces[:, ::-1], colors[:, ::-1], uv[:, ::-1]
     try:
@@ -363,12 +300,14 @@ def _body(
     interior = (vertices, faces)
     holds = hollow and mass is None
     if not (closed and abs(mesh.volume) > 1e-6 * hull.volume):
-        what = "encloses no volume" if closed else "is not closed"
+        fault = "encloses no volume" if closed else "is not closed"
         if strict:
-            raise ValueError(f"{path}: the mesh {what}: close it, or give strict=False to use its convex hull's volume")
+            raise ValueError(
+                f"{path}: the mesh {fault}: close it, or give strict=False to use its convex hull's volume"
+            )
         if holds:
             warnings.warn(
-                f"{path}: the mesh {what}, so its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
+                f"{path}: the mesh {fault}, so its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
         if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its padding class
@@ -394,19 +333,8 @@ def _body(
         raise ValueError(f"{path}: {error}") from error
 
 
-def _is_closed(faces: np.ndarray) -> bool:
-    """Whether faces have no boundary: each edge is traversed equally often in both directions.
-
-    A single part is then watertight and consistently wound. Where touching parts have been welded, more than two faces
-    may meet at an edge without leaving a hole.
-    """
-    start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
-    edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
-    _, place = np.unique(edge, return_inverse=True)
-    return not np.bincount(place.reshape(-1), np.where(start < end, 1, -1)).any()
-
-
 def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
+    """The corners (f, 3, 3) of the faces of a mesh, in the file's units."""
     faces = np.asarray(piece.faces)
     wrong = faces[(faces < 0) | (faces >= len(piece.vertices))]
     if wrong.size:
@@ -418,168 +346,8 @@ def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
 
 
 def _outward(vertices: np.ndarray, hull: ConvexHull) -> np.ndarray:
+    """The faces of a hull, counter-clockwise from outside."""
     triangles = vertices[hull.simplices]
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     inward = np.einsum("fi,fi->f", normal, hull.equations[:, :3]) < 0
     return np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
-
-
-def _image(path: Path) -> Image.Image:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image file")
-    try:
-        with Image.open(path) as picture:
-            return picture.convert("RGB")
-    except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: cannot be read as an image ({error}): replace it") from error
-
-
-class _Resolver(trimesh.resolvers.FilePathResolver):
-    def __init__(self, path: Path, images: Path) -> None:
-        super().__init__(str(path))
-        self.images = images
-
-    def get(self, name: str) -> bytes:
-        found = _found(Path(self.parent), name, self.images)
-        return super().get(name) if found is None else found.read_bytes()
-
-
-def _found(folder: Path, name: str, images: Path | None) -> Path | None:
-    """Find a file that a mesh file in `folder` refers to: by its relative path, or by its base name in `images`."""
-    name = name.strip().replace("\\", "/")
-    places = [folder / name] + ([] if images is None else [images / Path(name).name])
-    return next((place for place in places if place.is_file()), None)
-
-
-def _named(file: Path, word: str) -> list[str]:
-    return re.findall(
-        rf"^[ \t]*{word}[ \t]+(\S.*?)\s*$", file.read_text(errors="replace"), re.IGNORECASE | re.MULTILINE
-    )
-
-
-def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """Files that an OBJ or glTF file refers to, by name, or None for a missing file. Other formats are not read."""
-    if path.suffix.lower() == ".gltf":
-        tree = json.loads(path.read_text())
-        names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
-        return {name: _found(path.parent, name, images) for name in names if not name.startswith("data:")}
-    if path.suffix.lower() != ".obj":
-        return {}
-    files = {name: _found(path.parent, name, None) for name in _named(path, "mtllib")}
-    for library in [library for library in files.values() if library is not None]:
-        files |= {name: _found(path.parent, name, images) for name in _named(library, "map_kd")}
-    return files
-
-
-def _check_materials(path: Path, images: Path | None, strict: bool) -> None:
-    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones."""
-    if path.suffix.lower() != ".obj":
-        return
-    files = references(path, images)
-    missing = [str(path.parent / name) for name, file in files.items() if file is None]
-    if missing and strict:
-        raise FileNotFoundError(f"{path} refers to {', '.join(missing)}, not found: add it, or give texture=")
-    if missing:
-        warnings.warn(
-            f"{path} refers to {', '.join(missing)}, not found: drawn without it unless texture= is given", stacklevel=3
-        )
-    for file in files.values():
-        if file is not None and file.suffix.lower() != ".mtl":
-            _image(file)
-
-
-def _albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Corner colours, texture coordinates and the texture of all pieces together."""
-    is_linear = path.suffix.lower() in (".glb", ".gltf")
-    colors, uvs, images = [], [], []
-    for piece in pieces:
-        color, uv, image = _piece_albedo(piece, is_linear)
-        colors.append(color)
-        uvs.append(uv)
-        images.append(image)
-    pictures = [image for image in images if image is not None]
-    if not pictures:
-        return np.concatenate(colors), np.concatenate(uvs), None
-    try:
-        sheets = [np.asarray(picture.convert("RGB")) for picture in pictures]
-    except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: its texture cannot be read ({error}): replace it") from error
-    distinct: list[np.ndarray] = []
-    cell = []
-    for sheet in sheets:
-        same = [i for i, other in enumerate(distinct) if np.array_equal(other, sheet)]
-        cell.append(same[0] if same else len(distinct))
-        if not same:
-            distinct.append(sheet)
-    plain = len(distinct) if any(image is None for image in images) else -1
-    if plain >= 0:  # untextured pieces look up a white cell
-        distinct.append(np.full((8, 8, 3), 255, np.uint8))
-    if len(distinct) == 1:
-        return (
-            np.concatenate(colors),
-            np.concatenate(uvs),
-            linear(_square(distinct[0], _texture_class(max(distinct[0].shape[:2]))) / 255.0),
-        )
-
-    # The cells tile a sheet of a texture class's size, so that it is not resampled again.
-    grid = int(np.ceil(np.sqrt(len(distinct))))
-    size = _texture_class(grid * max(max(sheet.shape[:2]) for sheet in distinct))
-    side = size // grid
-    atlas = np.zeros((size, size, 3), np.uint8)
-    for index, sheet in enumerate(distinct):
-        row, column = divmod(index, grid)
-        atlas[row * side : (row + 1) * side, column * side : (column + 1) * side] = _square(sheet, side)
-    cells = iter(cell)
-    margin = 0.5 / side
-    for index, uv in enumerate(uvs):
-        place = plain if images[index] is None else next(cells)
-        inside = uv - np.floor(uv.min(axis=1, keepdims=True) + 1e-6)
-        uvs[index] = (np.clip(inside, margin, 1 - margin) + np.array(divmod(place, grid)[::-1])) * (side / size)
-    return np.concatenate(colors), np.concatenate(uvs), linear(atlas / 255.0)
-
-
-def _texture_class(longest: int) -> int:
-    return next((size for size in TEXTURE_CLASSES if longest <= size), TEXTURE_CLASSES[-1])
-
-
-def _square(sheet: np.ndarray, side: int) -> np.ndarray:
-    if sheet.shape[:2] == (side, side):
-        return sheet
-    return np.asarray(Image.fromarray(sheet).resize((side, side), Image.Resampling.LANCZOS))
-
-
-def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, np.ndarray, Image.Image | None]:
-    faces = np.asarray(piece.faces)
-    uv = np.zeros((len(faces), 3, 2))
-    visual = piece.visual
-    decode = (lambda x: x) if is_linear else linear
-    if isinstance(visual, trimesh.visual.TextureVisuals):
-        material = visual.material
-        if isinstance(material, trimesh.visual.material.PBRMaterial):
-            image, factor = material.baseColorTexture, material.baseColorFactor
-        else:
-            image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
-        if visual.uv is None or len(visual.uv) != len(piece.vertices):
-            image = None
-        if image is not None:
-            uv = np.asarray(visual.uv, float)[faces]
-            uv = np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
-        if factor is None or (image is not None and not is_linear):
-            color = np.ones(3) if image is not None or is_linear else linear(np.full(3, PLAIN))
-        else:
-            color = decode(_unit(np.asarray(factor))[:3])
-        corner = np.broadcast_to(color, (len(faces), 3, 3))
-        painted = visual.vertex_attributes.get("color") if is_linear else None
-        if painted is not None and len(painted) == len(piece.vertices):
-            corner = corner * _unit(np.asarray(painted))[faces][..., :3]
-        return np.array(corner), uv, image
-    if visual.kind == "vertex":
-        return decode(_unit(np.asarray(visual.vertex_colors))[faces][..., :3]), uv, None
-    if visual.kind == "face":
-        corner = decode(_unit(np.asarray(visual.face_colors))[:, None, :3])
-        return np.repeat(corner, 3, axis=1), uv, None
-    return np.full((len(faces), 3, 3), linear(np.array(PLAIN))), uv, None
-
-
-def _unit(color: np.ndarray) -> np.ndarray:
-    return color / np.iinfo(color.dtype).max if np.issubdtype(color.dtype, np.integer) else color.astype(float)

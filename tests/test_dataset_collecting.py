@@ -1,4 +1,4 @@
-"""A small collection from objects to shards: resumable, reproducible, split by object."""
+"""A small dataset, collected and loaded: it is reproducible, it can be resumed, and damage is found."""
 
 import dataclasses
 import inspect
@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import sts_jax as sts
-from sts_jax import _files, dataset, evaluation, geometry
-from sts_jax.dataset.collect import turn, turn_condition, turn_wrench
+from sts_jax import _files, dataset, evaluation
+from sts_jax.dataset.symmetry import turn_wrench
 
 SMALL = dataset.Collection(
     sts.physics.Freefall(frames=12), num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2
@@ -37,32 +37,7 @@ def sparse(tmp_path_factory):
     return folder
 
 
-def test_every_object_is_in_one_part_and_shares_are_kept():
-    collection = dataset.Collection(num_objects=160)
-    split = dataset.split_objects(collection)
-    assert {name: len(part) for name, part in split.items()} == {"train": 112, "validation": 16, "test": 32}
-    np.testing.assert_array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(160))
-    for part in split.values():  # each category alike
-        np.testing.assert_array_equal(np.bincount(part % 8, minlength=8), len(part) // 8)
-
-
-def test_the_split_of_the_published_collections_stays():
-    split = dataset.split_objects(dataset.Collection(num_objects=21, seed=5))
-    assert split["validation"].tolist() == [12, 18]
-    assert split["test"].tolist() == [2, 3, 8, 9]
-
-
-def test_classes_follow_the_categories():
-    collection = dataset.Collection(categories=("fork", "bottle"), num_objects=20)
-    names = dataset.class_names(collection)
-    assert names == ("fork", "bottle") * 10
-    for index, body in zip((1, 4), dataset.make_bodies(collection, np.array([1, 4])), strict=True):
-        assert sts.objects.CATEGORIES[int(body.category)] == names[index]
-    for part in dataset.split_objects(collection).values():
-        assert sum(names[i] == "fork" for i in part) == len(part) / 2
-
-
-def test_frames_are_those_that_sense_draws(folder):
+def test_stored_frames_are_those_that_sense_draws(folder):
     data = dataset.load(folder)
     assert data.trajectory["pose"].shape == (8, 12, 7)
     pairs = data.pairs(np.array([5, 0]), symmetries=True)
@@ -80,7 +55,7 @@ def test_frames_are_those_that_sense_draws(folder):
     np.testing.assert_array_equal(pairs.object, data.trajectory["body"][pairs.trajectory])
 
 
-def test_a_trajectory_without_images_is_that_of_a_collection_with_all_images(folder, sparse):
+def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, sparse):
     whole, data = dataset.load(folder), dataset.load(sparse)
     for name in ("pose", "outcome", "wrench", "body"):
         np.testing.assert_array_equal(data.trajectory[name], whole.trajectory[name])
@@ -121,7 +96,7 @@ def test_the_true_shape_and_mass_are_those_of_the_body_with_its_hidden_values(fo
     assert {leaf.dtype for leaf in (pairs.support, pairs.mass, pairs.com, pairs.pose)} == {np.dtype(np.float32)}
 
 
-def test_views_are_what_sense_draws_at_starts_of_no_trajectory(sparse):
+def test_views_are_drawn_by_sense_at_starts_of_no_trajectory(sparse):
     data = dataset.load(sparse)
     sense = jax.jit(lambda body, pose: sts.sense(sts.Sensor(), body, pose, jnp.zeros(6)).visual)
     seen = 0
@@ -150,74 +125,18 @@ def test_a_collection_without_views_has_none(folder):
         dataset.load(folder).views("all")
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"num_rendered": 0},
-            r"num_rendered must be a whole number from 1 to num_per_object=2, or None .* got 0",
-        ),
-        ({"num_rendered": 3}, r"num_rendered must be .* got 3"),
-        ({"num_rendered": True}, r"num_rendered must be .* got True"),
-        ({"num_views": -1}, r"num_views must be a whole number of at least 0, got -1"),
-        ({"num_views": False}, r"num_views must be .* got False"),
-    ],
-)
-def test_counts_out_of_range_are_refused_before_anything_is_written(tmp_path, changes, message):
-    with pytest.raises(ValueError, match=message):
-        dataset.collect(dataclasses.replace(SMALL, **changes), sts.Sensor(), tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-
-
-def test_the_sensor_of_a_dataset_is_read_as_any_other(folder):
+def test_the_sensor_of_a_dataset_can_be_loaded(folder):
     assert sts.Sensor.load(folder / "sensor.json").constants() == sts.Sensor().constants()
 
 
-def test_all_frames_of_the_full_ones_and_two_of_the_others(folder):
+def test_full_trajectories_have_all_frames_and_others_two(folder):
     data = dataset.load(folder)
     np.testing.assert_array_equal(data.full_trajectories(), [0])
     assert data.strip(0).visual.shape == (12, 64, 64, 3)
     assert len(data.frames) == 12 + 7 * 2 + 8 * 14
 
 
-def test_a_turn_turns_position_orientation_and_wrench():
-    key = jax.random.key(3)
-    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), geometry.random_quat(key)])
-    point = jnp.array([0.005, -0.01, 0.02])
-    x, y, z = np.asarray(geometry.transform(pose, point))
-    turned = turn(pose, 1)
-    np.testing.assert_allclose(geometry.transform(turned, point), [-y, x, z], atol=1e-7)
-    wrench = jnp.array([1.0, 2, 3, 4, 5, 6])
-    np.testing.assert_allclose(turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
-
-
-@pytest.mark.parametrize("scenario", [sts.physics.Freefall(), sts.physics.Inclined(), sts.physics.Perturbed()])
-def test_a_scenarios_symmetries_are_those_that_turn_its_gravity_with_its_condition(scenario):
-    condition = jnp.array([[3.0, -7.0, 0.08]])[:, : len(scenario.condition_scale)]
-    kept = []
-    for symmetry in range(8):
-        turned = turn_condition(condition, symmetry)
-        gravity, other = (scenario.gravity(jnp.float32(0.01), c[0]) for c in (condition, turned))
-        image = turn_wrench(jnp.concatenate([gravity, jnp.zeros(3)]), symmetry)[:3]
-        if np.allclose(other, image, atol=1e-5):
-            kept.append(symmetry)
-        np.testing.assert_array_equal(turned[:, 2:], condition[:, 2:])
-    assert tuple(kept) == scenario.symmetries
-
-
-def test_a_mirrored_pose_and_body_are_the_mirror_image_in_the_sensor_frame():
-    pose = jnp.concatenate([jnp.array([0.01, 0.02, 0.03]), geometry.random_quat(jax.random.key(4))])
-    point, arm, force = jnp.array([0.005, -0.01, 0.02]), jnp.array([0.3, -0.2, 0.1]), jnp.array([1.0, 2, 3])
-    flip = jnp.array([1.0, -1, 1])
-    np.testing.assert_allclose(
-        geometry.transform(turn(pose, 4), point * flip), geometry.transform(pose, point) * flip, atol=1e-7
-    )
-    wrench = jnp.concatenate([force, jnp.cross(arm, force)])
-    image = jnp.concatenate([force * flip, jnp.cross(arm * flip, force * flip)])
-    np.testing.assert_allclose(turn_wrench(wrench, 4), image, atol=1e-6)
-
-
-def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):
+def test_a_resumed_collection_has_the_same_bytes(folder, tmp_path):
     names = sorted(path.name for path in folder.iterdir())
     for name in names:  # a kill after the first shard, with a half-written second one
         if "00001-of" not in name:
@@ -239,16 +158,8 @@ def test_a_collection_goes_on_and_makes_the_same_bytes(folder, tmp_path):
     assert stamps == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
 
 
-def test_symmetries_of_a_pad_that_is_not_square_are_refused(tmp_path):
-    sensor = sts.Sensor()
-    sensor = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, size=(0.15, 0.1)))
-    with pytest.raises(ValueError, match=r"gel\.size=\[0\.15"):
-        dataset.collect(dataclasses.replace(SMALL, symmetries=True), sensor, tmp_path / "new")
-    assert not (tmp_path / "new").exists()
-
-
 @pytest.mark.slow
-def test_a_scenario_with_a_mirror_alone_takes_any_pad(tmp_path, monkeypatch):
+def test_a_scenario_without_quarter_turns_accepts_any_pad(tmp_path, monkeypatch):
     monkeypatch.setattr(sts.physics.Freefall, "symmetries", (0, 6))
     sensor = sts.Sensor()
     sensor = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, size=(0.15, 0.1)))
@@ -327,7 +238,7 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
         (lambda split: split.update(other=[]), "must have the parts train, validation, test, got .*'other'"),
     ],
 )
-def test_a_split_that_is_none_is_refused(copied, change, message):
+def test_an_invalid_split_is_refused(copied, change, message):
     path = copied / "split.json"
     split = json.loads(path.read_text())
     change(split)
@@ -354,7 +265,7 @@ def test_a_split_that_is_none_is_refused(copied, change, message):
         ),
     ],
 )
-def test_a_description_that_is_damaged_or_another_is_named(copied, name, content, message):
+def test_a_damaged_or_exchanged_description_is_named(copied, name, content, message):
     (copied / name).unlink()
     if content is not None:
         (copied / name).write_bytes(content)
@@ -396,7 +307,7 @@ def test_a_file_in_the_place_of_a_dataset_is_named(folder):
         dataset.load(folder / "collection.json")
 
 
-def test_the_identity_of_a_dataset_is_that_of_its_files(folder, copied):
+def test_the_identity_of_a_dataset_follows_from_its_files(folder, copied):
     assert dataset.load(copied).identity == dataset.load(folder).identity
     path = copied / "split.json"
     split = json.loads(path.read_text())

@@ -9,7 +9,8 @@ import numpy as np
 
 from sts_jax._files import TornFileError, digest, read_json, sha256
 from sts_jax.dataset import records
-from sts_jax.dataset.collect import PARTS, shard_path, turn, turn_condition
+from sts_jax.dataset.collection import PARTS
+from sts_jax.dataset.symmetry import turn, turn_condition
 
 
 class Pairs(NamedTuple):
@@ -280,7 +281,7 @@ def load(folder: str | Path) -> Dataset:
     count = -(-objects // each)
     shards, parts = [], []
     for index in range(count):
-        path = shard_path(folder, count, index)
+        path = records.shard_path(folder, count, index)
         if not path.with_suffix(".npz").exists():
             raise FileNotFoundError(
                 f"{path.with_suffix('.npz')} is missing: the collection is not finished. Run it again to resume it."

@@ -1,16 +1,11 @@
-import dataclasses
-import inspect
-import math
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
-from sts_jax import objects
-from sts_jax.objects import fill_moments, rest_poses
-from sts_jax.objects.solids import convex_hull, corner_normals, outside_hull, solid_moments, surface_moments
+from sts_jax.objects import fill_moments
+from sts_jax.objects.moments import solid_moments, surface_moments
 
 FILLS = np.linspace(0, 1, 33)
 _TABLE = jax.jit(jax.vmap(fill_moments, in_axes=(None, 0, None)))
@@ -40,7 +35,7 @@ def twisted() -> trimesh.Trimesh:
     return mesh
 
 
-def test_box_fills():
+def test_fills_of_a_box_are_the_closed_form():
     mesh = trimesh.creation.box((0.06, 0.04, 0.1))
     mesh.apply_translation([0.01, 0.02, 0.03])
     table = filled(mesh)
@@ -48,7 +43,7 @@ def test_box_fills():
     np.testing.assert_allclose(table, truth, rtol=1e-5, atol=1e-12)
 
 
-def test_prism_lying_on_its_side_is_the_clipped_polygon():
+def test_fills_of_a_lying_prism_are_those_of_the_clipped_polygon():
     # A cylinder of 64 sides along y: the filled part is the segment of the polygon, cut here by trapezoids.
     mesh = trimesh.creation.cylinder(radius=0.02, height=0.08, sections=64)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
@@ -72,7 +67,7 @@ def test_prism_lying_on_its_side_is_the_clipped_polygon():
         np.testing.assert_allclose(table[:, column], truth, atol=3e-5 * np.abs(truth).max())
 
 
-def test_sphere_caps():
+def test_fills_of_a_sphere_are_its_caps():
     radius = 0.03
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
     table = filled(mesh)
@@ -84,7 +79,7 @@ def test_sphere_caps():
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.0, 0.0, -2.0), (0.3, -0.8, 0.5)])
-def test_fills_of_a_ring_against_samples(direction):
+def test_fills_of_a_ring_agree_with_samples(direction):
     mesh = twisted()
     up = np.array(direction) / np.linalg.norm(direction)
     table = filled(mesh, direction)
@@ -104,7 +99,7 @@ def test_fills_of_a_ring_against_samples(direction):
         assert (abs(table[k, 4:] / table[k, 0] - square.mean(0)) < noise * square.std(0)).all()
 
 
-def test_opposite_directions_share_the_whole():
+def test_fills_along_opposite_directions_add_up_to_the_whole():
     mesh = twisted()
     up, down = filled(mesh, (0.2, 0.3, 0.9)), filled(mesh, (-0.2, -0.3, -0.9))
     np.testing.assert_allclose(up + down[::-1], np.broadcast_to(up[-1], up.shape), rtol=1e-5, atol=1e-11)
@@ -121,7 +116,7 @@ def test_whole_solid_agrees_with_trimesh():
     np.testing.assert_allclose(central.sum() - central, np.diag(mesh.moment_inertia), rtol=1e-6)
 
 
-def test_surface_moments_against_samples():
+def test_surface_moments_agree_with_samples():
     mesh = twisted()
     total = surface_moments(mesh.triangles).sum(0)
     points = trimesh.sample.sample_surface(mesh, 200_000, seed=1)[0]
@@ -130,103 +125,9 @@ def test_surface_moments_against_samples():
     np.testing.assert_allclose(total[4:7] / total[0], (points**2).mean(0), atol=3e-5)
 
 
-def test_nothing_and_no_interior_weigh_nothing():
+def test_an_empty_and_a_missing_interior_weigh_nothing():
     for triangles in (trimesh.creation.box((0.1, 0.1, 0.1)).triangles, np.zeros((8, 3, 3))):
         volume, centre, second = fill_moments(jnp.asarray(triangles, jnp.float32), 0.0)
         assert volume == 0
         np.testing.assert_array_equal(second, 0)
         np.testing.assert_allclose(centre, 0, atol=1e-7)
-
-
-def test_a_box_rests_on_six_faces_and_a_leaning_one_on_those_below_its_balance():
-    corners = trimesh.creation.box((0.06, 0.04, 0.1)).vertices
-    ups, share = rest_poses(corners, np.zeros(3))
-    np.testing.assert_allclose(sorted(map(tuple, ups)), sorted(map(tuple, np.r_[np.eye(3), -np.eye(3)])), atol=1e-9)
-    # The solid angle of a rectangle a x b at distance d: 4 atan(a b / (4 d sqrt(d^2 + a^2 / 4 + b^2 / 4))).
-    for up, part in zip(ups, share, strict=True):
-        d = np.array([0.06, 0.04, 0.1]) @ np.abs(up) / 2
-        a, b = np.array([0.06, 0.04, 0.1])[np.abs(up) < 0.5]
-        solid = 4 * np.arctan(a * b / (4 * d * np.sqrt(d**2 + a**2 / 4 + b**2 / 4)))
-        np.testing.assert_allclose(part, solid / (4 * np.pi), rtol=1e-6)
-    sheared = corners + np.outer(corners[:, 2] + 0.05, [0.5, 0, 0])  # the balance is over 25 mm of 30
-    assert max(rest_poses(sheared, np.array([0.025, 0, 0]))[0] @ [0, 0, 1]) > 0.99
-    assert max(rest_poses(sheared, np.array([0.032, 0, 0]))[0] @ [0, 0, 1]) < 0.99
-
-
-def test_a_prism_of_many_sides_rests_on_each():
-    angle = 2 * np.pi * np.arange(16) / 16
-    rim = 0.02 * np.c_[np.cos(angle), np.sin(angle)]
-    points = np.concatenate([np.c_[rim, np.full(16, z)] for z in (-0.05, 0.05)])
-    ups, share = rest_poses(points, np.zeros(3))
-    assert len(ups) == 18
-    np.testing.assert_allclose(share.sum(), 1)
-    flat = np.abs(ups[:, 2]) > 0.5
-    assert share[~flat].sum() > 5 * share[flat].sum()
-
-
-def test_hull_is_exact_while_it_may_be():
-    points = trimesh.creation.box((0.1, 0.05, 0.02)).subdivide().subdivide().vertices
-    hull = convex_hull(points)
-    assert len(hull) == 8
-    assert outside_hull(points, hull).max() < 1e-12
-
-
-def test_hull_keeps_what_matters_and_the_rest_is_stated():
-    points = trimesh.creation.icosphere(subdivisions=4, radius=0.05).vertices
-    hull = convex_hull(points)
-    assert len(hull) == 64
-    gap = outside_hull(points, hull).max()
-    assert 1e-3 < gap < 4e-3  # a sphere is the worst there is
-    assert {tuple(p) for p in hull} <= {tuple(p) for p in points}
-
-
-def test_outside_hull_is_the_distance():
-    hull = trimesh.creation.box((2.0, 2.0, 2.0)).vertices
-    points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.5, 0, 0], [1.3, 1.4, 0], [2.0, 2, 2]])
-    np.testing.assert_allclose(outside_hull(points, hull), [0, 0, 0.5, 0.5, np.sqrt(3)], atol=1e-9)
-
-
-def test_flat_points_have_no_hull():
-    with pytest.raises(ValueError, match="plane"):
-        convex_hull(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]))
-
-
-def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_box():
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-    normals = corner_normals(ball.vertices, ball.faces)
-    np.testing.assert_allclose(normals, ball.vertices[ball.faces], atol=2e-2)
-    cube = trimesh.creation.box((1.0, 1.0, 1.0))
-    normals = corner_normals(cube.vertices, cube.faces)
-    np.testing.assert_allclose(normals, np.repeat(cube.face_normals[:, None], 3, axis=1), atol=1e-12)
-
-
-def test_corner_normals_of_faces_without_area_are_finite():
-    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]])
-    normals = corner_normals(vertices, np.array([[0, 1, 2], [0, 1, 3]]))
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
-
-
-def test_directions_are_unit_vectors_spread_over_the_sphere():
-    directions = objects.DIRECTIONS
-    assert (directions.shape, directions.dtype) == ((128, 3), np.float32)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-6)
-    np.testing.assert_allclose(directions.mean(0), 0, atol=0.01)
-    np.testing.assert_allclose(directions.T @ directions / 128, np.eye(3) / 3, atol=0.01)
-    step = 37.5
-    angle, z = math.pi * (1 + math.sqrt(5)) * step, 1 - 2 * step / 128
-    expected = [math.sqrt(1 - z * z) * math.cos(angle), math.sqrt(1 - z * z) * math.sin(angle), z]
-    np.testing.assert_allclose(directions[37], expected, atol=1e-6)
-
-
-def test_the_support_of_a_cuboid_and_of_a_hull_is_the_furthest_corner():
-    corners = np.array([[x, y, z] for x in (-0.01, 0.03) for y in (-0.02, 0.02) for z in (-0.05, 0.01)])
-    body = objects.make(jax.random.key(0), "mouse")
-    padded = np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None].astype(np.float32)
-    for hulls in (padded, np.asarray(body.hulls)):
-        found = objects.support(dataclasses.replace(body, hulls=jnp.asarray(hulls)))
-        assert (found.shape, found.dtype) == ((128,), np.float32)
-        for direction, value in zip(objects.DIRECTIONS, found, strict=True):
-            furthest = max(float(np.dot(v, direction)) for v in hulls.reshape(-1, 3).astype(float))
-            np.testing.assert_allclose(value, furthest, atol=1e-7)
-    with pytest.raises(ValueError, match=r"hulls has the shape \(1, 1, .*: pass a single body"):
-        inspect.unwrap(objects.support)(objects.stack([body]))

@@ -1,0 +1,230 @@
+"""Collect a dataset: objects, trajectories and frames. Each shard is a pure function of the collection and sensor."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from sts_jax import objects, physics
+from sts_jax._files import claim, digest, lock, read_json
+from sts_jax.dataset import records
+from sts_jax.dataset.collection import (
+    Collection,
+    as_json,
+    class_names,
+    make_bodies,
+    split_objects,
+    symmetries_of,
+)
+from sts_jax.dataset.rendering import render
+from sts_jax.sensor import Sensor
+
+
+class Collected(NamedTuple):
+    """Summary of a whole dataset, as `collect` returns it."""
+
+    resampled: int  # number of discarded draws of trajectories
+    left_out: tuple[str, ...]  # one line for each object that was left out
+
+
+class Progress(NamedTuple):
+    """Progress of `collect`."""
+
+    done: int  # finished trajectories or frames
+    total: int
+    stage: str  # "trajectories" or "frames"
+
+
+def collect(
+    collection: Collection,
+    sensor: Sensor,
+    folder: Path,
+    *,
+    progress: Callable[[Progress], None] | None = None,
+) -> Collected:
+    """Make every shard of a dataset that does not exist yet.
+
+    Args:
+        collection: The description of the dataset.
+        sensor: The sensor that renders the frames.
+        folder: The folder for the shards, `collection.json`, `sensor.json` (for `Sensor.load`) and `split.json`.
+        progress: Called as trajectories and frames are finished.
+
+    Returns:
+        For the whole dataset, the number of draws that were discarded because the trajectory became non-finite or the
+        object sank too deep, and the objects that were left out because all their draws failed or because they
+        could not be made.
+
+    Raises:
+        ValueError: A constant of the sensor or a field of the collection is out of range, the folder holds another
+            collection (the message names the field) or one of an older format, the pad does not have the scenario's
+            symmetries, or no object of a shard can be simulated.
+        LockedError: Another process collects into the folder.
+        TornFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.
+        OSError: The disk is full, or the folder cannot be written to.
+    """
+    sensor.check()
+    collection.check(sensor)
+    with lock(folder):
+        return _collect(collection, sensor, folder, progress)
+
+
+def _collect(
+    collection: Collection, sensor: Sensor, folder: Path, progress: Callable[[Progress], None] | None
+) -> Collected:
+    """Collect into a folder that is locked."""
+    description, constants, path = as_json(collection), sensor.constants(), folder / "collection.json"
+    if path.exists():
+        records.check_format(read_json(path, f"delete {folder} and collect again"), folder)
+    claim(path, description)
+    claim(folder / "sensor.json", constants)
+    claim(
+        folder / "split.json",
+        {name: [int(i) for i in part] for name, part in split_objects(collection).items()},
+    )
+    made = Collected(0, ())
+    for index in range(collection.num_shards):
+        identity = records.Identity(digest(description), digest(constants), index)
+        path = records.shard_path(folder, collection.num_shards, index)
+        if not path.with_suffix(".npz").exists():
+            _make_shard(collection, sensor, folder, identity, progress)
+        shard = records.read_shard(path, identity)
+        resampled = made.resampled + int(shard["trajectory/resampled"].sum())
+        made = Collected(resampled, made.left_out + tuple(shard["left_out"].tolist()))
+    return made
+
+
+def _make_shard(
+    collection: Collection,
+    sensor: Sensor,
+    folder: Path,
+    identity: records.Identity,
+    progress: Callable[[Progress], None] | None,
+) -> None:
+    """Write the shard with the index of an identity."""
+    index, first = identity.shard, identity.shard * collection.objects_per_shard
+    members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
+    key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
+    found, left_out = _made(collection, members)
+    report = _report(progress, first * collection.num_per_object, collection.num_trajectories, "trajectories")
+    found, trajectory, failed = _simulated(collection, sensor, key, found, report)
+    left_out += failed
+    if trajectory is None:
+        raise ValueError(f"{folder}: no object of shard {index} can be simulated: {left_out[-1]}")
+    members, bodies = np.array(list(found)), list(found.values())
+    frames = _frames_of(collection, members, trajectory)
+    views = _views_of(collection, key, bodies, sensor)
+    arrays = _arrays(members, bodies, trajectory, views) | {"frames": frames, "left_out": np.array(left_out, str)}
+    report = _report(progress, 0, len(frames) + len(views["body"]), "frames")
+    images = render(collection, sensor, bodies, trajectory, frames, views, report)
+    records.write_shard(records.shard_path(folder, collection.num_shards, index), images, arrays, identity)
+
+
+def _simulated(
+    collection: Collection,
+    sensor: Sensor,
+    key: PRNGKeyArray,
+    bodies: dict[int, objects.Body],
+    report: Callable[[int], None],
+) -> tuple[dict[int, objects.Body], physics.Trajectory | None, list[str]]:
+    """The objects that can be simulated, their trajectories (None without objects), and a line for each other one."""
+    bodies = dict(bodies)
+    failed: list[str] = []
+    while bodies:
+        try:
+            trajectory = physics.simulate(
+                key,
+                list(bodies.values()),
+                sensor,
+                collection.scenario,
+                collection.num_per_object,
+                progress=report,
+                engine=collection.engine,
+            )
+            return bodies, jax.tree.map(np.asarray, trajectory), failed
+        except physics.BodyError as error:  # one bad object does not stop a collection
+            number = list(bodies)[error.body]
+            del bodies[number]
+            failed.append(f"{_named(collection, number)}: {str(error).partition(': ')[2]}")
+    return bodies, None, failed
+
+
+def _arrays(
+    members: np.ndarray, bodies: list[objects.Body], trajectory: physics.Trajectory, views: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The arrays of a shard. Bodies are counted in the collection instead of in the shard."""
+    arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
+    arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
+    arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
+    which = np.asarray(trajectory.body)
+    solid = _solid(bodies, which, trajectory.hidden)
+    mirrored = np.stack([objects.support(objects.mirror(body)) for body in bodies])
+    arrays |= {f"solid/{name}": leaf for name, leaf in solid.items()} | {"solid/mirrored": mirrored[which]}
+    arrays |= {f"view/{name}": leaf for name, leaf in views.items()}
+    arrays["view/body"] = members[views["body"]].astype(np.int32)
+    return arrays
+
+
+def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, objects.Body], list[str]]:
+    """Objects by index, and a line for each that cannot be made, such as one whose file was deleted meanwhile."""
+    bodies, left_out = {}, []
+    for number in members.tolist():
+        try:
+            (bodies[number],) = make_bodies(collection, np.array([number]))
+        except (OSError, ValueError) as error:
+            left_out.append(f"{_named(collection, number)}: {error}")
+    return bodies, left_out
+
+
+def _named(collection: Collection, number: int) -> str:
+    """The name of an object in a message."""
+    name = class_names(collection)[number] if collection.meshes is None else collection.meshes.names[number]
+    return f"object {number} ({name})"
+
+
+def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
+    """The frames to render, as rows of (trajectory, frame, symmetry). Trajectories are counted within the shard."""
+    num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
+    rows: list[tuple[int, int, int]] = []
+    for i in range(num):
+        # Full trajectories are spread over the objects: the first one of each, then the second one of each, ...
+        place, repeat = divmod(i, collection.num_per_object)
+        if repeat >= collection.rendered_per_object:
+            continue
+        rank = repeat * collection.num_objects + members[place]
+        full = rank < collection.num_full
+        rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
+        rows += [(i, t, symmetry) for symmetry in symmetries_of(collection) if symmetry for t in (0, last)]
+    frames = np.array(rows, np.int32)
+    # Sorted by object and then by mirror image, because a call renders one body.
+    return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
+
+
+def _solid(bodies: list[objects.Body], which: np.ndarray, hidden: physics.Hidden) -> dict[str, np.ndarray]:
+    """The true shape, mass (kg) and centre of mass (m, mesh frame) of each draw, float32."""
+    rigid = physics.rigids(bodies, which, hidden)
+    support = np.stack([objects.support(body) for body in bodies])
+    return {"support": support[which], "mass": rigid.mass.astype(np.float32), "com": rigid.com.astype(np.float32)}
+
+
+def _views_of(
+    collection: Collection, key: PRNGKeyArray, bodies: list[objects.Body], sensor: Sensor
+) -> dict[str, np.ndarray]:
+    """The further starts to render: pose, index of the body in the shard, and `_solid`."""
+    if not collection.num_views:
+        shapes = {"pose": (0, 7), "support": (0, len(objects.DIRECTIONS)), "mass": (0,), "com": (0, 3)}
+        return {"body": np.zeros(0, np.int32)} | {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
+    starts = physics.starts(key, bodies, sensor, collection.scenario, collection.num_views)
+    starts = jax.tree.map(np.asarray, starts)
+    return {"pose": starts.pose, "body": starts.body, **_solid(bodies, starts.body, starts.hidden)}
+
+
+def _report(progress: Callable[[Progress], None] | None, before: int, total: int, stage: str) -> Callable[[int], None]:
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(Progress(before + done, total, stage))
+
+    return report

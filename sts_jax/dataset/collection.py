@@ -1,0 +1,155 @@
+"""The description of a dataset, and everything that follows from it alone: bodies, classes and the split by object."""
+
+import dataclasses
+import math
+
+import jax
+import numpy as np
+
+from sts_jax import objects, physics
+from sts_jax.dataset import records
+from sts_jax.dataset.meshes import Meshes, open_library
+from sts_jax.sensor import Sensor
+
+PARTS = ("train", "validation", "test")  # of the split of the objects
+
+
+@dataclasses.dataclass(frozen=True)
+class Collection:
+    """Description of a dataset. Together with a `Sensor` it determines every byte of it.
+
+    The one exception are classes from outside the library, whose code the description names but does not contain.
+    """
+
+    scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
+    categories: tuple[str, ...] = objects.CATEGORIES  # procedural classes, used in turn, see `objects.find_family`
+    meshes: Meshes | None = None  # objects from files instead (num_objects is their number)
+    parts: bool = False  # convex parts for objects whose hull fits badly (package coacd, ten seconds per object)
+    num_objects: int = 160
+    num_per_object: int = 4  # trajectories per object, each with new hidden values
+    num_full: int = 20  # trajectories with every frame rendered (other rendered ones: first and last frame)
+    num_rendered: int | None = None  # trajectories per object that have images, the first ones (None: all)
+    num_views: int = 0  # pictures per object at further starts, which are not simulated
+    symmetries: bool = True  # render first and last frames in all `scenario.symmetries`, or only as simulated
+    resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
+    crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
+    shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # of the objects for training, validation and test
+    objects_per_shard: int = 40
+    seed: int = 0
+    engine: physics.Engine = "mujoco"  # see `physics.simulate` (trajectories differ between engines)
+
+    @property
+    def num_trajectories(self) -> int:
+        """Number of trajectories in the whole dataset."""
+        return self.num_objects * self.num_per_object
+
+    @property
+    def rendered_per_object(self) -> int:
+        """Number of trajectories per object that have images."""
+        return self.num_per_object if self.num_rendered is None else self.num_rendered
+
+    @property
+    def num_shards(self) -> int:
+        """Number of shards. A shard is written as a whole or not at all."""
+        return math.ceil(self.num_objects / self.objects_per_shard)
+
+    def check(self, sensor: Sensor) -> None:
+        """Raise an error unless the collection can be made with a sensor.
+
+        Raises:
+            ValueError: A field is out of range, a category is unknown, or the pad lacks the scenario's symmetries. The
+                message names the field.
+        """
+        sides = [float(side) for side in sensor.gel.size]
+        quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
+        if quarter_turns and sides[0] != sides[1]:
+            raise ValueError(f"symmetries=True needs a square pad, got gel.size={sides}: give one, or symmetries=False")
+        if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
+            raise ValueError(f"shares is {self.shares}, but the shares of the objects must be >= 0 and have sum 1")
+        if self.meshes is not None and self.num_objects != len(self.meshes.names):
+            raise ValueError(f"num_objects={self.num_objects}, but meshes has {len(self.meshes.names)} objects")
+        if self.meshes is None and not self.categories:
+            raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
+        for category in self.categories if self.meshes is None else ():
+            objects.find_family(category)
+        for name, least in (("num_objects", 1), ("num_per_object", 1), ("objects_per_shard", 1), ("num_full", 0)):
+            value = getattr(self, name)
+            if not (type(value) is int and value >= least):
+                raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+        if len(self.resolution) != 2 or not all(type(side) is int and side >= 1 for side in self.resolution):
+            raise ValueError(f"resolution must be two whole numbers of pixels (height, width), got {self.resolution!r}")
+        rendered, most = self.num_rendered, self.num_per_object
+        if rendered is not None and not (type(rendered) is int and 1 <= rendered <= most):
+            raise ValueError(
+                f"num_rendered must be a whole number from 1 to num_per_object={most}, or None for all, "
+                f"got {rendered!r}"
+            )
+        if not (type(self.num_views) is int and self.num_views >= 0):
+            raise ValueError(f"num_views must be a whole number of at least 0, got {self.num_views!r}")
+
+
+def class_names(collection: Collection) -> tuple[str, ...]:
+    """The class of each object of a collection, `num_objects` names."""
+    if collection.meshes is not None:
+        return collection.meshes.labels
+    return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))
+
+
+def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
+    """Make objects of a collection, given their indices (n,).
+
+    A procedural object has a key of its own, so that object i does not depend on the other objects that are made.
+
+    Raises:
+        FileNotFoundError: A mesh file no longer exists.
+        ValueError: No body can be made from an object.
+    """
+    if collection.meshes is not None:
+        library, where = open_library(collection.meshes, collection.parts)
+        chosen = [collection.meshes.names[i] for i in indices]
+        gone = [name for name in chosen if name not in where]
+        if gone:
+            raise FileNotFoundError(f"{library.folder} no longer has the mesh files {', '.join(gone)}: put them back")
+        return [objects.read(library, where[name]).body for name in chosen]
+    key, names = jax.random.key(collection.seed), class_names(collection)
+    bodies = [objects.make(jax.random.fold_in(key, int(i)), names[i]) for i in indices]
+    if not collection.parts:
+        return bodies
+    return [objects.decompose(body) if objects.gaps(body)[1] > objects.HOLLOW else body for body in bodies]
+
+
+def head(collection: Collection, count: int) -> Collection:
+    """The collection of the first `count` objects only."""
+    meshes = collection.meshes
+    if meshes is None:
+        return dataclasses.replace(collection, num_objects=count)
+    few = dataclasses.replace(meshes, names=meshes.names[:count], labels=meshes.labels[:count])
+    return dataclasses.replace(collection, meshes=few, num_objects=len(few.names))
+
+
+def split_objects(collection: Collection) -> dict[str, np.ndarray]:
+    """Indices of the objects for training, validation and test, shuffled by the seed, with classes spread evenly."""
+    rng = np.random.default_rng([collection.seed, 1])
+    # Each block has one object of every class that has one left, so that a cut spreads the classes evenly.
+    names = np.array(class_names(collection))
+    members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
+    blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
+    cuts = np.round(np.cumsum(collection.shares)[:-1] * collection.num_objects).astype(int)
+    parts = np.split(np.concatenate(blocks), cuts)
+    return {name: np.sort(part).astype(np.int64) for name, part in zip(PARTS, parts, strict=True)}
+
+
+def symmetries_of(collection: Collection) -> tuple[int, ...]:
+    """Symmetries of the pad in which the first and last frames of a trajectory are rendered. 0 is the identity."""
+    return collection.scenario.symmetries if collection.symmetries else (0,)
+
+
+def as_json(collection: Collection) -> dict:
+    """The content of a dataset's `collection.json`."""
+    content = dataclasses.asdict(collection)
+    scenario = collection.scenario
+    content["scenario"] = {"name": type(scenario).__name__, **content["scenario"]}
+    # Left out where it is 1, so that the descriptions of older datasets, whose conditions have one vector, stay valid.
+    if scenario.quantities and scenario.vectors != 1:
+        content["scenario"]["vectors"] = scenario.vectors
+    return {"format": records.FORMAT, **content}

@@ -1,0 +1,118 @@
+"""Rendering of the frames of a dataset, in parallel and as they are stored."""
+
+import concurrent.futures
+import functools
+import os
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from sts_jax import objects, physics
+from sts_jax.dataset import records
+from sts_jax.dataset.collection import Collection, make_bodies, symmetries_of
+from sts_jax.dataset.symmetry import turn, turn_wrench
+from sts_jax.frame import sense
+from sts_jax.sensor import Sensor
+
+# Frames rendered by one compiled call. The last call of an object is padded. A CPU renders frames one after another.
+RENDER_BATCH = 32
+CPU_RENDER_BATCH = 8
+
+
+class _Job(NamedTuple):
+    """Frames of one body that one compiled call renders."""
+
+    body: objects.Body
+    pose: np.ndarray  # (n, 7)
+    wrench: np.ndarray  # (n, 6)
+    is_view: bool  # whether only the visual image is kept
+
+
+def render(
+    collection: Collection,
+    sensor: Sensor,
+    bodies: list[objects.Body],
+    trajectory: physics.Trajectory,
+    frames: np.ndarray,
+    views: dict[str, np.ndarray],
+    report: Callable[[int], None],
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Render a shard in batches, with one thread per core, because one call keeps only one core busy.
+
+    Args:
+        collection: The description of the dataset.
+        sensor: The sensor.
+        bodies: The objects of the shard.
+        trajectory: Their trajectories, as NumPy arrays, with bodies counted in the shard.
+        frames: Rows of (trajectory, frame, symmetry), sorted by object and then by mirror image, (m, 3).
+        views: The poses and bodies of the views, sorted by object.
+        report: Called with the number of finished images.
+
+    Yields:
+        The records in order: `Images` of the frames, then `(visual,)` of the views.
+    """
+    size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
+    turned = {
+        q: [np.asarray(f(jnp.asarray(x), q)) for f, x in ((turn, trajectory.pose), (turn_wrench, trajectory.wrench))]
+        for q in symmetries_of(collection)
+    }
+    mirrored = [objects.mirror(body) for body in bodies] if max(turned) >= 4 else bodies
+
+    def jobs() -> Iterator[_Job]:
+        owner = np.stack([trajectory.body[frames[:, 0]], frames[:, 2] >= 4], 1)
+        for body_index, flip in np.unique(owner, axis=0):
+            rows = frames[(owner == [body_index, flip]).all(1)]
+            for part in np.split(rows, range(size, len(rows), size)):
+                pose = np.stack([turned[q][0][i, t] for i, t, q in part])
+                wrench = np.stack([turned[q][1][i, t] for i, t, q in part])
+                yield _Job((mirrored if flip else bodies)[body_index], pose, wrench, False)
+        for body_index in np.unique(views["body"]):
+            poses = views["pose"][views["body"] == body_index]
+            for pose in np.split(poses, range(size, len(poses), size)):
+                yield _Job(bodies[body_index], pose, np.zeros((len(pose), 6), np.float32), True)
+
+    def work(job: _Job) -> tuple[np.ndarray, ...]:
+        pose, wrench = (np.pad(x, ((0, size - len(x)), (0, 0)), "edge") for x in (job.pose, job.wrench))
+        images = render_uint8(sensor, job.body, pose, wrench, resolution=collection.resolution, crop=collection.crop)
+        kept = images[:1] if job.is_view else images
+        return tuple(np.asarray(leaf)[: len(job.pose)] for leaf in kept)
+
+    done = 0
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        for images in pool.map(work, jobs()):
+            done += len(images[0])
+            report(done)
+            yield images
+
+
+@functools.partial(jax.jit, static_argnames=("resolution", "crop"))
+def render_uint8(
+    sensor: Sensor,
+    body: objects.Body,
+    pose: Float[Array, "n 7"],
+    wrench: Float[Array, "n 6"],
+    *,
+    resolution: tuple[int, int],
+    crop: bool,
+) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
+    """Render frames of one object as they are stored: visual and tactile in `uint8`, segmentation in bool."""
+
+    def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        frame = sense(sensor, body, *item, resolution=resolution, crop=crop)
+        visual, tactile = (jnp.round(image * 255).astype(jnp.uint8) for image in (frame.visual, frame.tactile))
+        return visual, tactile, frame.segmentation
+
+    # A CPU is twice as fast if it renders one frame after another instead of all at once.
+    return jax.lax.map(one, (pose, wrench), batch_size=1 if jax.default_backend() == "cpu" else len(pose))
+
+
+def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
+    """Both streams (`uint8`) and the segmentation (bool) of the untouched sensor, as the collection renders them."""
+    body = make_bodies(collection, np.array([0]))[0]
+    gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
+    images = render_uint8(sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop)
+    return records.Images(*(np.asarray(leaf)[0] for leaf in images))

@@ -1,0 +1,133 @@
+"""Assembly of a body from a surface and its material."""
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull
+
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, Body, pad, size_class
+from sts_jax.objects.hulls import convex_hull
+from sts_jax.objects.moments import PAIRS, solid_moments, surface_moments
+
+WALL = 1.2  # kg/m^2, default shell of a hollow object: plastic about 1.2 mm thick
+STEEL = 5.9  # kg/m^2 of each face: stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301) x 1.5 mm, on two faces
+CONTENTS = 1000.0  # kg/m^3, water
+CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are computed
+
+
+def assemble(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    colors: Float[np.ndarray, "f 3 3"],
+    *,
+    density: Float[np.ndarray, "f"],
+    interior: tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]] | None,
+    contents_density: float = 0.0,
+    mass: float | None = None,
+    uv: Float[np.ndarray, "f 3 2"] | None = None,
+    texture: Float[np.ndarray, "t t 3"] | None = None,
+    two_sided: Bool[np.ndarray, ""] | bool = False,
+    category: int = -1,
+) -> Body:
+    """Assemble a padded `Body` from a surface and its material, with the hull's centroid as the origin.
+
+    Args:
+        vertices: m, +z up.
+        faces: counter-clockwise from outside, at most FACE_CLASSES[-1] of them.
+        colors: [0, 1], linear light, of each corner.
+        density: kg/m^2 of each face.
+        interior: a closed mesh in the same frame that bounds the contents, or None for a solid object.
+        contents_density: kg/m^3.
+        mass: kg, of the shell. None takes area times density.
+        uv: texture coordinates of each corner, v = 0 at the texture's top row.
+        texture: [0, 1], linear light, of one of TEXTURE_CLASSES.
+        two_sided: whether the surface is visible from behind too.
+        category: index into CATEGORIES, or -1.
+
+    Returns:
+        The body.
+
+    Raises:
+        ValueError: the convex hull or the interior has no volume.
+    """
+    hull = convex_hull(vertices)
+    shape = ConvexHull(hull)
+    middle = hull.mean(axis=0)
+    outward = hull[shape.simplices] - middle
+    sign = np.sign(np.einsum("fi,fi->f", outward[:, 0], np.cross(outward[:, 1], outward[:, 2])))
+    moments = sign @ solid_moments(outward)
+    origin = middle + moments[1:4] / moments[0]
+    vertices, hull = vertices - origin, hull - origin
+
+    shell = density @ surface_moments(vertices[faces])
+    if mass is not None:
+        shell *= mass / shell[0]
+    com = shell[1:4] / shell[0]
+    second = np.zeros((3, 3))
+    for (i, j), value in zip(PAIRS, shell[4:], strict=True):
+        second[i, j] = second[j, i] = value
+    second -= shell[0] * np.outer(com, com)
+
+    contents = np.zeros((0, 3, 3)) if interior is None else (interior[0] - origin)[interior[1]]
+    if interior is not None and not solid_moments(contents).sum(axis=0)[0] > 0:
+        raise ValueError("the interior encloses no volume: close it, or turn its faces outwards")
+
+    size = size_class(max(len(faces), len(vertices), len(contents)), FACE_CLASSES)
+    single = np.float32
+    uv = np.zeros((len(faces), 3, 2)) if uv is None else uv
+    texture = np.ones((1, 1, 3)) if texture is None else texture
+    return Body(
+        vertices=jnp.asarray(pad(vertices, size, vertices[-1]), single),
+        faces=jnp.asarray(pad(faces, size, 0.0), np.int32),
+        normals=jnp.asarray(pad(corner_normals(vertices, faces), size, np.array([0.0, 0.0, 1.0])), single),
+        colors=jnp.asarray(pad(colors, size, 0.0), single),
+        uv=jnp.asarray(pad(uv, size, 0.0), single),
+        texture=jnp.asarray(texture, single),
+        two_sided=jnp.asarray(two_sided, bool),
+        hulls=jnp.asarray(pad(hull, size_class(len(hull), HULL_CLASSES), hull[-1])[None], single),
+        shell_mass=jnp.asarray(shell[0], single),
+        shell_com=jnp.asarray(com, single),
+        shell_inertia=jnp.asarray(np.trace(second) * np.eye(3) - second, single),
+        interior=jnp.asarray(pad(contents, size, 0.0), single),
+        contents_density=jnp.asarray(contents_density, single),
+        category=jnp.asarray(category, np.int32),
+    )
+
+
+def corner_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
+) -> Float[np.ndarray, "f 3 3"]:
+    """Unit normal of each corner: the angle-weighted mean over the faces at its vertex within the crease angle.
+
+    Args:
+        vertices: m.
+        faces: indices. Faces must share the index of a vertex for the surface to be smooth there.
+        crease: rad.
+
+    Returns:
+        Normals. A face without area counts as facing (0, 0, 1).
+    """
+    triangles = vertices[faces]
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    flat = np.where(length > 0, cross / np.where(length > 0, length, 1), np.array([0.0, 0.0, 1.0]))
+    angle = trimesh.triangles.angles(triangles) * (length > 0)
+
+    corner_vertex = faces.ravel()
+    order = np.argsort(corner_vertex, kind="stable")
+    count = np.bincount(corner_vertex, minlength=len(vertices))
+    start = np.cumsum(count) - count
+    # Pair every corner with all corners at its vertex.
+    repeats = count[corner_vertex]
+    first = np.repeat(np.arange(len(corner_vertex)), repeats)
+    within = np.arange(len(first)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    second = order[start[corner_vertex[first]] + within]
+    near = np.einsum("pi,pi->p", flat[first // 3], flat[second // 3]) > np.cos(crease)
+    weight = near * angle.ravel()[second]
+    normals = np.stack(
+        [np.bincount(first, weight * flat[second // 3, axis], len(corner_vertex)) for axis in range(3)], axis=1
+    )
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(size > 1e-9, normals / np.where(size > 1e-9, size, 1), np.repeat(flat, 3, axis=0))
+    return normals.reshape(-1, 3, 3)

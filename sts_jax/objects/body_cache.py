@@ -1,0 +1,64 @@
+"""The cache of loaded bodies: one file per object, whose name is a hash of everything that the body depends on."""
+
+import dataclasses
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from sts_jax._files import write_whole
+from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES, Body
+from sts_jax.objects.items import Entry, Item, Library
+from sts_jax.objects.materials import references
+
+_FORMAT = 1  # version of cached objects, increased whenever the same file and settings give a different body
+
+
+def path_of(library: Library, item: Item) -> Path:
+    """The file of an item in the cache of its library, which must have one.
+
+    Raises:
+        FileNotFoundError: the mesh file does not exist any more.
+    """
+    assert library.cache is not None
+    digest = hashlib.sha256()
+    fields = [field.name for field in dataclasses.fields(Body)]
+    settings = [item.scale, item.longest_side, item.up, item.front, item.label, item.notes]
+    layout = [_FORMAT, fields, FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTURE_CLASSES]
+    digest.update(json.dumps([layout, settings, library.faces, library.largest, library.parts]).encode())
+    try:
+        named = references(item.path, item.textures)
+    except (OSError, ValueError):
+        named = {}  # `load` raises an error for it
+    if not item.path.is_file():
+        raise FileNotFoundError(f"{item.path}: no such mesh file")
+    for name, path in [(item.path.name, item.path), *sorted(named.items())]:
+        digest.update(name.encode() + b"\0" + (b"" if path is None else hashlib.sha256(path.read_bytes()).digest()))
+    return library.cache / f"{digest.hexdigest()[:32]}.npz"
+
+
+def write(path: Path, entry: Entry) -> None:
+    """Write an entry as a whole or not at all."""
+    about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
+    leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
+
+    def save(temporary: Path) -> None:
+        with temporary.open("wb") as file:  # given a name, NumPy would add a suffix to it
+            np.savez(file, about=np.frombuffer(about.encode(), np.uint8), **leaves)
+
+    write_whole(path, save)
+
+
+def read(path: Path, item: Item) -> Entry | None:
+    """Read the entry of an item, or return None if its file is missing or damaged."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})
+            about = json.loads(data["about"].tobytes())
+        return Entry(item, body, tuple(about["gaps"]), tuple(about["notes"]))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None

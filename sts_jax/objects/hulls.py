@@ -1,0 +1,145 @@
+"""Convex hulls on the host, in NumPy float64: vertices, distances, support function and rest poses."""
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+from sts_jax.objects.body import HULL_CLASSES, Body
+
+HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less than this
+SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull whose normals differ by less than this form one face
+REST_GRAIN = 2e-5  # m, points of a hull this near a face's plane belong to the face
+REST_MARGIN = 5e-4  # m, how far inside the outline of a face the centre of mass must lie for the object to rest on it
+NUM_DIRECTIONS = 128
+
+
+def lattice(num: int) -> Float[np.ndarray, "n 3"]:
+    """`num` unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+    step = np.arange(num) + 0.5
+    z, angle = 1 - 2 * step / num, np.pi * (1 + np.sqrt(5)) * step
+    points = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+    return points.astype(np.float32)
+
+
+DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3) unit vectors, at which `support` is evaluated
+
+
+def convex_hull(
+    points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
+) -> Float[np.ndarray, "h 3"]:
+    """Vertices of a convex hull, simplified to a tolerance and a maximum number of vertices.
+
+    Starting from a simplex, the point furthest outside is added until no point is outside by more than the tolerance.
+
+    Args:
+        points: m.
+        limit: maximum number of vertices, which takes precedence over the tolerance.
+        tolerance: m.
+
+    Returns:
+        A subset of the points.
+
+    Raises:
+        ValueError: the points lie in a plane.
+    """
+    try:
+        candidates = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError) as error:
+        raise ValueError("the points lie in a plane: their convex hull has no volume") from error
+    chosen = [int(np.argmax(candidates[:, 0]))]
+    relative = candidates - candidates[chosen[0]]
+    chosen.append(int(np.argmax(np.linalg.norm(relative, axis=1))))
+    chosen.append(int(np.argmax(np.linalg.norm(np.cross(relative, relative[chosen[1]]), axis=1))))
+    normal = np.cross(relative[chosen[1]], relative[chosen[2]])
+    chosen.append(int(np.argmax(np.abs(relative @ normal))))
+    while len(chosen) < limit:
+        planes = ConvexHull(candidates[chosen]).equations
+        outside = (candidates @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+        furthest = int(np.argmax(outside))
+        if outside[furthest] <= tolerance:
+            break
+        chosen.append(furthest)
+    corners = candidates[chosen]
+    return corners[np.sort(ConvexHull(corners).vertices)]
+
+
+def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
+    """Distance (m) of each point from a convex hull, 0 inside."""
+    shape = ConvexHull(hull)
+    normals, offsets = shape.equations[:, :3], shape.equations[:, 3]
+    sides = points @ normals.T + offsets
+    plane = np.argmax(sides, axis=1)
+    distance = np.maximum(sides[np.arange(len(points)), plane], 0.0)
+    # The distance to the plane that a point is furthest beyond is exact if the foot of the perpendicular lies on the
+    # hull. Otherwise the nearest point of the hull lies on an edge.
+    feet = points - distance[:, None] * normals[plane]
+    rows = np.nonzero((distance > 0) & ((feet @ normals.T + offsets).max(axis=1) > 1e-12))[0]
+    triangles = hull[shape.simplices]
+    for some in np.array_split(rows, -(-len(rows) * len(triangles) // 200_000)) if len(rows) else []:
+        pairs = np.repeat(some, len(triangles))
+        nearest = trimesh.triangles.closest_point(np.tile(triangles, (len(some), 1, 1)), points[pairs])
+        distance[some] = np.linalg.norm(nearest - points[pairs], axis=1).reshape(len(some), -1).min(axis=1)
+    return distance
+
+
+def support(body: Body) -> Float[np.ndarray, "128"]:
+    """Support function of the collision parts' convex hull, about the mesh origin: h(d) = max over vertices v . d.
+
+    Args:
+        body: one body.
+
+    Returns:
+        float32, m, at DIRECTIONS in the mesh frame.
+
+    Raises:
+        ValueError: `body` has leading axes.
+    """
+    if np.ndim(body.hulls) != 3:
+        raise ValueError(f"hulls has the shape {np.shape(body.hulls)}, but one body has (p, h, 3): pass a single body")
+    points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
+    return (points @ DIRECTIONS.T.astype(np.float64)).max(axis=0).astype(np.float32)
+
+
+def rest_poses(
+    points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
+    """Attitudes in which a convex hull rests on a plane.
+
+    The hull rests on a face if the centre of mass lies above the face and at least REST_MARGIN inside its outline.
+
+    Args:
+        points: m. Their convex hull is the object at rest.
+        com: centre of mass, m.
+
+    Returns:
+        For each such face, the unit vector that points up when the hull rests on it, and a weight: the face's solid
+        angle seen from the centre of mass, as a share of the sum over these faces.
+    """
+    hull = ConvexHull(points)
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    r = points[hull.simplices] - com
+    length = np.linalg.norm(r, axis=2)
+    # Van Oosterom and Strackee (1983): the solid angle of a triangle.
+    numerator = np.abs(np.einsum("fi,fi->f", r[:, 0], np.cross(r[:, 1], r[:, 2])))
+    pairs = [np.einsum("fi,fi->f", r[:, i], r[:, j]) * length[:, k] for i, j, k in ((0, 1, 2), (0, 2, 1), (1, 2, 0))]
+    angle = 2 * np.arctan2(numerator, length.prod(axis=1) + np.sum(pairs, axis=0))
+
+    ups, weights = [], []
+    left = np.ones(len(normals), bool)
+    while left.any():
+        first = np.flatnonzero(left)[np.argmax(angle[left])]
+        face = left & (normals @ normals[first] > np.cos(SAME_FACE))
+        left &= ~face
+        normal = normals[first]
+        support = points[points @ normal + offsets[first] > -REST_GRAIN]
+        across = np.linalg.svd(normal[None])[2][1:]
+        try:
+            edges = ConvexHull(support @ across.T).equations
+        except QhullError:  # the points form an edge or a corner
+            continue
+        above = normal @ com + offsets[first] < 0
+        if above and np.max(edges[:, :2] @ (across @ com) + edges[:, 2]) < -REST_MARGIN:
+            ups.append(-normal)
+            weights.append(angle[face].sum())
+    return np.array(ups).reshape(-1, 3), np.array(weights) / max(np.sum(weights), 1e-12)

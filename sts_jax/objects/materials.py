@@ -1,0 +1,221 @@
+"""Colours, texture coordinates and textures of mesh files, and the material and image files that they refer to."""
+
+import json
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from sts_jax.objects.body import TEXTURE_CLASSES
+from sts_jax.objects.colors import linear
+
+PLAIN = 0.7  # sRGB grey of a mesh without colours
+
+
+def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
+    """List the files that an OBJ or glTF file refers to. Other formats are not read.
+
+    Args:
+        path: the mesh file.
+        images: additional folder of images.
+
+    Returns:
+        The place of each file by the name that refers to it, or None for a missing file.
+    """
+    if path.suffix.lower() == ".gltf":
+        tree = json.loads(path.read_text())
+        names = [part.get("uri", "data:") for key in ("buffers", "images") for part in tree.get(key, [])]
+        return {name: _found(path.parent, name, images) for name in names if not name.startswith("data:")}
+    if path.suffix.lower() != ".obj":
+        return {}
+    files = {name: _found(path.parent, name, None) for name in _named(path, "mtllib")}
+    for library in [library for library in files.values() if library is not None]:
+        files |= {name: _found(path.parent, name, images) for name in _named(library, "map_kd")}
+    return files
+
+
+def check_materials(path: Path, images: Path | None, strict: bool) -> None:
+    """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones.
+
+    Args:
+        path: the mesh file. Other formats pass.
+        images: additional folder of images.
+        strict: whether a missing file is an error instead of a warning.
+
+    Raises:
+        FileNotFoundError: a file is missing and `strict` is set.
+        ValueError: an image cannot be read.
+    """
+    if path.suffix.lower() != ".obj":
+        return
+    files = references(path, images)
+    missing = [str(path.parent / name) for name, file in files.items() if file is None]
+    if missing and strict:
+        raise FileNotFoundError(f"{path} refers to {', '.join(missing)}, not found: add it, or give texture=")
+    if missing:
+        warnings.warn(
+            f"{path} refers to {', '.join(missing)}, not found: drawn without it unless texture= is given", stacklevel=3
+        )
+    for file in files.values():
+        if file is not None and file.suffix.lower() != ".mtl":
+            read_image(file)
+
+
+def read_image(path: Path) -> Image.Image:
+    """Read an image file as RGB.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        ValueError: the file cannot be read as an image.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such image file")
+    try:
+        with Image.open(path) as picture:
+            return picture.convert("RGB")
+    except (OSError, SyntaxError) as error:
+        raise ValueError(f"{path}: cannot be read as an image ({error}): replace it") from error
+
+
+class Resolver(trimesh.resolvers.FilePathResolver):
+    """Lets trimesh find images in an additional folder."""
+
+    def __init__(self, path: Path, images: Path) -> None:
+        super().__init__(str(path))
+        self.images = images
+
+    def get(self, name: str) -> bytes:
+        """The content of a file that the mesh file refers to."""
+        found = _found(Path(self.parent), name, self.images)
+        return super().get(name) if found is None else found.read_bytes()
+
+
+def _found(folder: Path, name: str, images: Path | None) -> Path | None:
+    """Find a file that a mesh file in `folder` refers to: by its relative path, or by its base name in `images`."""
+    name = name.strip().replace("\\", "/")
+    places = [folder / name] + ([] if images is None else [images / Path(name).name])
+    return next((place for place in places if place.is_file()), None)
+
+
+def _named(file: Path, word: str) -> list[str]:
+    """The names behind a word at the start of a line in an OBJ or MTL file."""
+    return re.findall(
+        rf"^[ \t]*{word}[ \t]+(\S.*?)\s*$", file.read_text(errors="replace"), re.IGNORECASE | re.MULTILINE
+    )
+
+
+def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Colours, texture coordinates and texture of all meshes of a file together.
+
+    Args:
+        path: the file. Colours of glTF files are in linear light, all others in sRGB.
+        pieces: its meshes.
+
+    Returns:
+        Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) of all corners, and the texture (t, t, 3) in
+        linear light, or None.
+
+    Raises:
+        ValueError: a texture cannot be read.
+    """
+    is_linear = path.suffix.lower() in (".glb", ".gltf")
+    colors, uvs, images = [], [], []
+    for piece in pieces:
+        color, uv, image = _piece_albedo(piece, is_linear)
+        colors.append(color)
+        uvs.append(uv)
+        images.append(image)
+    pictures = [image for image in images if image is not None]
+    if not pictures:
+        return np.concatenate(colors), np.concatenate(uvs), None
+    try:
+        sheets = [np.asarray(picture.convert("RGB")) for picture in pictures]
+    except (OSError, SyntaxError) as error:
+        raise ValueError(f"{path}: its texture cannot be read ({error}): replace it") from error
+    distinct: list[np.ndarray] = []
+    cell = []
+    for sheet in sheets:
+        same = [i for i, other in enumerate(distinct) if np.array_equal(other, sheet)]
+        cell.append(same[0] if same else len(distinct))
+        if not same:
+            distinct.append(sheet)
+    plain = len(distinct) if any(image is None for image in images) else -1
+    if plain >= 0:  # untextured pieces look up a white cell
+        distinct.append(np.full((8, 8, 3), 255, np.uint8))
+    if len(distinct) == 1:
+        texture = _square(distinct[0], _texture_class(max(distinct[0].shape[:2])))
+    else:
+        cells = iter(cell)
+        texture, uvs = _packed(distinct, uvs, [plain if image is None else next(cells) for image in images])
+    return np.concatenate(colors), np.concatenate(uvs), linear(texture / 255.0)
+
+
+def _packed(sheets: list[np.ndarray], uvs: list[np.ndarray], cells: list[int]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Pack several textures into one, and map the coordinates of each piece, given its texture's index, to its cell."""
+    # The cells tile a sheet of a texture class's size, so that it is not resampled again.
+    grid = int(np.ceil(np.sqrt(len(sheets))))
+    size = _texture_class(grid * max(max(sheet.shape[:2]) for sheet in sheets))
+    side = size // grid
+    atlas = np.zeros((size, size, 3), np.uint8)
+    for index, sheet in enumerate(sheets):
+        row, column = divmod(index, grid)
+        atlas[row * side : (row + 1) * side, column * side : (column + 1) * side] = _square(sheet, side)
+    margin = 0.5 / side
+    mapped = []
+    for uv, cell in zip(uvs, cells, strict=True):
+        inside = uv - np.floor(uv.min(axis=1, keepdims=True) + 1e-6)
+        mapped.append((np.clip(inside, margin, 1 - margin) + np.array(divmod(cell, grid)[::-1])) * (side / size))
+    return atlas, mapped
+
+
+def _texture_class(longest: int) -> int:
+    return next((size for size in TEXTURE_CLASSES if longest <= size), TEXTURE_CLASSES[-1])
+
+
+def _square(sheet: np.ndarray, side: int) -> np.ndarray:
+    """An image, stretched to a square."""
+    if sheet.shape[:2] == (side, side):
+        return sheet
+    return np.asarray(Image.fromarray(sheet).resize((side, side), Image.Resampling.LANCZOS))
+
+
+def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, np.ndarray, Image.Image | None]:
+    """Colours (f, 3, 3) in linear light, texture coordinates (f, 3, 2) and the image, if any, of one mesh."""
+    faces = np.asarray(piece.faces)
+    uv = np.zeros((len(faces), 3, 2))
+    visual = piece.visual
+    decode = (lambda x: x) if is_linear else linear
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        material = visual.material
+        if isinstance(material, trimesh.visual.material.PBRMaterial):
+            image, factor = material.baseColorTexture, material.baseColorFactor
+        else:
+            image, factor = getattr(material, "image", None), getattr(material, "diffuse", None)
+        if visual.uv is None or len(visual.uv) != len(piece.vertices):
+            image = None
+        if image is not None:
+            uv = np.asarray(visual.uv, float)[faces]
+            uv = np.stack([uv[..., 0], 1 - uv[..., 1]], axis=-1)
+        if factor is None or (image is not None and not is_linear):
+            color = np.ones(3) if image is not None or is_linear else linear(np.full(3, PLAIN))
+        else:
+            color = decode(_unit(np.asarray(factor))[:3])
+        corner = np.broadcast_to(color, (len(faces), 3, 3))
+        painted = visual.vertex_attributes.get("color") if is_linear else None
+        if painted is not None and len(painted) == len(piece.vertices):
+            corner = corner * _unit(np.asarray(painted))[faces][..., :3]
+        return np.array(corner), uv, image
+    if visual.kind == "vertex":
+        return decode(_unit(np.asarray(visual.vertex_colors))[faces][..., :3]), uv, None
+    if visual.kind == "face":
+        corner = decode(_unit(np.asarray(visual.face_colors))[:, None, :3])
+        return np.repeat(corner, 3, axis=1), uv, None
+    return np.full((len(faces), 3, 3), linear(np.array(PLAIN))), uv, None
+
+
+def _unit(color: np.ndarray) -> np.ndarray:
+    """Colours in [0, 1], from integers of any size or from floats."""
+    return color / np.iinfo(color.dtype).max if np.issubdtype(color.dtype, np.integer) else color.astype(float)

@@ -1,0 +1,182 @@
+"""Convex collision parts: decomposition of a body, and the gaps between parts and visible surface."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull, KDTree
+
+from sts_jax.objects.body import HULL_CLASSES, PART_CLASSES, Body, pad, size_class
+from sts_jax.objects.hulls import convex_hull, outside_hull
+from sts_jax.objects.surface import surface_samples
+
+
+def convex_parts(
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    *,
+    limit: int = PART_CLASSES[-1],
+    vertices_per_part: int = HULL_CLASSES[0],
+) -> list[Float[np.ndarray, "_ 3"]]:
+    """Decompose a surface into convex parts, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
+
+    The same mesh gives the same parts. CoACD first closes open surfaces, which thickens them a little.
+
+    Args:
+        vertices: m.
+        faces: counter-clockwise from outside.
+        limit: maximum number of parts.
+        vertices_per_part: maximum number of vertices of each part.
+
+    Returns:
+        The vertices (m) of each part. A convex surface gives a single part.
+
+    Raises:
+        ImportError: coacd is not installed.
+        ValueError: the surface cannot be decomposed.
+    """
+    try:
+        import coacd
+    except ImportError as error:
+        raise ImportError(
+            "convex parts need the package coacd, which is not installed: pip install 'sts_jax[meshes]'"
+        ) from error
+    coacd.set_log_level("off")
+    try:
+        pieces = coacd.run_coacd(
+            coacd.Mesh(np.asarray(vertices, float), np.asarray(faces, np.int32)),
+            max_convex_hull=limit,
+            resolution=1000,
+            mcts_nodes=10,
+            mcts_iterations=40,
+            seed=0,
+        )
+        parts = [convex_hull(np.asarray(corners, float), limit=vertices_per_part) for corners, _ in pieces]
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"no convex parts were found ({error}): keep the convex hull") from error
+    if not parts:
+        raise ValueError("no convex parts were found: keep the convex hull")
+    return sorted(parts, key=lambda part: (-ConvexHull(part).volume, *part[0]))
+
+
+def decompose(body: Body) -> Body:
+    """Let a body, such as scissors, a bowl or a mug, collide as several convex parts instead of its convex hull.
+
+    Args:
+        body: one body.
+
+    Returns:
+        The body with the parts as `hulls`, at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each.
+        If a single part suffices, the body is returned unchanged.
+
+    Raises:
+        ImportError: coacd is not installed.
+        ValueError: the surface cannot be decomposed.
+    """
+    parts = convex_parts(*_surface(body))
+    if len(parts) == 1:
+        return body
+    size = size_class(max(map(len, parts)), HULL_CLASSES)
+    padded = np.stack([pad(part, size, part[-1]) for part in parts])
+    hulls = pad(padded, size_class(len(parts), PART_CLASSES), padded[-1])
+    return dataclasses.replace(body, hulls=jnp.asarray(hulls, np.float32))
+
+
+def gaps(body: Body) -> tuple[float, float]:
+    """`surface_gaps` (m) of one body: how far its surface sticks out of the collision parts, and the reverse."""
+    parts = np.asarray(body.hulls, float)
+    new = np.array([True, *(parts[1:] != parts[:-1]).any(axis=(1, 2))])  # padding repeats the last part
+    return surface_gaps(*_surface(body), [np.unique(part, axis=0) for part in parts[new]])
+
+
+def surface_gaps(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
+) -> tuple[float, float]:
+    """Largest distances (m) between the visible surface and the collision parts.
+
+    Each is the maximum over the corners and 10,000 points of one surface of the exact distance to the other. A maximum
+    between two points can be missed by about half their spacing. The first distance is exact for a single hull.
+
+    Args:
+        vertices: m.
+        faces: of the visible surface, counter-clockwise from outside.
+        hulls: the vertices of each convex part.
+
+    Returns:
+        How far the surface sticks out of all parts, which is how deep the drawn surface can sink in. How far the parts
+        reach outside the surface, where the object collides although nothing is visible, as in a bowl's hollow.
+    """
+    points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
+    shapes = [ConvexHull(hull) for hull in hulls]
+    for shape in shapes:
+        points = points[(points @ shape.equations[:, :3].T + shape.equations[:, 3]).max(axis=1) > 1e-9]
+    out = np.min([outside_hull(points, hull) for hull in hulls], axis=0).max(initial=0.0)
+
+    triangles = np.concatenate([hull[shape.simplices] for hull, shape in zip(hulls, shapes, strict=True)])
+    points = np.unique(np.concatenate([triangles.reshape(-1, 3), _points(triangles, 10_000)]), axis=0)
+    closed = bool(trimesh.Trimesh(vertices, faces, process=False).is_watertight)
+    return float(out), _reach(points, vertices[faces], closed)
+
+
+def hull_gap(body: Body) -> float:
+    """Largest distance (m) by which the visible surface of one body sticks out of the collision parts."""
+    surface = np.unique(np.asarray(body.vertices, float), axis=0)
+    parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
+    return float(np.min(parts, axis=0).max())
+
+
+def _surface(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    faces = np.asarray(body.faces)
+    return np.asarray(body.vertices, float), faces[faces.any(axis=1)]
+
+
+def _points(triangles: np.ndarray, num: int) -> np.ndarray:
+    face, weight = surface_samples(triangles, num)
+    return np.einsum("nk,nkc->nc", weight, triangles[face])
+
+
+def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
+    """Largest distance from the triangles over the points outside them, or over all points if they are not closed.
+
+    The distance to the nearest corner or sample is an upper bound for a point. Therefore only points whose bound
+    exceeds the largest distance so far are measured, each against the triangles within its bound.
+    """
+    bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
+    center = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - center[:, None], axis=2).max(axis=1)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    order, largest = np.argsort(-bound, kind="stable"), 0.0
+    for some in np.array_split(order, -(-len(order) // 128)):
+        if bound[some[0]] <= largest:
+            break
+        apart = np.linalg.norm(center - points[some, None], axis=2)
+        row, column = np.nonzero(apart - radius <= bound[some, None] * (1 + 1e-9))
+        away = points[some][row] - trimesh.triangles.closest_point(triangles[column], points[some][row])
+        lengths = np.linalg.norm(away, axis=1)
+        distance = np.full(len(some), np.inf)
+        np.minimum.at(distance, row, lengths)
+        # The nearest faces of a closed surface decide which side a point is on. If they disagree, the winding decides.
+        nearest = lengths <= distance[row] + 1e-9
+        front = np.zeros((2, len(some)), bool)
+        np.logical_or.at(front, ((np.einsum("pi,pi->p", away, normals[column]) > 0).astype(int), row), nearest)
+        for index in np.argsort(-distance, kind="stable"):
+            if distance[index] <= max(largest, 1e-6):
+                break
+            behind, before = front[:, index]
+            if not closed or (before and (not behind or _turns(points[some[index]], triangles) < 0.5)):
+                largest = float(distance[index])
+                break
+    return largest
+
+
+def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
+    """Winding number of the triangles around a point (van Oosterom and Strackee, 1983): 1 inside, 0 outside."""
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
+    across = np.einsum("fi,fi->f", a, np.cross(b, c))
+    dots = (np.einsum("fi,fi->f", left, right) for left, right in ((a, b), (b, c), (c, a)))
+    along = one * two * three + sum(dot * size for dot, size in zip(dots, (three, one, two), strict=True))
+    return float(np.arctan2(across, along).sum() / (2 * np.pi))

@@ -1,0 +1,142 @@
+"""ShapeNetSem as downloaded: its table gives class, size and attitude of each mesh."""
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from sts_jax.objects.items import Item, Vector
+from sts_jax.objects.meshes import rotation
+
+# Class of each of ShapeNetSem's categories (the `category` column of its metadata.csv, named in its taxonomy.txt).
+# "Mouse" is left out because, unlike "ComputerMouse", it may be the animal.
+CLASSES = {
+    "Bottle": "bottle",
+    "BeerBottle": "bottle",
+    "DrinkBottle": "bottle",
+    "PillBottle": "bottle",
+    "SoapBottle": "bottle",
+    "WineBottle": "bottle",
+    "Camera": "camera",
+    "DSLRCamera": "camera",
+    "WebCam": "webcam",
+    "ComputerMouse": "mouse",
+    "Scissors": "scissors",
+    "Fork": "fork",
+    "Spoon": "spoon",
+    "Watch": "watch",
+}
+# The required columns among those in ShapeNetSem's README: id, categories, directions, metres per unit.
+_COLUMNS = ("fullId", "category", "up", "front", "unit")
+# Defaults of ShapeNet's own viewer for missing directions (ShapeNet/shapenet-viewer, Constants.scala).
+_UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
+
+
+def find_root(folder: Path) -> Path | None:
+    """Find the folder with the table: `folder`, or a sub-folder as the archive unpacks it. None without a table."""
+    for table in (folder / "metadata.csv", *sorted(folder.glob("*/metadata.csv"))):
+        if table.is_file():
+            with table.open(encoding="utf-8", errors="replace", newline="") as lines:
+                header = next(csv.reader(lines), [])
+            if "fullId" in header or len(set(_COLUMNS) & set(header)) > 2 or (table.parent / "models-OBJ").is_dir():
+                return table.parent
+    return None
+
+
+def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
+    """List the models of the classes CLASSES.
+
+    Args:
+        root: the folder with the table.
+
+    Returns:
+        The items, and (name, reason) of each skipped model.
+
+    Raises:
+        ValueError: the table lacks columns or cannot be read.
+    """
+    rows = _rows(root / "metadata.csv")
+    found: list[Item] = []
+    skipped: list[tuple[str, str]] = []
+    meshes = [root / "models-OBJ" / "models", root / "models-OBJ", root / "models"]
+    textures = [root / "models-textures" / "textures", root / "models-textures", root / "textures"]
+    images = next((place for place in textures if place.is_dir()), None)
+    others, seen = 0, set()
+    for row in rows:
+        name = row["fullId"].strip().rpartition(".")[2]  # "wss.<id>"
+        categories = [part.strip() for part in row["category"].split(",") if part.strip()]
+        labels = {CLASSES[part] for part in categories if part in CLASSES}
+        if "webcam" in labels:
+            labels.discard("camera")
+        if not labels or not name:
+            others += 1
+            continue
+        try:
+            if name in seen:
+                raise ValueError("its id is in the table twice, and the first row is used")
+            seen.add(name)
+            if "_BAD" in categories:
+                raise ValueError("marked _BAD in the table")
+            if len(labels) > 1:
+                raise ValueError(f"it has several classes ({', '.join(sorted(labels))})")
+            path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
+            if path is None:
+                raise ValueError(f"models-OBJ/models/{name}.obj does not exist")
+            found.append(_item(row, path, name, labels.pop(), images))
+        except ValueError as error:
+            skipped.append((name, str(error)))
+    if others:
+        skipped.append(("metadata.csv", f"{others:,} of {len(rows):,} models are of none of the eight classes"))
+    return found, skipped
+
+
+def _rows(table: Path) -> list[dict[str, str]]:
+    """The rows of the table, by column."""
+    text = table.read_text(encoding="utf-8", errors="replace")
+    for escape in (None, "\\"):  # commas inside a value are quoted, escaped or both
+        reader = csv.DictReader(io.StringIO(text), escapechar=escape, restkey="rest", restval="")
+        missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
+        if missing:
+            raise ValueError(
+                f"{table}: lacks the columns {', '.join(missing)} of ShapeNetSem's table: download it again"
+            )
+        try:
+            rows = list(reader)
+        except csv.Error as error:
+            raise ValueError(f"{table}: cannot be read as a table ({error}): download it again") from error
+        if not any("rest" in row for row in rows):
+            return rows
+    raise ValueError(f"{table}: has rows with more cells than columns: download it again")
+
+
+def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:
+    """The item of a row. Raises a ValueError with the reason if the row cannot be used."""
+    unit = row["unit"].strip()
+    if not unit:
+        raise ValueError("its unit is missing, so its size is unknown")
+    try:
+        scale = float(unit)
+    except ValueError:
+        scale = float("nan")
+    if not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"its unit is {unit!r}, not a positive number of metres")
+    notes = [f"no {key} in the table: ShapeNet's default" for key in ("up", "front") if not row[key].strip()]
+    up, front = _vector(row["up"], "up") or _UP, _vector(row["front"], "front") or _FRONT
+    rotation(up, front)  # raises an error if they do not define a rotation
+    # ShapeNetSem's README gives these in metres, but the released table holds centimetres.
+    sides = _vector(row.get("aligned.dims", ""), "aligned.dims")
+    stated = None if sides is None else max(sides) / 100
+    return Item(path, name, label, up, front, scale=scale, textures=images, stated=stated, notes=tuple(notes))
+
+
+def _vector(text: str, key: str) -> Vector | None:
+    """Three numbers from the text of a cell, or None if it is empty."""
+    text = text.strip().strip('"')
+    if not text:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.replace("\\", "").split(","))
+    except ValueError as error:
+        raise ValueError(f"its {key} is {text!r}, not three numbers") from error
+    return x, y, z

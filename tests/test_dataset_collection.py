@@ -1,0 +1,69 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+import sts_jax as sts
+from sts_jax import dataset
+
+SMALL = dataset.Collection(num_objects=4, num_per_object=2, num_full=1, objects_per_shard=2)
+
+
+def test_every_object_is_in_one_part_and_shares_are_kept():
+    collection = dataset.Collection(num_objects=160)
+    split = dataset.split_objects(collection)
+    assert {name: len(part) for name, part in split.items()} == {"train": 112, "validation": 16, "test": 32}
+    np.testing.assert_array_equal(np.sort(np.concatenate(list(split.values()))), np.arange(160))
+    for part in split.values():  # each category alike
+        np.testing.assert_array_equal(np.bincount(part % 8, minlength=8), len(part) // 8)
+
+
+def test_the_split_of_published_collections_is_unchanged():
+    split = dataset.split_objects(dataset.Collection(num_objects=21, seed=5))
+    assert split["validation"].tolist() == [12, 18]
+    assert split["test"].tolist() == [2, 3, 8, 9]
+
+
+def test_classes_follow_the_categories():
+    collection = dataset.Collection(categories=("fork", "bottle"), num_objects=20)
+    names = dataset.class_names(collection)
+    assert names == ("fork", "bottle") * 10
+    for index, body in zip((1, 4), dataset.make_bodies(collection, np.array([1, 4])), strict=True):
+        assert sts.objects.CATEGORIES[int(body.category)] == names[index]
+    for part in dataset.split_objects(collection).values():
+        assert sum(names[i] == "fork" for i in part) == len(part) / 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"num_rendered": 0},
+            r"num_rendered must be a whole number from 1 to num_per_object=2, or None .* got 0",
+        ),
+        ({"num_rendered": 3}, r"num_rendered must be .* got 3"),
+        ({"num_rendered": True}, r"num_rendered must be .* got True"),
+        ({"num_views": -1}, r"num_views must be a whole number of at least 0, got -1"),
+        ({"num_views": False}, r"num_views must be .* got False"),
+        ({"num_objects": 0}, r"num_objects must be a whole number of at least 1, got 0"),
+        ({"num_per_object": 1.5}, r"num_per_object must be a whole number of at least 1, got 1\.5"),
+        ({"objects_per_shard": 0}, r"objects_per_shard must be a whole number of at least 1, got 0"),
+        ({"num_full": -1}, r"num_full must be a whole number of at least 0, got -1"),
+        ({"resolution": (64, 0)}, r"resolution must be two whole numbers .* got \(64, 0\)"),
+        ({"categories": ()}, r"categories is empty, but it must name at least one class"),
+        ({"categories": ("bottle", "cup")}, r"category is 'cup', but it must be one of bottle, camera"),
+        ({"shares": (0.5, 0.5, 0.5)}, r"shares is \(0\.5, 0\.5, 0\.5\), but .* sum 1"),
+    ],
+)
+def test_fields_out_of_range_are_refused_before_anything_is_written(tmp_path, changes, message):
+    with pytest.raises(ValueError, match=message):
+        dataset.collect(dataclasses.replace(SMALL, **changes), sts.Sensor(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_symmetries_of_a_pad_that_is_not_square_are_refused(tmp_path):
+    sensor = sts.Sensor()
+    sensor = dataclasses.replace(sensor, gel=dataclasses.replace(sensor.gel, size=(0.15, 0.1)))
+    with pytest.raises(ValueError, match=r"gel\.size=\[0\.15"):
+        dataset.collect(dataclasses.replace(SMALL, symmetries=True), sensor, tmp_path / "new")
+    assert not (tmp_path / "new").exists()

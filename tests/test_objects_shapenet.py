@@ -1,0 +1,160 @@
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapenet_folder as shapenet
+import trimesh
+from object_files import box, same_points, surface, volume
+
+from sts_jax import objects
+from sts_jax.objects.colors import linear
+
+INCH = 0.0254  # m
+ATTITUDES = {
+    "z_up": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "y_up": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "front_is_x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
+    "upside_down": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    "slanted": ((0.8, 0.6, 0), (-0.6, 0.8, 0), (0, 0, 1)),
+}
+
+
+def only(root: Path, mesh: trimesh.Trimesh, **values: str) -> objects.Library:
+    category = values.pop("category", "Bottle")
+    return objects.library(shapenet.build(root, [shapenet.row("a", category, **values)], {"a": mesh}))
+
+
+@pytest.mark.parametrize(("attitude", "unit"), [*zip(ATTITUDES, [INCH, 0.001, 1.0, INCH, 0.01], strict=True)])
+def test_unit_up_and_front_give_size_and_attitude(tmp_path, attitude, unit):
+    right, back, up = ATTITUDES[attitude]
+    truth = shapenet.wedge()
+    vector = r"\,".join(str(float(x)) for x in up)
+    front = r"\,".join(str(-float(x)) for x in back)
+    listed = only(tmp_path, shapenet.in_file(truth, right, back, up, unit), up=vector, front=front, unit=str(unit))
+    entry = objects.read(listed, 0)
+    assert entry.notes == ()
+    same_points(surface(entry.body).vertices, truth.vertices - truth.center_mass)
+    np.testing.assert_allclose(volume(entry.body), truth.volume, rtol=1e-4)
+    assert objects.CATEGORIES[int(entry.body.category)] == "bottle"
+
+
+def test_a_front_that_is_oblique_to_up_is_projected(tmp_path):
+    truth = shapenet.wedge()
+    listed = only(tmp_path, truth, unit="1", front=r"0.0\,-1.0\,0.7")
+    same_points(surface(objects.read(listed, 0).body).vertices, truth.vertices - truth.center_mass)
+
+
+def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason(tmp_path):
+    rows = [
+        shapenet.row("g", "WineBottle,Bottle,_StanfordSceneDBModels"),
+        shapenet.row("b", "Camera,DSLRCamera"),
+        shapenet.row("c", "Camera,WebCam"),
+        shapenet.row("d", "ComputerMouse"),
+        shapenet.row("e", "Mouse"),
+        shapenet.row("f", "Chair"),
+        shapenet.row("h", "Fork,Spoon"),
+        shapenet.row("i", "Watch", unit=""),
+        shapenet.row("j", "Watch", unit="inch"),
+        shapenet.row("k", "Watch", up=r"0\,0\,1", front=r"0\,0\,-1"),
+        shapenet.row("l", "Watch", up=r"0\,0"),
+        shapenet.row("m", "Watch"),
+        shapenet.row("n", "Scissors", front=""),
+        shapenet.row("d", "ComputerMouse"),
+        shapenet.row("o", "Bottle,_BAD"),
+    ]
+    shapenet.build(tmp_path, rows, dict.fromkeys("abcdefghijklno", box((2, 2, 2))))
+    listed = objects.library(tmp_path)
+    assert [(item.label, item.name) for item in listed.items] == [
+        ("bottle", "g"),
+        ("camera", "b"),
+        ("mouse", "d"),
+        ("scissors", "n"),
+        ("webcam", "c"),
+    ]
+    assert listed.classes == ("bottle", "camera", "mouse", "scissors", "webcam")
+    assert listed.items[3].notes == ("no front in the table: ShapeNet's default",)
+    reasons = dict(listed.skipped)
+    for name, reason in (
+        ("h", "it has several classes (fork, spoon)"),
+        ("i", "unit is missing"),
+        ("j", "unit is 'inch'"),
+        ("k", "must not be parallel"),
+        ("l", "its up is"),
+        ("m", "models-OBJ/models/m.obj does not exist"),
+        ("d", "twice"),
+        ("o", "_BAD"),
+        ("metadata.csv", "2 of 15 models are of none"),
+    ):
+        assert reason in reasons.pop(name)
+    assert not reasons
+    assert objects.library(tmp_path) == listed  # and again the same, in the same order
+
+
+def test_commas_may_be_escaped_without_quotes(tmp_path):
+    shapenet.build(tmp_path, [], {"a": box((2, 2, 2))})
+    header, line = ",".join(shapenet.COLUMNS), r"wss.a,Bottle\,WineBottle,,,0\,0\,1,0\,-1\,0,0.0254,,,,,,,,a,*"
+    (tmp_path / "metadata.csv").write_text(f"{header}\n{line}\n")
+    (item,) = objects.library(tmp_path).items
+    assert (item.name, item.label, item.scale, item.up, item.front) == ("a", "bottle", INCH, (0, 0, 1), (0, -1, 0))
+
+
+def test_the_table_may_be_in_a_sub_folder(tmp_path):
+    shapenet.build(tmp_path / "ShapeNetSem.v0", [shapenet.row("a", "Spoon")], {"a": box((2, 2, 2))})
+    assert [item.label for item in objects.library(tmp_path).items] == ["spoon"]
+
+
+def test_images_are_found_in_the_folder_of_textures(tmp_path):
+    paint = (200, 40, 0)
+    shapenet.build(tmp_path, [shapenet.row("a", "Watch")], {"a": box((2, 1, 1))}, {"a": paint})
+    entry = objects.read(objects.library(tmp_path), 0)
+    assert entry.notes == ()
+    assert entry.body.texture.shape == (256, 256, 3)
+    np.testing.assert_allclose(entry.body.texture[128, 128], linear(np.array(paint) / 255), atol=1e-5)
+    np.testing.assert_allclose(entry.body.colors[0], 1)  # and not the Kd
+    (tmp_path / "models-textures" / "textures" / "a.png").unlink()
+    assert "a.png, not found" in objects.read(objects.library(tmp_path), 0).notes[0]
+
+
+def test_a_larger_object_is_scaled_down_with_a_note(tmp_path):
+    listed = only(tmp_path, box((3, 2, 20)))
+    entry = objects.read(listed, 0)
+    np.testing.assert_allclose(np.ptp(np.asarray(entry.body.vertices), axis=0), [0.018, 0.012, 0.12], rtol=1e-5)
+    assert entry.notes == ("its longest side is 0.508 m, scaled down to 0.12 m",)
+    (note,) = objects.read(dataclasses.replace(listed, largest=0.05), 0).notes
+    assert note.endswith("scaled down to 0.05 m")
+
+
+def test_a_size_that_differs_from_the_table_is_noted(tmp_path):
+    dims = r"5.08\,5.08\,10.16"  # cm
+    assert objects.read(only(tmp_path / "a", box((2, 2, 4)), **{"aligned.dims": dims}), 0).notes == ()
+    (note,) = objects.read(only(tmp_path / "b", box((2, 2, 3)), **{"aligned.dims": dims}), 0).notes
+    assert note == "the table's aligned.dims give a longest side of 102 mm"
+
+
+def test_cutlery_is_solid_and_of_steel(tmp_path):
+    fork = objects.read(only(tmp_path, box((1, 4, 0.2)), category="Fork"), 0).body
+    area = 2 * (4 + 0.2 + 0.8) * INCH**2
+    for fill in (0.0, 1.0):
+        np.testing.assert_allclose(objects.rigid(fork, fill, 1.0)[0], 5.9 * area, rtol=1e-5)
+
+
+def test_missing_columns_are_named(tmp_path):
+    shapenet.build(tmp_path, [], {})
+    shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name not in ("unit", "front")])
+    with pytest.raises(ValueError, match=r"metadata\.csv: lacks the columns front, unit "):
+        objects.library(tmp_path)
+    shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name != "fullId"])
+    (tmp_path / "models-OBJ").rename(tmp_path / "models")  # known by its columns alone
+    with pytest.raises(ValueError, match=r"metadata\.csv: lacks the columns fullId "):
+        objects.library(tmp_path)
+    (tmp_path / "models").rename(tmp_path / "models-OBJ")
+    shapenet.table(tmp_path, [], ["id", "class"])
+    with pytest.raises(ValueError, match="lacks the columns fullId, category, up, front, unit"):
+        objects.library(tmp_path)
+
+
+def test_a_table_without_a_usable_object_is_refused(tmp_path):
+    shapenet.build(tmp_path, [shapenet.row("a", "Watch", unit="")], {"a": box()})
+    with pytest.raises(ValueError, match=r"holds no mesh that can be used.*\n  a: its unit is missing"):
+        objects.library(tmp_path)
