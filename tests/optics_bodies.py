@@ -1,4 +1,4 @@
-"""Bodies for the tests of optics, tactile and frame, straight from trimesh's primitives."""
+"""Bodies from trimesh's primitives, and reference values from embree, for the tests of optics, tactile and frame."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ __all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
-    """A body with flat normals, of the smallest size class where it fits; `colors` are per face."""
+    """A body with flat normals, in the smallest size class that fits. `colors` has a colour for each face."""
     number = len(mesh.faces)
     padded = next(size for size in FACE_CLASSES if size >= number)
     normals = np.repeat(mesh.face_normals[:, None], 3, axis=1)
@@ -43,7 +43,7 @@ def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -
 
 
 def rays_hidden(mesh, places, num=3000):
-    """Share of rays, spread by the cosine, from places of the skin that meet a mesh."""
+    """Share of the cosine-distributed rays from each place of the skin that hit a mesh."""
     scene = EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, np.float32))
     index = np.arange(num)

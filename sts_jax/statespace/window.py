@@ -1,4 +1,4 @@
-"""The part of an image that differs from the empty sensor's: found in the image alone, turned upright and magnified."""
+"""The window of an image that differs from the image of the empty sensor, rotated to its axes and magnified."""
 
 from typing import NamedTuple
 
@@ -7,9 +7,9 @@ from jaxtyping import Array, Float
 
 from sts_jax.statespace import poses
 
-THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (a shadow differs by less)
-MARGIN = 1.1  # side of the window over the larger extent of the silhouette
-SMALLEST = 0.08  # side of the smallest window, of the image's
+THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (shadows differ by less)
+MARGIN = 1.1  # side of the window, divided by the larger extent of the silhouette
+SMALLEST = 0.08  # side of the smallest window, divided by the side of the image
 
 
 class Window(NamedTuple):
@@ -21,19 +21,19 @@ class Window(NamedTuple):
 
 
 def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """1 where an image shows something, else 0.
+    """1 for pixels that differ from the empty sensor, else 0.
 
     Args:
-        change: images less that of the empty sensor.
+        change: Images less that of the empty sensor.
     """
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """The window around everything that an image shows, or the whole image if it shows nothing.
+    """The window around all pixels that differ from the empty sensor, or the whole image if there are none.
 
     Args:
-        change: square images less that of the empty sensor.
+        change: Square images less that of the empty sensor.
     """
     size = change.shape[1]
     weight = shows(change)
@@ -64,12 +64,12 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """The windows at another resolution, each pixel the mean of four interpolated values, zero outside of the image.
+    """The windows at another resolution. A pixel is the mean of four interpolated values, 0 outside of the image.
 
     Args:
-        images: square ones.
-        window: of each.
-        side: pixels of the result.
+        images: Square images.
+        window: The window of each image.
+        side: Side of the result in pixels.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5
@@ -80,10 +80,10 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Bilinear interpolation at some columns and rows, whole numbers at pixel centres. Zero outside of the image."""
+    """Bilinear interpolation at columns and rows, where whole numbers are pixel centres. Zero outside of the image."""
     side, channels = images.shape[1], images.shape[-1]
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    # The four neighbours of a place lie side by side, and one lookup finds them.
+    # The four neighbours of a place are stored side by side, so that one lookup finds them.
     corners = [framed[:, down : down + side + 1, right : right + side + 1] for down in (0, 1) for right in (0, 1)]
     table = jnp.concatenate(corners, axis=-1).reshape(len(images), (side + 1) ** 2, 4 * channels)
     places = jnp.clip(places + 1, 0, side + 1)
