@@ -48,7 +48,7 @@ def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> 
 
 
 def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
-    """A compiled training step on random data."""
+    """A function that runs a compiled training step of an `mvae` model on random data."""
     rng = np.random.default_rng(0)
     data: dict[str, Any] = {
         m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
@@ -73,7 +73,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """A compiled prediction of all modalities from vision."""
+    """A function that runs a compiled prediction of all modalities from vision."""
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
     state = nnx.merge_state(params, stats)
     run = jax.jit(lambda state, x: mvae.predict(graphdef, state, {"visual": x}))
@@ -82,7 +82,7 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """A compiled training step of freefall's state-space model on random data."""
+    """A function that runs a compiled training step of freefall's state-space model on random data."""
     rng, model = np.random.default_rng(0), statespace.Config()
     config = training.TrainConfig(batch_size=size)
 
@@ -118,7 +118,7 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
-    """A compiled prediction from vision by a state-space model with random weights."""
+    """A function that runs a prediction from vision of a state-space model with random weights."""
     config = statespace.Config()
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     view = training.Preprocessing(resolution=(config.input_size, config.input_size))

@@ -1,4 +1,4 @@
-"""The first steps of a new user, one after the other, for a fresh process."""
+"""The first steps of a new user, to be timed in a fresh process."""
 
 import os
 import time

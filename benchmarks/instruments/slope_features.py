@@ -61,8 +61,8 @@ def balance(
         slope: rad, towards +y.
 
     Returns:
-        (m,) tips (0), slides (1) or sticks (2), and (m, 2) m, centres of pressure. A body that tips presses on the edge
-        over which it tips.
+        Motion (m,), which is 0 for tipping, 1 for sliding and 2 for sticking, and centre of pressure (m, 2) in m. A
+        body that tips presses on the edge over which it tips.
     """
     grip = np.minimum(friction, math.tan(slope))
     pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])

@@ -1,4 +1,4 @@
-"""The window of an image that differs from the image of the empty sensor, rotated to its axes and magnified."""
+"""Windows around the changed part of an image, aligned with its principal axes and magnified."""
 
 from typing import NamedTuple
 
