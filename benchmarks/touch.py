@@ -1,7 +1,7 @@
 """The mass of held-out objects, read from their uint8 tactile frames at rest.
 
-    python -m benchmarks.touch                        # about a minute, for the dataset of runs/freefall
-    python -m benchmarks.touch runs/perturbed/dataset
+    python -m benchmarks.touch          # about a minute, for the dataset of runs/freefall
+    python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
 Prints the accuracy of ridge regression of the log mass on simple image features (sums, sizes, depths), which is fitted
 on training objects, and the share of imprint pixels at 0 or 255. Both use the last frames of settled objects on the
@@ -22,7 +22,7 @@ from sts_jax import dataset, objects, physics
 class Args:
     """Options of the command line."""
 
-    dataset: tyro.conf.Positional[Path] = Path("runs/freefall/dataset")  # a collected dataset of procedural objects
+    dataset: tyro.conf.Positional[Path] = Path("runs/freefall/dataset")  # a dataset of procedural objects
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
