@@ -81,7 +81,7 @@ class Case(NamedTuple):
 
 
 class Durations(NamedTuple):
-    """Median seconds of one frame, or of its parts with `fields`."""
+    """Median seconds per frame, for whole frames and for parts of them."""
 
     frame: float
     gel: float  # the gel alone
