@@ -1,1 +1,1 @@
-"""What is measured: speed, endurance, invariance, what touch tells; each module's own docstring says how."""
+"""Measurements of speed, endurance, accuracy and information. Each module is a command that describes itself."""

@@ -2,14 +2,14 @@
 
     python -m benchmarks.depth    # about two minutes on two CPU cores
 
-Prints for each size how many of the objects' pixels agree with embree's depth within several limits. A pixel is
-interior if embree hits its whole 3x3 neighbourhood within 1 mm of depth. The objects are procedural ones, loaded ones
-(miniworld's meshes, Apache 2.0), a concave one and a thin one. In four poses the object touches the pad with a load, in
-three it is above the pad, and in three it is partly out of view. `tests/test_frame_depth.py` tests some of them.
+Prints, for each size and object, the share of the pixels whose depth agrees with embree's within several limits. A
+pixel is interior if embree hits its whole 3x3 neighbourhood within 1 mm of depth. The objects are procedural ones,
+loaded ones (miniworld's meshes, Apache 2.0), a concave one and a thin one. In four poses the object touches the pad
+with a load, in three it is above the pad, and in three it is partly out of view. `tests/test_frame_depth.py` tests some
+of them. Writes no files.
 """
 
 import dataclasses
-import importlib.util
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
@@ -20,10 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
+import tyro
 
 import sts_jax as sts
+from benchmarks.instruments.meshes import public_meshes
+from benchmarks.instruments.truth import body_mesh, embree, interior, neighbours
 from sts_jax import geometry, objects
 
 SIZES = ((64, 64), (97, 53), (200, 200), (480, 640))
@@ -46,14 +47,6 @@ class Difference(NamedTuple):
     silhouette_differs: int  # on the object in one of the images only
     strays: int  # the same, where embree hits all or none of the neighbourhood
     worst: float  # m, largest error in the interior
-
-
-def public_meshes() -> Path:
-    """miniworld's folder of meshes (Farama Foundation, Apache 2.0). Its code needs a display and is not run."""
-    found = importlib.util.find_spec("miniworld")
-    assert found is not None, "the test extra is not installed: pip install -e .[test]"
-    assert found.origin is not None
-    return Path(found.origin).parent / "meshes"
 
 
 def make(name: str) -> objects.Body:
@@ -80,7 +73,10 @@ def make(name: str) -> objects.Body:
 
 
 def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
-    """A pose of a kind and its wrench: 1 N under the object's lowest point if it touches, else none."""
+    """Draw a pose of one of the kinds POSES, and its wrench.
+
+    The wrench is 1 N under the object's lowest point if the object touches the pad, and zero otherwise.
+    """
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
     points = np.asarray(geometry.transform(jnp.asarray([0, 0, 0, *quat], jnp.float32), body.vertices))
@@ -99,45 +95,11 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
 
 
 def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Poses of each kind in the given numbers, with their wrenches."""
+    """Poses and their wrenches, as many of each kind in POSES as `numbers` has for it."""
     rng = np.random.default_rng(seed)
     for kind, number in zip(POSES, numbers, strict=True):
         for _ in range(number):
             yield places(body, rng, kind)
-
-
-def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
-    """The body's triangles in the sensor frame, in float64."""
-    faces = np.asarray(body.faces)
-    faces = faces[np.any(faces != faces[:, :1], axis=1)]
-    turn = trimesh.transformations.quaternion_matrix(np.asarray(pose[3:], float))[:3, :3]
-    vertices = np.asarray(body.vertices, float) @ turn.T + np.asarray(pose[:3], float)
-    return trimesh.Trimesh(vertices, faces, process=False)
-
-
-def embree(
-    mesh: trimesh.Trimesh, camera: sts.optics.Camera, shape: tuple[int, int], *, two_sided: bool = False
-) -> np.ndarray:
-    """Depth along the optical axis of the nearest triangle that faces the camera, `inf` where there is none."""
-    towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, camera.distance]) < 0
-    scene = EmbreeScene()
-    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles[towards | two_sided], np.float32))
-    height = 2 * camera.distance * np.tan(camera.fov / 2)
-    width = min(height * camera.aspect, height * shape[1] / shape[0])
-    height = width * shape[0] / shape[1]
-    x = (-width / 2 + (np.arange(shape[1]) + 0.5) / shape[1] * width) / camera.distance
-    y = (-height / 2 + (np.arange(shape[0]) + 0.5) / shape[0] * height) / camera.distance
-    slopes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], -1).astype(np.float32)
-    origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))
-    hit = scene.run(origins, directions, query="DISTANCE")
-    return np.where(hit < 1e3, hit, np.inf).astype(float).reshape(shape)
-
-
-def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
-    """Pixels whose 3x3 neighbourhood is hit throughout and spans less than `span` of depth (m)."""
-    around = _around(np.where(np.isfinite(depth), depth, 1e9), 1e9)
-    return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
 
 
 def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
@@ -147,7 +109,7 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
     other = hit & seen & ~inner
     error = np.abs(np.where(hit & seen, depth, 1e9) - np.where(hit & seen, truth, 1e9))
     error[hit != seen] = np.inf
-    around = _around(hit)
+    around = neighbours(hit)
     boundary = np.any(around, 0) & ~np.all(around, 0)
     return Difference(
         interior=int(inner.sum()),
@@ -197,15 +159,8 @@ def describe(d: Difference) -> str:
     )
 
 
-def _around(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
-    height, width = image.shape
-    fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}
-    padded = np.pad(image, 1, **fill)
-    return np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
-
-
 def main() -> None:
-    """Print one row per size and object, and one per size."""
+    """Print a row for each size and object, and the sum for each size."""
     print(f"{'':28} interior  % <10 um  >100um  worst um elsewhere  % <1 mm silhouette  differs  strays")
     for shape in SIZES:
         found = measure(PROCEDURAL + LOADED + MADE, shape)
@@ -214,4 +169,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -1,40 +1,42 @@
-"""Hidden properties: whether they decide the outcome, and whether touch or images reveal them.
+"""The influence of hidden properties on the outcome, and the information that touch and images give about them.
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
     python -m benchmarks.hidden outcomes truth  # some of the parts outcomes, truth, pictures, fill
     python -m benchmarks.hidden --keep FOLDER   # keep starts and outcomes there, and resume from them
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # starts from `benchmarks.soak`
 
-- `outcomes`: shares of the outcomes, and of the starts that end differently when only the fill (on the slope, the fill
-  and its direction) is drawn again.
+- `outcomes`: shares of the outcomes, and share of the starts that end differently when only the fill (on the slope, the
+  fill and its direction) is drawn again.
 - `truth`: log loss of a classifier of the outcome that has the exact shape, start and jerk (on the slope, the pose up
-  to `slope.SEEN`), and of one that also has a noisy measurement of touch. The gain is the share of the loss that
-  disappears.
+  to `slope_features.SEEN`), and of one that also has a noisy measurement of touch. The gain is the relative decrease of
+  the loss.
 - `pictures`: the same with the measurement that a small network reads from the first uint8 tactile frame. The network
   is trained on other objects.
 - `fill`: AUC of a small network that separates full from empty objects in frames in the air, in the same frames with
   the fuller objects painted, and in tactile frames. For the jerked pad only, where containers stand.
 
-Folds and 95 % intervals are by object. Everything is simulated once with the defaults of the scenario. The features of
-the classifiers are in `benchmarks.jerk` and `benchmarks.slope`.
+Folds and 95 % intervals are by object. Everything is simulated once with the defaults of the scenario, and printed. The
+features of the classifiers are in `benchmarks.instruments`.
 """
 
-import argparse
 import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+import tyro
 from jaxtyping import PRNGKeyArray
 
-from benchmarks import classify, jerk, reader, slope, soak
-from benchmarks.starts import Starts, bodies, draw, kept, roll
+from benchmarks import soak
+from benchmarks.instruments import classifier, cnn, jerk_features, slope_features
+from benchmarks.instruments.starts import Starts, bodies, draw, kept, roll
 from sts_jax import dataset, objects, physics
+from sts_jax.evaluation import metrics
 
-PARTS = ("outcomes", "truth", "pictures", "fill")
+Part = Literal["outcomes", "truth", "pictures", "fill"]
 TINT = 0.1  # share of white in the colours of painted objects (linear light)
 OTHERS = 1_000_000  # keys of the objects on which networks are trained begin here
 EXAMPLES = 8  # starts of each of these objects
@@ -44,25 +46,15 @@ EXAMPLES = 8  # starts of each of these objects
 class Study:
     """The study of one scenario."""
 
+    parts: tuple[Part, ...]
     scenario: physics.Scenario
     categories: tuple[str, ...]  # categories of the objects, in turn
-    reroll: tuple[str, ...]  # hidden values that are drawn again
+    reroll: tuple[str, ...]  # fields of `physics.Hidden` that are drawn again
     touch: Callable[[Starts], np.ndarray]  # (n, k) exact measurement of touch, nan without contact
-    noise: float  # standard deviation of the measurement, in each column
+    noise: float  # standard deviation of the measurement in each column
     noise_name: str
-    # features of shape (n, k), given the scenario, the bodies and their starts. `touch` may be None
+    # Features (n, k), given the scenario, the bodies, their starts and their touch, which may be None.
     features: Callable[[Any, list[objects.Body], Starts, np.ndarray | None], np.ndarray]
-
-
-@dataclasses.dataclass(frozen=True)
-class Counts:
-    """The numbers of objects, starts and training steps."""
-
-    objects: int = 200
-    num: int = 16  # starts of each object
-    again: int = 8  # starts of each object that are rolled again
-    others: int = 800  # objects on which networks are trained
-    steps: int = 1500  # training steps of the networks
 
 
 class Lesson(NamedTuple):
@@ -76,29 +68,58 @@ class Lesson(NamedTuple):
 
 STUDIES = {
     "perturbed": Study(
+        parts=("outcomes", "truth", "pictures", "fill"),
         scenario=physics.Perturbed(),
         categories=("bottle",),
         reroll=("fill",),
-        touch=jerk.weighed,
-        noise=jerk.NOISE,
+        touch=jerk_features.weighed,
+        noise=jerk_features.NOISE,
         noise_name="weight to 5 %",
-        features=jerk.shaken,
+        features=jerk_features.shaken,
     ),
     "inclined": Study(
+        parts=("outcomes", "truth", "pictures"),  # full and empty containers can be compared only where they stand
         scenario=physics.Inclined(),
         categories=objects.CATEGORIES,
         reroll=("fill", "up"),
-        touch=slope.pressed,
-        noise=slope.NOISE,
+        touch=slope_features.pressed,
+        noise=slope_features.NOISE,
         noise_name="pressure to 1 mm",
-        features=slope.laid,
+        features=slope_features.laid,
     ),
 }
 
 
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line.
+
+    Raises:
+        ValueError: The scenario lacks one of the parts, or an option would be ignored beside `soaked`.
+    """
+
+    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # default: all parts of the scenario
+    scenario: Literal["perturbed", "inclined"] = "perturbed"
+    objects: int | None = None  # simulated objects (default: 200)
+    num: int = 16  # simulated starts of each object
+    again: int | None = None  # starts of each object that are simulated again (default: 8)
+    others: int = 800  # objects on which the networks are trained
+    steps: int = 1500  # training steps of the networks
+    keep: Path | None = None  # folder that keeps starts and outcomes, from which the next call resumes
+    soaked: Path | None = None  # folder of kept blocks of `benchmarks.soak`, used instead of simulated starts
+
+    def __post_init__(self) -> None:
+        known = STUDIES[self.scenario].parts
+        if unknown := [part for part in self.parts if part not in known]:
+            raise ValueError(f"parts is {' '.join(unknown)}, but the parts of {self.scenario} are {', '.join(known)}")
+        unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
+        if self.soaked is not None and unused:
+            raise ValueError(f"--soaked provides the starts, so leave out {' and '.join(unused)}")
+
+
 def outcomes(study: Study, starts: Starts) -> None:
     """Print the shares of the outcomes, of unsettled starts, and of starts that end differently with another fill."""
-    share = functools.partial(classify.interval, np.mean, groups=starts.body)
+    share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
     print(f"{'unsettled':30s} {share(~starts.settled)}")
@@ -106,7 +127,7 @@ def outcomes(study: Study, starts: Starts) -> None:
     if not rolled.any():
         return
     changed = (starts.rerolled != starts.outcome)[rolled]
-    figure = classify.interval(np.mean, changed, groups=starts.body[rolled])
+    figure = classifier.interval(classifier.mean, changed, groups=starts.body[rolled])
     print(f"{'another fill, another outcome':30s} {figure} ({len(changed)} starts)", flush=True)
 
 
@@ -114,27 +135,27 @@ def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.nd
     """Log loss (n,) of each start's outcome, for a classifier without or with touch."""
     label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     features = study.features(study.scenario, items, starts, touch)
-    return classify.log_loss(classify.chances(features, label, starts.body), label)
+    return metrics.log_loss(classifier.probabilities(features, label, starts.body), label)
 
 
 def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
     """Print the log losses of classifiers on true states and, if given, with the touch `read` from images."""
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
-    interval = functools.partial(classify.interval, groups=starts.body)
+    interval = functools.partial(classifier.interval, groups=starts.body)
     share = np.array([np.mean(starts.outcome == outcome) for outcome in study.scenario.outcomes])
     before, after = losses(study, items, starts, None), losses(study, items, starts, rough)
     print(f"{'log loss: constant':30s} {-(share * np.log(share)).sum():.3f}")
-    print(f"{'log loss: vision':30s} {interval(np.mean, before)}")
-    print(f"{'log loss: ' + study.noise_name:30s} {interval(np.mean, after)}")
-    print(f"{'gain: ' + study.noise_name:30s} {interval(classify.gain, before, after)}", flush=True)
+    print(f"{'log loss: vision':30s} {interval(classifier.mean, before)}")
+    print(f"{'log loss: ' + study.noise_name:30s} {interval(classifier.mean, after)}")
+    print(f"{'gain: ' + study.noise_name:30s} {interval(classifier.gain, before, after)}", flush=True)
     if read is None:
         return
-    seen_too = losses(study, items, starts, read)
+    with_read = losses(study, items, starts, read)
     error = np.sqrt(np.nanmean((read - exact) ** 2, 0))
     print(f"{'read in the tactile frame':30s} rms error {' '.join(f'{e:.4g}' for e in error)}")
-    print(f"{'gain: pictures':30s} {interval(classify.gain, before, seen_too)}")
-    print(f"{'share of the gain kept':30s} {interval(classify.kept, before, after, seen_too)}", flush=True)
+    print(f"{'gain: pictures':30s} {interval(classifier.gain, before, with_read)}")
+    print(f"{'share of the gain kept':30s} {interval(classifier.kept, before, after, with_read)}", flush=True)
 
 
 def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
@@ -146,9 +167,9 @@ def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int)
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
     """Touch (n, k) as a network reads it from the tactile frames of the starts, nan without contact."""
-    told = study.touch(learned.starts)
-    known = np.isfinite(told).all(1)
-    read = reader.fit(jax.random.key(0), learned.examples[known], told[known], steps=steps)(learned.tactile)
+    touch = study.touch(learned.starts)
+    known = np.isfinite(touch).all(1)
+    read = cnn.fit(jax.random.key(0), learned.examples[known], touch[known], steps=steps)(learned.tactile)
     return np.where(np.isfinite(study.touch(starts)), read, np.nan)  # contact is taken as known
 
 
@@ -158,7 +179,7 @@ def painted(body: objects.Body) -> objects.Body:
 
 
 def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
-    """Objects in the air at the start of freefall: starts, visual frames, and these with the fuller ones painted."""
+    """Starts of freefall, visual frames of the objects in the air, and these frames with the fuller objects painted."""
     starts = roll(key, items, physics.Freefall(frames=11), num)  # the fewest in which a fall can end
     plain, _ = draw(items, starts)
     both, _ = draw([painted(body) for body in items], starts)
@@ -166,68 +187,54 @@ def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Start
 
 
 def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Print how well a network detects, in frames of held-out objects, which are fuller than half."""
-    read = reader.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
+    """Print the AUC of a network that detects, in frames of held-out objects, which of them are more than half full."""
+    read = cnn.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
     label, score = held_out.fill > 0.5, read(new)[:, 0]
-    figure = classify.interval(classify.auc, label, score, groups=held_out.body)
+    figure = classifier.interval(metrics.auc, label, score, groups=held_out.body)
     print(f"{'AUC of the fill: ' + name:30s} {figure} ({len(label)} held-out items)", flush=True)
 
 
-def fill(learned: Lesson, items: list[objects.Body], starts: Starts, counts: Counts) -> None:
-    """Print how well the fill is detected from touch, from frames in the air, and from these with paint."""
-    detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, counts.steps)
+def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, steps: int) -> None:
+    """Print the AUC of the fill from touch, from frames in the air, and from these frames with painted objects."""
+    detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, steps)
     flying, plain, tinted = aloft(jax.random.key(2), learned.items, EXAMPLES)
-    new, new_plain, new_tinted = aloft(jax.random.key(3), items, counts.num)
-    detect("seen in the air", plain, flying, new_plain, new, counts.steps)
-    detect(f"{TINT:.0%} tint", tinted, flying, new_tinted, new, counts.steps)
+    new, new_plain, new_tinted = aloft(jax.random.key(3), items, num)
+    detect("seen in the air", plain, flying, new_plain, new, steps)
+    detect(f"{TINT:.0%} tint", tinted, flying, new_tinted, new, steps)
 
 
-def main(parts: set[str], name: str, counts: Counts, keep: Path | None, soaked: Path | None) -> None:
+def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
+    """The objects and their starts: soaked, kept or simulated now."""
+    if args.soaked is not None:
+        starts = soak.soaked(args.soaked, args.scenario)
+        return bodies(study.categories, int(starts.body.max()) + 1), starts
+    count = 200 if args.objects is None else args.objects
+    again = 8 if args.again is None else args.again
+    if args.keep is not None:
+        made = {"scenario": repr(study.scenario), "objects": count, "num": args.num, "again": again}
+        dataset.claim(args.keep / f"{args.scenario}.json", made)
+    items = bodies(study.categories, count)
+    begin = functools.partial(roll, again=again, reroll=study.reroll)
+    return items, kept(args.keep, args.scenario, lambda: begin(jax.random.key(0), items, study.scenario, args.num))
+
+
+def main(args: Args) -> None:
     """Simulate the necessary starts and print the parts."""
-    study = STUDIES[name]
-    if soaked is not None:
-        starts = soak.soaked(soaked, name)
-        items = bodies(study.categories, int(starts.body.max()) + 1)
-    else:
-        if keep is not None:
-            made = {"scenario": repr(study.scenario), "objects": counts.objects, "num": counts.num}
-            dataset.claim(keep / f"{name}.json", made | {"again": counts.again})
-        items = bodies(study.categories, counts.objects)
-        begin = functools.partial(roll, again=counts.again, reroll=study.reroll)
-        starts = kept(keep, name, lambda: begin(jax.random.key(0), items, study.scenario, counts.num))
+    study = STUDIES[args.scenario]
+    parts = set(args.parts or study.parts)
+    items, starts = begun(study, args)
     number = len(np.unique(starts.body))
     print(study.scenario)
     print(f"{len(starts.body)} starts of {number} objects ({', '.join(study.categories)})", flush=True)
     if "outcomes" in parts:
         outcomes(study, starts)
-    learned = lesson(study, items, starts, counts.others) if parts & {"pictures", "fill"} else None
-    read = pictures(study, learned, starts, counts.steps) if learned and "pictures" in parts else None
+    learned = lesson(study, items, starts, args.others) if parts & {"pictures", "fill"} else None
+    read = pictures(study, learned, starts, args.steps) if learned and "pictures" in parts else None
     if parts & {"truth", "pictures"}:
         gains(study, items, starts, read)
     if learned and "fill" in parts:
-        fill(learned, items, starts, counts)
+        fill(learned, items, starts, args.num, args.steps)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    usual = Counts()
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)} (default: all)")
-    parser.add_argument("--scenario", choices=STUDIES, default="perturbed")
-    parser.add_argument("--objects", type=int, help=f"simulated objects ({usual.objects})")
-    parser.add_argument("--num", type=int, default=usual.num, help=f"starts of each object ({usual.num})")
-    parser.add_argument("--again", type=int, help=f"of these, starts that are rolled again ({usual.again})")
-    parser.add_argument("--others", type=int, default=usual.others, help=f"training objects ({usual.others})")
-    parser.add_argument("--steps", type=int, default=usual.steps, help=f"training steps of networks ({usual.steps})")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep starts and outcomes there, resume from them")
-    parser.add_argument("--soaked", type=Path, metavar="FOLDER", help="use kept blocks of benchmarks.soak instead")
-    args = parser.parse_args()
-    # Full and empty objects are separated only where containers stand.
-    parts = PARTS if args.scenario == "perturbed" else PARTS[:-1]
-    if not set(args.parts) <= set(parts):
-        parser.error(f"{' '.join(args.parts)}: the parts of {args.scenario} are {', '.join(parts)}")
-    unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(args, name) is not None]
-    if args.soaked is not None and unused:
-        parser.error(f"--soaked has the starts, so {' and '.join(unused)} would be ignored: leave them out")
-    given = {field.name: getattr(args, field.name) for field in dataclasses.fields(Counts)}
-    counts = Counts(**{name: count for name, count in given.items() if count is not None})
-    main(set(args.parts or parts), args.scenario, counts, args.keep, args.soaked)
+    main(tyro.cli(Args, description=__doc__))

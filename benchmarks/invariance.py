@@ -1,11 +1,12 @@
-"""Rest poses and outcomes do not depend on time step, engine or handedness: shares compared between sides.
+"""Shares of rest poses and outcomes at half the time step, in the mirror, and in C MuJoCo.
 
-    python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two quiet cores
+    python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes
     python -m benchmarks.invariance --only jerked-bottles
 
-A box and a bottle are released 20 mm above the pad in any orientation, and their runs are labelled by the face that is
-down at the end. Bottles on the jerked pad are labelled by outcome. A side is one way to compute the same runs:
+Prints, for each outcome, its shares on two sides and the interval of their difference, and writes no files. A box and a
+bottle are released 20 mm above the pad in any orientation, and their runs are labelled by the face that is down at the
+end. Bottles on the jerked pad are labelled by outcome. A side is one way to compute the same runs:
 
 - `simulate` in MJX ("ours"), with half the time step, and as mirror image (of start, jerk and object)
 - `simulate` in C MuJoCo, with half the time step, and as mirror image
@@ -20,19 +21,19 @@ All sides have the same starts and hidden values, so the interval of a differenc
 Min 2005: 95 %, half a count added to each cell).
 """
 
-import argparse
 import concurrent.futures
 import copy
 import dataclasses
 import math
 import os
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+import tyro
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
@@ -50,6 +51,14 @@ POINT = 1e-6  # m, radius of the contact sphere at each vertex
 CARRIAGE = 1e5  # kg, mass of the driven pad, a million times an object's
 MESH_GAP = 0.001  # m, depth from which the mesh pushes beside such vertices: only at rims, where no vertex is
 UP = math.cos(math.radians(20))  # cosine of the largest lean of an object that rests on a face
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line."""
+
+    num: int = 4000  # runs per side
+    only: Literal["box", "bottle", "jerked-bottles"] | None = None  # one case (default: all)
 
 
 class MirroredFreefall(physics.Freefall):
@@ -80,7 +89,7 @@ def mirror_shape(shape: Shape) -> Shape:
 
 
 class Case(NamedTuple):
-    """Runs of one kind, and the labels of their ends."""
+    """A scenario, its bodies, and the labels of the ends of its runs."""
 
     name: str
     scenario: physics.Freefall | physics.Perturbed
@@ -127,11 +136,11 @@ def cases() -> list[Case]:
     small, middle, large = (f"on {1e3 * a:.0f} x {1e3 * b:.0f} mm" for a, b in ((BOX[1], BOX[2]), BOX[::2], BOX[:2]))
     mirrored = MirroredFreefall(**dataclasses.asdict(DROP) | {"contact": DROP.contact})
     shaken = MirroredPerturbed(**dataclasses.asdict(SHAKE) | {"contact": SHAKE.contact})
-    names = ("box", "bottle", "jerked-bottles")
+    outcomes = tuple(outcome.name.lower() for outcome in physics.Outcome)
     return [
-        Case(names[0], DROP, mirrored, [box()], (small, middle, large, "on no face", "fell off"), box_face),
-        Case(names[1], DROP, mirrored, [squat], ("stands", "on its head", "lies", "fell off"), bottle_side),
-        Case(names[2], SHAKE, shaken, bottles, tuple(o.name.lower() for o in physics.Outcome), SHAKE.outcome),
+        Case("box", DROP, mirrored, [box()], (small, middle, large, "on no face", "fell off"), box_face),
+        Case("bottle", DROP, mirrored, [squat], ("stands", "on its head", "lies", "fell off"), bottle_side),
+        Case("jerked-bottles", SHAKE, shaken, bottles, outcomes, SHAKE.outcome),
     ]
 
 
@@ -144,7 +153,7 @@ def roll(
     seed: int = 0,
     engine: physics.Engine = "mjx",
 ) -> physics.Trajectory:
-    """Simulate `num` runs of a case, with its own bodies and scenario unless others are given, as NumPy arrays."""
+    """Simulate `num` runs of a case as NumPy arrays. `bodies` and `scenario` replace those of the case."""
     items = list(case.bodies if bodies is None else bodies)
     each = -(-num // len(items))
     with tqdm(total=each * len(items), desc=case.name, leave=False, disable=None) as bar:
@@ -168,9 +177,13 @@ def halved(scenario: physics.Freefall | physics.Perturbed) -> physics.Freefall |
 
 
 def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, driven: bool) -> mujoco.MjModel:
-    """The scene for C MuJoCo, with its own contacts of the mesh or with every vertex of the hull as a contact.
+    """The scene for C MuJoCo.
 
-    The pad is fixed or on two slides.
+    Args:
+        body: The object.
+        contact: Constants of the contact.
+        every_vertex: Add a contact sphere at every vertex of the hull. Otherwise C MuJoCo finds the mesh's contacts.
+        driven: Put the pad on two slides. Otherwise it is fixed.
     """
     gel, parts = Sensor().gel.size, np.asarray(body.hulls)
     xml = scene.scene_xml(parts, (float(gel[0]), float(gel[1])), contact)
@@ -191,10 +204,10 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
 
 
 def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = False, driven: bool = False) -> np.ndarray:
-    """The last poses (n, 7), in the pad's frame, of trajectories that C MuJoCo steps from their first frames.
+    """Step trajectories in C MuJoCo from their first frames. Returns the last poses (n, 7) in the pad's frame.
 
-    Gravity is the scenario's. If the pad is `driven`, gravity stays vertical, and the pad accelerates with the opposite
-    of the horizontal part.
+    Gravity is the scenario's. If the pad is `driven`, gravity stays vertical, and the pad accelerates by the horizontal
+    part of gravity in the opposite direction.
     """
     scenario = case.scenario
     times = np.arange(scenario.steps * (scenario.frames - 1)) * scenario.contact.timestep
@@ -248,7 +261,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """The labels of every run on each side. The first side is ours."""
+    """Simulate all sides. Returns the index of the label of every run on each side, with `simulate` in MJX first."""
     other_hand = [objects.mirror(body) for body in case.bodies]
     rolled: dict[str, physics.Trajectory] = {}
     sides_of: dict[str, physics.Engine] = {"ours": "mjx", "simulate in C": "mujoco"}
@@ -259,7 +272,7 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
     ours = rolled["ours"]
     first = ours.pose[:, 0]
     print(
-        f"{case.name}: {len(first)} runs a side; unsettled {100 * np.mean(~ours.settled):.1f} %, drawn again "
+        f"{case.name}: {len(first)} runs a side, unsettled {100 * np.mean(~ours.settled):.1f} %, drawn again "
         f"{', '.join(f'{int(traj.resampled.sum())} ({name})' for name, traj in rolled.items())}"
     )
     found = {
@@ -274,7 +287,7 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print the shares of every outcome and whether they agree within the margin. Return whether all do."""
+    """Print the shares of every outcome on our side and on each other. Returns whether all agree within the margin."""
     ours, within = found["ours"], True
     for side, theirs in list(found.items())[1:]:
         print(f"    {side}: {100 * np.mean(ours == theirs):.1f} % of the runs end alike")
@@ -291,15 +304,11 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
     return within
 
 
-def main(num: int, only: str | None) -> None:
+def main(args: Args) -> None:
     """Compare the sides of all cases, or of one."""
-    within = [compare(sides(case, num), case.labels) for case in cases() if only in (None, case.name)]
+    within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num", type=int, default=4000, help="runs per side")
-    parser.add_argument("--only", choices=[case.name for case in cases()], help="one case instead of all")
-    arguments = parser.parse_args()
-    main(arguments.num, arguments.only)
+    main(tyro.cli(Args, description=__doc__))

@@ -1,26 +1,27 @@
-"""Time of one training step at batch 64 and of one prediction at batch 1.
+"""Seconds of one training step and of one prediction of both models.
 
-    python -m benchmarks.learning
+    python -m benchmarks.learning               # about 3 minutes on two CPU cores
+    taskset -c 0 python -m benchmarks.learning  # on one core
 
-The step is that of freefall (three modalities, touch absent, every subset predicts all). Beside it is a plain
-implementation of the same step: XLA's convolutions and transposed convolutions, and all seven subsets enumerated. Then
-follow a step of the state-space model as freefall trains it, and its prediction with 16 samples. The figures are
-medians of alternating calls, after one unmeasured call each. Takes a few minutes on two CPU cores. `taskset -c 0`
-measures one core.
+The first step is that of the paper's model in freefall at batch 64 (three modalities, touch absent, every subset
+predicts all). It is compared with a plain implementation of the same step, which enumerates all seven subsets and uses
+XLA's convolutions and transposed convolutions. Then follow smaller batches, vision alone, a prediction at batch 1, a
+step of the state-space model as freefall trains it, and its prediction with 16 samples. The figures are medians of
+alternating calls, after one unmeasured call each. Prints a line for each and writes no files.
 """
 
-import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
 
 import jax
 import numpy as np
+import tyro
 from flax import nnx
 from jaxtyping import Array
 
 import sts_jax as sts
+from benchmarks.instruments.timing import in_turn
 from sts_jax import mvae, statespace, training
 from sts_jax.mvae import networks
 
@@ -36,18 +37,18 @@ LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 
 def plain_conv(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """Convolution as in `nnx.Conv`."""
+    """XLA's convolution, as `nnx.Conv` uses it."""
     return jax.lax.conv_general_dilated(x, kernel, (stride, stride), [(padding,) * 2] * 2, dimension_numbers=LAYOUT)
 
 
 def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """Transposed convolution as in `nnx.ConvTranspose`."""
+    """XLA's transposed convolution, as `nnx.ConvTranspose` uses it."""
     pads = [(len(kernel) - 1 - padding,) * 2] * 2
     return jax.lax.conv_transpose(x, kernel[::-1, ::-1], (stride, stride), pads, dimension_numbers=LAYOUT)
 
 
 def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
-    """A compiled training step on random data."""
+    """A function that runs a compiled training step of an `mvae` model on random data."""
     rng = np.random.default_rng(0)
     data: dict[str, Any] = {
         m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
@@ -72,7 +73,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """A compiled prediction of all modalities from vision."""
+    """A function that runs a compiled prediction of all modalities from vision."""
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
     state = nnx.merge_state(params, stats)
     run = jax.jit(lambda state, x: mvae.predict(graphdef, state, {"visual": x}))
@@ -81,7 +82,7 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """A compiled training step of freefall's state-space model on random data."""
+    """A function that runs a compiled training step of freefall's state-space model on random data."""
     rng, model = np.random.default_rng(0), statespace.Config()
     config = training.TrainConfig(batch_size=size)
 
@@ -117,7 +118,7 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
-    """A compiled prediction from vision by a state-space model with random weights."""
+    """A function that runs a prediction from vision of a state-space model with random weights."""
     config = statespace.Config()
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     view = training.Preprocessing(resolution=(config.input_size, config.input_size))
@@ -129,34 +130,24 @@ def state_predictor(num_samples: int) -> Callable[[], None]:
     return lambda: jax.block_until_ready(predict(visual=image, key=key, num_samples=num_samples)) and None
 
 
-def medians(calls: dict[str, Callable[[], None]], repeats: int) -> dict[str, float]:
-    """Median seconds per call. The calls alternate."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for call in calls.values():
-        call()
-    for _ in range(repeats):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}
+def median_seconds(call: Callable[[], None], repeats: int) -> float:
+    """Median seconds of a call."""
+    return float(np.median(in_turn(call, repeats=repeats)))
 
 
 def main() -> None:
     """Measure and print."""
     with mock.patch.multiple(networks, conv=plain_conv, conv_transpose=plain_conv_transpose):
         plain = stepper(MODEL, 64, ())
-    steps = medians({"step": stepper(MODEL, 64, ("tactile",)), "plain": plain}, 3)
-    ratio = steps["plain"] / steps["step"]
-    print(f"training step, batch 64: {steps['step']:.2f} s; plain {steps['plain']:.2f} s, ratio {ratio:.1f}")
+    ours, enumerated = np.median(in_turn(stepper(MODEL, 64, ("tactile",)), plain, repeats=3), axis=0)
+    print(f"training step, batch 64: {ours:.2f} s, plain {enumerated:.2f} s, ratio {enumerated / ours:.1f}")
     for size in (16, 32):
-        print(f"training step, batch {size}: {medians({'': stepper(MODEL, size, ('tactile',))}, 5)['']:.3f} s")
-    visual = medians({"": stepper(VISUAL, 64, ())}, 5)[""]
-    print(f"training step, visual only, batch 64: {visual:.3f} s")
-    print(f"prediction, batch 1: {1e3 * medians({'': predictor(1)}, 50)['']:.1f} ms")
-    print(f"state-space model, training step, batch 32: {medians({'': state_stepper(32)}, 11)['']:.3f} s")
-    print(f"state-space model, prediction with 16 samples: {1e3 * medians({'': state_predictor(16)}, 50)['']:.1f} ms")
+        print(f"training step, batch {size}: {median_seconds(stepper(MODEL, size, ('tactile',)), 5):.3f} s")
+    print(f"training step, visual only, batch 64: {median_seconds(stepper(VISUAL, 64, ()), 5):.3f} s")
+    print(f"prediction, batch 1: {1e3 * median_seconds(predictor(1), 50):.1f} ms")
+    print(f"state-space model, training step, batch 32: {median_seconds(state_stepper(32), 11):.3f} s")
+    print(f"state-space model, prediction with 16 samples: {1e3 * median_seconds(state_predictor(16), 50):.1f} ms")
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

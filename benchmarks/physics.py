@@ -1,43 +1,46 @@
 """Speed of the physics: steps per second compared with C MuJoCo, falls and frames per second, and compilation.
 
-    python -m benchmarks.physics                   # about 2 minutes
-    python -m benchmarks.physics --engines 4       # about 2 minutes on two cores
-    python -m benchmarks.physics --pipeline 64     # about a minute on two cores. Give 16384 on a GPU
-    python -m benchmarks.physics --scaling         # about 10 minutes on two cores. Writes benchmarks/results/physics/
-    python -m benchmarks.physics --compile         # about 8 minutes on two cores
+    python -m benchmarks.physics                   # about 2 minutes on two CPU cores
+    python -m benchmarks.physics --engines 4       # about 2 minutes
+    python -m benchmarks.physics --pipeline 64     # about a minute (use 16384 worlds on a GPU)
+    python -m benchmarks.physics --scaling         # about 10 minutes. Writes benchmarks/results/physics/
+    python -m benchmarks.physics --compile         # about 8 minutes
 
-The first command drops one hull of 32 vertices, then hulls of up to 64 vertices from the eight classes, from the same
-starts in MJX and in C MuJoCo's batch (`mujoco.rollout`) on all cores, measured in turn. `--engines` measures falls per
-second of both engines of `simulate`, for this many default falls of each of 16 objects. `--pipeline` drops a bottle
-this many times and renders every frame, vision and touch, 64x64, uint8, fetched from the device. It measures seconds
-and frames per second of physics, rendering and both, where a frame is one world at one time. Both options include all
-costs except compilation. `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU). `--compile` prints the seconds
-before the first step of each scenario, and the number of compilations for a hundred objects. It uses fresh processes:
-the first has an empty cache of compiled programs, and the second finds the programs of the first there.
+All commands print their results. Only `--scaling` writes files.
+
+- The first command drops one hull of 32 vertices, then hulls of up to 64 vertices from the eight classes. It alternates
+  between MJX and C MuJoCo's batch (`mujoco.rollout`) on all cores, with the same starts.
+- `--engines` measures falls per second of both engines of `simulate`, for this many falls of each of 16 objects.
+- `--pipeline` drops a bottle this many times, renders every frame in both streams as 64x64 uint8 images, and fetches
+  them from the device. It measures seconds and frames per second of physics, rendering and both, where a frame is one
+  world at one time. Like `--engines`, it includes all costs except compilation.
+- `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU).
+- `--compile` measures the seconds before the first step of each scenario, and counts the compilations for a hundred
+  objects. It uses two fresh processes, the first one with an empty cache of compiled programs, and the second one with
+  the cache that the first one left.
 """
 
-import argparse
 import concurrent.futures
 import copy
 import dataclasses
 import functools
-import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
+import tyro
 
-from benchmarks.starts import bodies, rigid_of
+from benchmarks.instruments import fresh
+from benchmarks.instruments.starts import bodies, rigid_of
+from benchmarks.instruments.timing import in_turn
 from sts_jax import dataset, objects, physics
 from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
@@ -59,7 +62,33 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "inclined": physics.Inclined(),
 }
 GPU_BATCH = 4096  # frames rendered at once on a GPU
-TACCEL = 915  # environment steps/s of 4,096 environments on an H100, as published. Our mark is ten times as many
+TACCEL = 915  # environment steps/s of 4,096 environments on an H100, as published. Our goal is ten times as many
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line. At most one measurement is chosen."""
+
+    num: int = 8  # drops of each of the eight objects in the comparison with C MuJoCo
+    engines: int | None = None  # measure both engines of `simulate`, with this many falls of each object
+    pipeline: int | None = None  # measure physics and rendering of this many drops
+    scaling: bool = False  # measure steps per second against the number of worlds
+    compile: bool = False  # measure the time of compilation, and count compiled programs
+    count: int = 100  # objects whose compilations are counted
+
+    def __post_init__(self) -> None:
+        chosen = [name for name in ("engines", "pipeline", "scaling", "compile") if getattr(self, name)]
+        if len(chosen) > 1:
+            raise ValueError(f"choose one measurement, got {' and '.join(f'--{name}' for name in chosen)}")
+
+
+class Speeds(NamedTuple):
+    """Steps per second of a number of worlds."""
+
+    worlds: int
+    at_once: float  # MJX, one call for all worlds
+    in_chunks: float  # MJX, a call for each chunk of worlds, in threads
+    in_c: float  # C MuJoCo's batch
 
 
 def rod() -> objects.Body:
@@ -94,19 +123,6 @@ def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics
         models.append(model)
         states.append(state)
     return models, np.array(states)
-
-
-def in_turn(*runs: Callable[[], object], repeats: int = 5) -> np.ndarray:
-    """Seconds of calls made in turn, (repeats, calls). The first call of each is not counted."""
-    for run in runs:
-        run()
-    seconds = np.empty((repeats, len(runs)))
-    for row in seconds:
-        for i, run in enumerate(runs):
-            begin = time.perf_counter()
-            run()
-            row[i] = time.perf_counter() - begin
-    return seconds
 
 
 def speed(num: int) -> None:
@@ -162,7 +178,7 @@ def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
 def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
     """The arguments that `simulate` passes to MJX for drops of the rod from 2 mm."""
     scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
-    pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # drawn once, then repeated
+    pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # more worlds repeat these starts
     index = np.zeros(some, np.int32)
     shapes = physics_bodies.shapes([body], scenario)
     nth = np.arange(some, dtype=np.int32)
@@ -176,11 +192,11 @@ def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
 
 
 def scaling(frames: int = 8, chunk: int = 32) -> None:
-    """Measure steps per second against the number of worlds. Writes a table and a plot."""
+    """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS."""
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
     scenario = physics.Freefall(height=0.002, frames=frames)
-    rows: list[list[float]] = []
+    rows: list[Speeds] = []
     steps = frames * scenario.steps
     for count in counts:
         full, model, data = worlds(count, frames)
@@ -202,26 +218,30 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
             mujoco.rollout.rollout(models, own, states, nstep=steps, persistent_pool=True)
 
         seconds = np.median(in_turn(at_once, in_chunks, rollout, repeats=3), axis=0)
-        row = [float(count), *(count * steps / seconds).tolist()]
+        row = Speeds(count, *(count * steps / seconds).tolist())
         rows.append(row)
-        print(f"{count:6d} worlds: {row[1]:12,.0f} at once {row[2]:12,.0f} in chunks {row[3]:12,.0f} C", flush=True)
-    write_scaling(np.array(rows), jax.devices()[0].device_kind, chunk)
+        print(
+            f"{count:6d} worlds: {row.at_once:12,.0f} at once {row.in_chunks:12,.0f} in chunks {row.in_c:12,.0f} C",
+            flush=True,
+        )
+    write_scaling(rows, jax.devices()[0].device_kind, chunk)
 
 
-def write_scaling(rows: np.ndarray, device: str, chunk: int) -> None:
-    """Write `scaling.md` and `scaling.png` from rows (worlds, steps/s at once, in chunks, in C MuJoCo)."""
+def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
+    """Write `scaling.md` and `scaling.png` to RESULTS."""
     from matplotlib.figure import Figure
 
     names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
     RESULTS.mkdir(parents=True, exist_ok=True)
     lines = [f"| worlds | {' | '.join(names)} |", "|---|---|---|---|"]
-    lines += [f"| {row[0]:,.0f} | {row[1]:,.0f} | {row[2]:,.0f} | {row[3]:,.0f} |" for row in rows]
+    lines += [f"| {' | '.join(f'{number:,.0f}' for number in row)} |" for row in rows]
     title = f"Steps per second, one hull of 32 vertices ({device}, {os.cpu_count()} cores)"
     (RESULTS / "scaling.md").write_text("\n".join([title, "", *lines, ""]))
     figure = Figure(figsize=(5, 3.6), layout="constrained")
     axes = figure.subplots()
-    for name, column in zip(names, rows[:, 1:].T, strict=True):
-        axes.loglog(rows[:, 0], column, "o-", label=name)
+    worlds, *speeds = zip(*rows, strict=True)
+    for name, column in zip(names, speeds, strict=True):
+        axes.loglog(worlds, column, "o-", label=name)
     axes.set(xlabel="worlds", ylabel="steps per second", title=title)
     axes.title.set_fontsize(9)
     axes.grid(alpha=0.3, which="both")
@@ -245,27 +265,31 @@ def draw(body: objects.Body, traj: physics.Trajectory) -> None:
 
 
 def pipeline(count: int) -> None:
-    """Print frames per second for `count` drops of a bottle: of the physics, of both streams, and together."""
+    """Print frames per second of the physics, of both streams, and of both together, for drops of a bottle."""
     chunk = 32 if jax.default_backend() == "cpu" else count
     body, scenario = objects.make(jax.random.key(0), "bottle"), physics.Freefall()
-    for _ in range(2):  # the first compiles
-        times = [time.perf_counter()]
-        traj = physics.simulate(jax.random.key(1), body, Sensor(), scenario, count, chunk=chunk)
-        jax.block_until_ready(traj)
-        times.append(time.perf_counter())
+    for _ in range(2):  # the first round compiles
+        begin = time.perf_counter()
+        traj = jax.block_until_ready(physics.simulate(jax.random.key(1), body, Sensor(), scenario, count, chunk=chunk))
+        simulated = time.perf_counter()
         draw(body, traj)
-        times.append(time.perf_counter())
+        drawn = time.perf_counter()
     frames = count * scenario.frames
     print(f"{count:,} worlds of {scenario.frames} frames, both streams 64x64: {jax.devices()[0].device_kind}")
-    for name, seconds in (("physics", times[1] - times[0]), ("streams", times[2] - times[1])):
+    for name, seconds in (("physics", simulated - begin), ("streams", drawn - simulated), ("together", drawn - begin)):
         print(f"    {name:9s} {seconds:8.2f} s {frames / seconds:10,.0f} frames/s")
-    rate = frames / (times[2] - times[0])
-    print(f"    together  {times[2] - times[0]:8.2f} s {rate:10,.0f} frames/s, {rate / (10 * TACCEL):.3f} of the mark")
-    print(f"    Taccel, 4,096 environments on an H100: {TACCEL} steps/s as published; the mark: {10 * TACCEL:,}")
+    share = frames / (drawn - begin) / (10 * TACCEL)
+    print(f"    {share:.3f} of the goal of {10 * TACCEL:,} frames/s, ten times the {TACCEL} steps/s that Taccel")
+    print("    published for 4,096 environments on an H100")
 
 
-def first_call(name: str, count: int) -> None:
-    """Print the seconds before the first step in a fresh process and the compilations of `count` objects, as JSON."""
+def first_call(name: str, count: int) -> dict[str, Any]:
+    """The first call of a scenario, for a fresh process.
+
+    Returns:
+        `seconds`: time before the first step. `objects`: objects that the scenario takes, of `count`. `programs`:
+        compilations of each function of `simulate` for these objects.
+    """
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]
     begin = time.perf_counter()
@@ -283,42 +307,33 @@ def first_call(name: str, count: int) -> None:
         "gravity": gravity_at,
     }
     programs = {name: function._cache_size() for name, function in compiled.items()}
-    print(json.dumps({"seconds": first - again, "objects": len(items), "programs": programs}))
+    return {"seconds": first - again, "objects": len(items), "programs": programs}
 
 
 def compilation(count: int = 100) -> None:
     """Print the seconds of compilation of each scenario, without and with the programs of an earlier process."""
     for name in SCENARIOS:
         with tempfile.TemporaryDirectory() as folder:
-            environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": folder, "TF_CPP_MIN_LOG_LEVEL": "3"}
-            for kind in ("nothing kept", "kept      "):
-                command = [sys.executable, "-m", "benchmarks.physics", "--first-call", name, "--count", str(count)]
-                told = json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE).stdout)
-                print(
-                    f"{name:9s} {kind}  {told['seconds']:5.1f} s before the first step; {told['objects']} objects: "
-                    + ", ".join(f"{f} {n}" for f, n in told["programs"].items())
-                )
+            for kind in ("empty cache", "kept cache"):
+                found = fresh.call("benchmarks.physics.first_call", name, count, cache=Path(folder))
+                programs = ", ".join(f"{function} {number}" for function, number in found["programs"].items())
+                print(f"{name:9s} {kind:11s} {found['seconds']:5.1f} s before the first step")
+                print(f"{'':9s} programs for {found['objects']} objects: {programs}", flush=True)
+
+
+def main(args: Args) -> None:
+    """Run the chosen measurement."""
+    if args.compile:
+        compilation(args.count)
+    elif args.scaling:
+        scaling()
+    elif args.engines is not None:
+        engines(args.engines)
+    elif args.pipeline is not None:
+        pipeline(args.pipeline)
+    else:
+        speed(args.num)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num", type=int, default=8, help="drops of each of eight objects in the speed test")
-    parser.add_argument("--engines", type=int, metavar="FALLS", help="falls per second of both engines")
-    parser.add_argument("--pipeline", type=int, metavar="WORLDS", help="frames per second of this many rendered drops")
-    parser.add_argument("--scaling", action="store_true", help="steps per second against the number of worlds")
-    parser.add_argument("--compile", action="store_true", help="seconds and number of compilations")
-    parser.add_argument("--count", type=int, default=100, help="objects whose compilations are counted")
-    parser.add_argument("--first-call", choices=SCENARIOS, help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.first_call:
-        first_call(arguments.first_call, arguments.count)
-    elif arguments.compile:
-        compilation(arguments.count)
-    elif arguments.scaling:
-        scaling()
-    elif arguments.engines is not None:
-        engines(arguments.engines)
-    elif arguments.pipeline is not None:
-        pipeline(arguments.pipeline)
-    else:
-        speed(arguments.num)
+    main(tyro.cli(Args, description=__doc__))

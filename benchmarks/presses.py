@@ -1,6 +1,6 @@
-"""Our shader, compared with real presses of a ball on a GelSight.
+"""Error of our shader for real presses of a ball on a GelSight.
 
-    python -m benchmarks.presses    # half a minute of processor time
+    python -m benchmarks.presses    # about a minute. Writes benchmarks/results/presses/
 
 The wheel of `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm pressed into
 a GelSight, the image without contact (the background), and the centre and radius of each contact. Within the contact
@@ -9,14 +9,15 @@ image is modelled by
 
     background (1 + phong(pressed) - phong(flat))
 
-so that the flat sensor gives the background, and the change is proportional to the background's brightness. All values
-are the camera's, divided by 255. Non-negative least squares selects lights from rings of candidates around the image.
-Gradient descent then fits their positions and colours, the fall-off, the specular share and the shininess. The fitted
-lights explain the images and do not coincide with the LEDs of the sensor: a few end up below the image.
+so that the flat sensor gives the background, and the change is proportional to the background's brightness. Values are
+those of the camera, divided by 255. Non-negative least squares selects lights from candidates in rings around the
+image. Gradient descent then fits their positions and colours, the fall-off, the specular share and the shininess. The
+fitted lights explain the images and do not coincide with the LEDs of the sensor: a few end up below the image.
 
 Prints the peak signal-to-noise ratio for the background alone, far lights and near lights, over all pixels of all
-held-out presses within 0.92 of the contacts' radii. `presses.png` has a column for each held-out press: real, ours, and
-four times their difference on grey. Beside the contact the shape of the skin is unknown, and ours is the background.
+held-out presses within 0.92 of the contacts' radii. `presses.png` has a column for each held-out press: the real image,
+ours, and four times their difference on grey. Outside of the contact the shape of the skin is unknown, and our image is
+the background.
 Candidates, steps and learning rate were chosen on the 36 presses alone.
 """
 
@@ -25,11 +26,13 @@ import functools
 import importlib.util
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import tyro
 from jaxtyping import Array, Float
 from PIL import Image
 from scipy.optimize import nnls
@@ -38,7 +41,7 @@ from sts_jax import tactile
 
 PITCH = 0.0295e-3  # m a pixel (taxim/calib/gelsight/params.json)
 RADIUS = 2e-3  # m, of the ball
-TRUSTED = 0.92  # share of a contact's radius within which its normals count as known
+TRUSTED = 0.92  # share of a contact's radius within which its normals are taken as known
 EVERY = 4  # one press in this many is held out: the fourth, the eighth, ...
 STEPS = 1000
 RATE = 0.1
@@ -66,17 +69,24 @@ class Pixels:
     background: Float[Array, "p 3"]
 
 
+class Descent(NamedTuple):
+    """State of the optimisation."""
+
+    unknowns: dict[str, Array]
+    optimiser: optax.OptState
+
+
 def read() -> Presses:
     """Read the recordings from the installed package without importing it.
 
     Raises:
-        FileNotFoundError: the package is not installed.
+        FileNotFoundError: The package is not installed.
     """
     spec = importlib.util.find_spec("taxim")
     path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
     if path is None or not path.is_file():
         raise FileNotFoundError(
-            "the package taxim 1.4.1 has the presses. Install it: pip install -e '.[bench]' -c constraints.txt"
+            "the presses come with the package taxim 1.4.1. Install it: pip install -e '.[bench]' -c constraints.txt"
         )
     with np.load(path) as pack:
         background, images = (pack[name][..., ::-1] / np.float32(255) for name in ("f0", "imgs"))  # blue is first
@@ -144,9 +154,10 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
 
 
 def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
-    """Change that the press makes to each light, if white: the shader's image less that of the flat skin.
+    """The shader's image of the pressed skin less that of the flat skin, for each light alone, in white.
 
-    One program for all lights, because the shader's own loop over so many takes minutes to compile with its gradient.
+    The lights are a batch of one program, because the gradient of the shader's own loop over them takes minutes to
+    compile.
     """
     flat = jnp.broadcast_to(jnp.array([[0.0, 0, -1]]), given.normals.shape)
     normals = jnp.stack([given.normals, flat])
@@ -205,12 +216,11 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
     def loss(unknowns: dict[str, Array]) -> Array:
         return jnp.mean((draw(*shader(unknowns, near=near), given) - given.color) ** 2)
 
-    def step(_: Array, carry: tuple) -> tuple:
-        unknowns, state = carry
-        updates, state = optimiser.update(jax.grad(loss)(unknowns), state)
-        return optax.apply_updates(unknowns, updates), state
+    def step(_: Array, state: Descent) -> Descent:
+        updates, moments = optimiser.update(jax.grad(loss)(state.unknowns), state.optimiser)
+        return Descent(optax.apply_updates(state.unknowns, updates), moments)
 
-    return jax.lax.fori_loop(0, steps, step, (unknowns, optimiser.init(unknowns)))[0]
+    return jax.lax.fori_loop(0, steps, step, Descent(unknowns, optimiser.init(unknowns))).unknowns
 
 
 def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
@@ -219,7 +229,18 @@ def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong
 
 
 def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
-    """Real, ours and their difference around a contact, one below the other. Beyond it, ours is the background."""
+    """The real image, ours and their difference around a contact, one below the other.
+
+    Args:
+        presses: The recordings.
+        index: Number of the press.
+        constants: Constants of the shader.
+        leds: Fitted lights.
+        half: Half the side of the part around the contact (pixels).
+
+    Returns:
+        `(6 * half, 2 * half, 3)`. Outside of the contact, our image is the background.
+    """
     given = pixels(presses, np.array([index]), within=1.0)
     column, row = (int(v) for v in presses.centres[index])
     shape = presses.background.shape[:2]
@@ -235,7 +256,7 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
 
 
 def main() -> None:
-    """Fit, print and draw."""
+    """Fit the lights, print the errors and draw the held-out presses."""
     OUT.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
 
@@ -245,15 +266,15 @@ def main() -> None:
 
     presses = read()
     held = held_out(len(presses.images))
-    fitting, asked = pixels(presses, np.flatnonzero(~held), every=8), pixels(presses, np.flatnonzero(held))
-    say(f"fitted: {np.sum(~held)} presses, {len(fitting.color)} pixels; held out: {np.sum(held)}, {len(asked.color)}")
-    say(f"background alone: held out {psnr(asked.background, asked.color):.1f} dB")
+    train, test = pixels(presses, np.flatnonzero(~held), every=8), pixels(presses, np.flatnonzero(held))
+    say(f"fitted: {np.sum(~held)} presses, {len(train.color)} pixels; held out: {np.sum(held)}, {len(test.color)}")
+    say(f"background alone: held out {psnr(test.background, test.color):.1f} dB")
     for name, near in (("far lights", False), ("near lights", True)):
         began = time.perf_counter()
-        constants, lights = fit(fitting, near=near)
-        own, other = (psnr(draw(constants, lights, v), v.color) for v in (fitting, asked))
+        constants, lights = fit(train, near=near)
+        fitted, unseen = (psnr(draw(constants, lights, part), part.color) for part in (train, test))
         seconds = time.perf_counter() - began
-        say(f"{len(lights.colors)} {name}: fitted {own:.1f} dB, held out {other:.1f} dB ({seconds:.0f} s)")
+        say(f"{len(lights.colors)} {name}: fitted {fitted:.1f} dB, held out {unseen:.1f} dB ({seconds:.0f} s)")
     assert isinstance(lights, tactile.Leds)
     x, y, z = 1e3 * np.abs(np.asarray(lights.positions)).T
     across, down = 1e3 * PITCH * np.array(presses.background.shape[1::-1]) / 2
@@ -265,4 +286,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

@@ -1,11 +1,11 @@
-"""Can a stranger tell which predicted picture belongs to which true end?
+"""A picture that tests whether people can match predicted ends with the true ones.
 
-    python -m benchmarks.recognise runs/freefall --out recognise.png
+    python -m benchmarks.recognise runs/freefall --out recognise.png           # about a minute
     python -m benchmarks.recognise runs/freefall --given visual pose --first 20
 
 Predicts ten consecutive held-out trajectories and draws one sample of the last visual image of each (A to J), above the
-ten true images in another order (1 to 10). Print or show the picture, ask somebody to match them, then compare with the
-answers that are printed here. Guessing gets one right on average.
+ten true images in another order (1 to 10). The picture is written to `--out`, and the answers are printed. A person who
+guesses matches one pair on average.
 """
 
 import dataclasses
@@ -26,11 +26,11 @@ NUMBER = 10
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """The run, the inputs and the trajectories whose predictions are drawn."""
+    """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment with its models trained
-    out: Path = Path("recognise.png")
-    given: tuple[str, ...] = ()  # modalities (default: all of the model's)
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment with trained models
+    out: Path = Path("recognise.png")  # the picture
+    given: tuple[str, ...] = ()  # input modalities (default: all inputs of the model)
     first: int = 0  # place of the first trajectory in the held-out list
     seed: int = 0  # of the samples and of the order
 

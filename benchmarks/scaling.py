@@ -1,18 +1,18 @@
-"""How the state-space model's skill grows with the number of training trajectories and with training time.
+"""Skill of the state-space model against the number of training trajectories and against training time.
 
-    python -m benchmarks.scaling runs/freefall --out scaling.png               # of --preset default, half an hour
-    python -m benchmarks.scaling runs/freefall --shares 1 --steps 3300 --seeds 1 2   # how far two more seeds differ
+    python -m benchmarks.scaling runs/freefall --out scaling.png  # a run of --preset default, about 20 minutes
+    python -m benchmarks.scaling runs/freefall --shares 1 --steps 3300 --seeds 1 2   # the spread between two more seeds
 
-Takes the dataset of a run, and trains a model for each pair of a number of training objects and a number of gradient
-steps, in `RUN/scaling/`. A model that is there is not trained again. Prints the errors on the held-out objects, and
-draws the visual skill with 95 % intervals.
+Takes the dataset of a run, and trains models in `RUN/scaling/`: with several numbers of training objects for the most
+gradient steps, and with all objects for fewer steps. Models that exist there are kept. Prints the errors on the
+held-out objects, and draws the visual skill with 95 % intervals to `--out`.
 """
 
 import dataclasses
 import itertools
 import time
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import tyro
@@ -31,15 +31,23 @@ SUBSETS = (("visual", "pose"), ("visual",))
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Which models are trained."""
+    """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment with its dataset collected
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
     scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
     preset: Literal["smoke", "default", "long"] = "default"
-    shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)  # of the training objects, each with the most steps
+    shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)  # shares of the training objects, each trained for the most steps
     steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps, each with all training objects
     seeds: tuple[int, ...] = (0,)  # of the networks and of the order of the batches
-    out: Path = Path("scaling.png")
+    out: Path = Path("scaling.png")  # the plot
+
+
+class Point(NamedTuple):
+    """A trained model and the inputs it is tested with."""
+
+    inputs: str
+    trajectories: int
+    minutes: float  # of training
 
 
 def some(part: Part, objects: np.ndarray) -> Part:
@@ -50,7 +58,16 @@ def some(part: Part, objects: np.ndarray) -> Part:
 def train(
     config: Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
 ) -> tuple[int, float]:
-    """Train a model on a share of the objects for so many steps. Returns the number of trajectories and minutes."""
+    """Train a model unless it exists. Returns its number of trajectories and its minutes of training.
+
+    Args:
+        config: Configuration of the run.
+        data: Dataset of the run.
+        folder: Folder of the model.
+        share: Share of the training objects.
+        steps: Number of gradient steps.
+        seed: Seed of the network and of the order of the batches.
+    """
     pairs, views = data.pairs(data.members("train")), data.views("train")
     falls = data.ends(data.members("train", rendered=False))
     objects = np.unique(falls.object)
@@ -67,7 +84,7 @@ def train(
 
 
 def main(args: Args) -> str:
-    """Train and judge every model, and return a table with a row for each model and subset of inputs."""
+    """Train and score every model, and return a table with a row for each model and subset of inputs."""
     sts.enable_compilation_cache()
     config = EXPERIMENTS[args.scenario].PRESETS[args.preset]
     with _files.lock(args.workdir):
@@ -89,7 +106,7 @@ def main(args: Args) -> str:
                 say(title)
                 found = evaluation.predict(predictor, subset, given, scenario, num_samples=config.num_samples)
                 scores[title] = judge(found, test)
-                points[title] = (" and ".join(subset), trajectories, round(minutes, 1))
+                points[title] = Point(" and ".join(subset), trajectories, round(minutes, 1))
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     skills = {title: summary["predictors"][title]["visual_skill"] for title in points}
     trained = [
@@ -98,7 +115,7 @@ def main(args: Args) -> str:
         if title.endswith(f"seed {args.seeds[0]}")
     ]
     scaling(args.out, trained, title=f"{args.workdir.name}: visual skill of the state-space model")
-    notes = [f"{title}: {point[2]} minutes of training" for title, point in points.items()]
+    notes = [f"{title}: {point.minutes} minutes of training" for title, point in points.items()]
     return evaluation.table(summary, title=f"{args.workdir.name}: scaling", rows=list(points), notes=notes)
 
 

@@ -1,45 +1,47 @@
 """Whole frames per second of `sense` beside embree's depth, and the cost of a frame from small to large.
 
     python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
-    python -m benchmarks.sensor --taxim     # a minute: tactile images from height maps, beside taxim in JAX
-    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory. Writes a plot
-    python -m benchmarks.sensor --compile   # 2 minutes: number of compilations for a hundred objects
+    python -m benchmarks.sensor --taxim     # about a minute: tactile images from height maps, compared with taxim
+    python -m benchmarks.sensor --cost      # about 10 minutes: cost per pixel and per face, memory
+    python -m benchmarks.sensor --compile   # about 2 minutes: number of compilations for a hundred objects
+
+All commands print their results. Only `--cost` writes a file, the plot benchmarks/results/sensor/cost.png.
 
 The first command draws objects at rest on the pad with the wrench of their weight: the gel's balance, both streams,
-depth and segmentation. Beside it, embree traces the depth alone of the same faces and poses in three ways: `traced`
-calls embreex with every ray of an image at once and a scene built beforehand, `built` also builds the scene for each
-pose, as a moving object needs it, and `trimesh` uses the Python interface `mesh.ray`. Each runs in one thread and in as
-many threads as there are cores, because one call of `sense` keeps little more than one core busy and `dataset.collect`
-draws in threads too. On other devices, `sense` draws a batch. The runs alternate, and the figures are medians. A
-ratio is embree's seconds over ours, in as many threads. Below are the share of each stage in our time and, at 640x480,
-the speed relative to the paper's code, which takes 0.40 s per frame of this size on such a CPU (its renderer and shader
-without its physics, measured by us elsewhere).
+depth and segmentation. In comparison, embree traces the depth alone, of the same faces and poses, in three ways.
+`traced` calls embreex with every ray of an image at once and a scene built beforehand, `built` also builds the scene
+for each pose, as a moving object needs it, and `trimesh` uses the Python interface `mesh.ray`. Each runs in one thread
+and in as many threads as there are cores, because one call of `sense` keeps little more than one core busy and
+`dataset.collect` draws in threads too. On other devices, `sense` draws a batch. The runs alternate, and the figures are
+medians. A ratio is embree's seconds divided by ours, with the same number of threads. A second table has the share of
+each stage in our time and, at 640x480, the speed relative to the paper's code, which takes 0.40 s per frame of this
+size on such a CPU (its renderer and shader without its physics, measured by us elsewhere).
 """
 
-import argparse
 import concurrent.futures
+import dataclasses
 import functools
-import json
 import os
 import resource
-import subprocess
-import sys
 import tempfile
-import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import trimesh
+import tyro
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 import sts_jax as sts
+from benchmarks.instruments import fresh
+from benchmarks.instruments.meshes import public_meshes
+from benchmarks.instruments.timing import in_turn
 from sts_jax import geometry, objects, optics, tactile
 from sts_jax.rendering import drawing, equilibrium
 
@@ -53,10 +55,47 @@ COST_FACES = (500, 1000, 2000, 5000, 10000, 20000, 50000)
 RESULTS = Path(__file__).parent / "results" / "sensor"
 
 Inputs = tuple[jax.Array, jax.Array]
+Works = list[Callable[[], object]]  # one call for each pose
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line. At most one measurement is chosen."""
+
+    taxim: bool = False  # measure tactile images from height maps, compared with taxim
+    cost: bool = False  # measure the cost per pixel and per face, and the memory
+    compile: bool = False  # count the compilations for a hundred objects
+
+    def __post_init__(self) -> None:
+        if sum((self.taxim, self.cost, self.compile)) > 1:
+            raise ValueError("choose one of --taxim, --cost and --compile")
+
+
+class Case(NamedTuple):
+    """An object at rest, and the size of its images."""
+
+    name: str  # of the row
+    body: objects.Body
+    inputs: Inputs
+    shape: tuple[int, int]
+    repeats: int  # rounds of measurements
+
+
+class Durations(NamedTuple):
+    """Median seconds per frame, for whole frames and for parts of them."""
+
+    frame: float
+    gel: float  # the gel alone
+    depth: float  # gel and depth
+    visual: float  # gel, depth and visual stream
+    tactile: float  # gel, depth and tactile stream
+    at_once: float  # a frame in as many threads as there are cores, or batched
+    embree: np.ndarray  # of depth, for each way to call embree
+    embree_at_once: np.ndarray  # the same in threads
 
 
 def finer(body: objects.Body, faces: int | None) -> objects.Body:
-    """The same surface with about this number of faces: subdivided, then decimated."""
+    """The same surface with about this number of faces, by subdivision and decimation."""
     if faces is None:
         return body
     own = np.asarray(body.faces)
@@ -67,7 +106,7 @@ def finer(body: objects.Body, faces: int | None) -> objects.Body:
         longest *= 0.8
         mesh = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it is decimated, and may be open
+        warnings.simplefilter("ignore")  # about decimation and open meshes
         path = Path(folder) / "finer.ply"
         mesh.export(path)
         return objects.load(path, faces=faces, mass=float(objects.rigid(body, 0.5, 1.0)[0]), hollow=False)
@@ -93,7 +132,7 @@ def resting(body: objects.Body, number: int = POSES) -> Inputs:
     return poses, jnp.stack([zero, zero, zero + force, places[:, 1] * force, -places[:, 0] * force, zero], 1)
 
 
-def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, list[Callable[[], object]]]:
+def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, Works]:
     """Functions that trace the depth of each pose, for each way to call embree."""
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
@@ -111,7 +150,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
     def trace(made: EmbreeScene) -> np.ndarray:
         return made.run(origins, directions, query="DISTANCE")
 
-    def asked(mesh: trimesh.Trimesh) -> np.ndarray:
+    def trace_mesh(mesh: trimesh.Trimesh) -> np.ndarray:
         places, ray, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
         depth = np.full(len(slopes), np.inf)
         depth[ray] = places[:, 2] + camera.distance
@@ -122,21 +161,13 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
     return {
         "traced": [functools.partial(trace, made) for made in scenes],
         "built": [functools.partial(lambda vertices: trace(scene(vertices)), vertices) for vertices in posed],
-        "trimesh": [functools.partial(asked, mesh) for mesh in meshes],
+        "trimesh": [functools.partial(trace_mesh, mesh) for mesh in meshes],
     }
 
 
 def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each function. They run in turn, so that a busy machine slows all alike."""
-    seconds = []
-    for _ in range(repeats + 1):
-        row = []
-        for work in works:
-            start = time.perf_counter()
-            jax.block_until_ready(work())
-            row.append(time.perf_counter() - start)
-        seconds.append(row)
-    return [float(s) for s in np.median(seconds[1:], axis=0)]
+    """Median seconds of each function, see `in_turn`."""
+    return np.median(in_turn(*works, repeats=repeats), axis=0).tolist()
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "fields", "batched"))
@@ -150,62 +181,79 @@ def frames(
 ) -> object:
     """Frames, one after the other or batched. With `fields`, XLA omits the work for all other fields."""
 
-    def asked(inputs: Inputs) -> object:
+    def draw(inputs: Inputs) -> object:
         whole = sts.sense(sts.Sensor(), body, *inputs, resolution=shape)
         return tuple(getattr(whole, name) for name in fields) if fields else whole
 
-    return jax.vmap(asked)(inputs) if batched else jax.lax.map(asked, inputs)
+    return jax.vmap(draw)(inputs) if batched else jax.lax.map(draw, inputs)
 
 
 def speed() -> None:
     """Print one row per object and size, then the share of each stage."""
-    cores = os.cpu_count() or 1
-    on_cpu = jax.default_backend() == "cpu"
-    every = f"{cores} threads" if on_cpu else "batched"
+    every = f"{os.cpu_count()} threads" if jax.default_backend() == "cpu" else "batched"
     print(f"frames /s, and embree's seconds over ours: traced, built, trimesh; {jax.devices()[0].device_kind}")
     print(f"{'object':9} {'faces':>6} {'image':>9} | {'one thread':>37} | {every:>37}")
     stages = []
-    pool = concurrent.futures.ThreadPoolExecutor(cores)
+    for case in cases():
+        found = measure(case)
+        print(rates(case, found), flush=True)
+        stages.append(shares(case, found))
+    print("\nshare of each stage, %: the time with it less the time without it (they need not sum to 100)")
+    print(f"{'object':9} {'faces':>6} {'image':>9} | {'frame':>11} {'gel':>9} {'depth':>9} {'vision':>9} {'touch':>9}")
+    print("\n".join(stages))
 
-    def call(work: Callable[[], object]) -> object:
-        return jax.block_until_ready(work())
 
-    def in_turn(works: list[Callable[[], object]]) -> Callable[[], object]:
-        return lambda: [call(work) for work in works]
-
-    def in_threads(works: list[Callable[[], object]]) -> Callable[[], object]:
-        return lambda: list(pool.map(call, works))
-
+def cases() -> Iterator[Case]:
+    """Every object with every number of faces at every size."""
     for category in CATEGORIES:
         for faces in FACES:
             body = finer(objects.make(jax.random.key(0), category), faces)
             inputs = resting(body)
             for shape, repeats in SIZES.items():
-                asked = [(), ("pressure",), ("depth",), ("visual",), ("tactile",)]
-                ours = [functools.partial(frames, body, inputs, shape=shape, fields=fields) for fields in asked]
-                batched = functools.partial(frames, body, inputs, shape=shape, batched=True)
-                at_once = in_threads([ours[0]] * cores) if on_cpu else batched
-                others = list(embree(body, inputs[0], shape).values())
-                threaded = [in_threads(works * cores) for works in others]
-                times = median_seconds(*ours, at_once, *map(in_turn, others), *threaded, repeats=repeats)
-                whole, gel, depth, visual, touch = (seconds / POSES for seconds in times[:5])
-                best = times[5] / POSES / (cores if on_cpu else 1)
-                alone, together = (np.array(some) / POSES for some in (times[6:9], times[9:]))
                 name = f"{category:9} {count(body):6} {shape[1]:4}x{shape[0]:<4}"
-                row = [f"{name} |"]
-                for mine, theirs in ((whole, alone), (best, together / cores)):
-                    row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
-                print(" ".join(row[:-1]), flush=True)
-                shares = [gel, depth - gel, visual - depth, touch - depth]
-                line = " ".join(f"{100 * share / whole:9.0f}" for share in shares)
-                stages.append(
-                    f"{name} | {1e3 * whole:8.2f} ms {line}"
-                    + (f"   {PAPER / best:.1f} times the paper's" if shape == (480, 640) else "")
-                )
-    pool.shutdown()
-    print("\nshare of each stage, %: the time with it less the time without it (they need not sum to 100)")
-    print(f"{'object':9} {'faces':>6} {'image':>9} | {'frame':>11} {'gel':>9} {'depth':>9} {'vision':>9} {'touch':>9}")
-    print("\n".join(stages))
+                yield Case(name, body, inputs, shape, repeats)
+
+
+def measure(case: Case) -> Durations:
+    """Measure frames and embree, in one thread and in all."""
+    cores, on_cpu = os.cpu_count() or 1, jax.default_backend() == "cpu"
+    pool = concurrent.futures.ThreadPoolExecutor(cores)
+
+    def call(work: Callable[[], object]) -> object:
+        return jax.block_until_ready(work())
+
+    def one_by_one(works: Works) -> Callable[[], object]:
+        return lambda: [call(work) for work in works]
+
+    def in_threads(works: Works) -> Callable[[], object]:
+        return lambda: list(pool.map(call, works))
+
+    draw = functools.partial(frames, case.body, case.inputs, shape=case.shape)
+    parts = [functools.partial(draw, fields=(name,)) for name in ("pressure", "depth", "visual", "tactile")]
+    at_once = in_threads([draw] * cores) if on_cpu else functools.partial(draw, batched=True)
+    others = list(embree(case.body, case.inputs[0], case.shape).values())
+    threaded = [in_threads(works * cores) for works in others]
+    with pool:
+        seconds = median_seconds(draw, *parts, at_once, *map(one_by_one, others), *threaded, repeats=case.repeats)
+    whole, gel, depth, visual, tactile, together = (s / POSES for s in seconds[:6])
+    alone, traced = (np.array(some) / POSES for some in (seconds[6:9], seconds[9:]))
+    return Durations(whole, gel, depth, visual, tactile, together / (cores if on_cpu else 1), alone, traced / cores)
+
+
+def rates(case: Case, found: Durations) -> str:
+    """Frames per second of ours and of embree, and embree's seconds over ours, in one thread and in all."""
+    row = [f"{case.name} |"]
+    for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
+        row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
+    return " ".join(row[:-1])
+
+
+def shares(case: Case, found: Durations) -> str:
+    """The share of each stage in the time of a frame and, for the paper's size, the speed relative to its code."""
+    stages = [found.gel, found.depth - found.gel, found.visual - found.depth, found.tactile - found.depth]
+    line = " ".join(f"{100 * stage / found.frame:9.0f}" for stage in stages)
+    paper = f"   {PAPER / found.at_once:.1f} times the paper's" if case.shape == (480, 640) else ""
+    return f"{case.name} | {1e3 * found.frame:8.2f} ms {line}{paper}"
 
 
 def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: float = 1e-3) -> np.ndarray:
@@ -221,7 +269,7 @@ def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.nd
     return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)
 
 
-def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
+def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
     """Print the time of each renderer for the tactile image of an imprint."""
     from taxim import Taxim  # taxim imports JAX itself, and nothing else here needs it
 
@@ -254,26 +302,30 @@ def beside_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) 
         print(f"{name:6} {row} | {taxim / far:8.2f} {taxim / leds:8.2f} {taxim_shadows / shadows:8.2f}", flush=True)
 
 
-def one(faces: int, shape: tuple[int, int]) -> None:
-    """Print seconds per frame and peak memory as JSON, in a fresh process."""
-    body = finer(objects.make(jax.random.key(0), "bottle"), faces)
+def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
+    """The cost of a frame, for a fresh process.
+
+    Returns:
+        `faces`: number of faces. `seconds`: per frame. `bytes`: peak memory of this process.
+    """
+    body, shape = finer(objects.make(jax.random.key(0), "bottle"), faces), (height, width)
     poses, wrenches = resting(body, 1 if shape == COST_SIZES[-1] else 4)  # four of the largest are 0.2 GiB
     (seconds,) = median_seconds(lambda: frames(body, (poses, wrenches), shape=shape))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps({"faces": count(body), "seconds": seconds / len(poses), "bytes": peak}))
+    return {"faces": count(body), "seconds": seconds / len(poses), "bytes": peak}
 
 
 def cost() -> None:
-    """Print and plot the cost of a frame by pixels and by faces, each measured in a process of its own."""
+    """Print and plot the cost of a frame by pixels and by faces, each measured in a fresh process."""
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
-        command = [sys.executable, "-m", "benchmarks.sensor", "--one", str(faces), *map(str, shape)]
-        found = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
+        found = fresh.call("benchmarks.sensor.cost_of", faces, *shape)
         seconds, image = found["seconds"], f"{shape[1]:5}x{shape[0]:<5}"
         per_pixel = 1e9 * seconds / shape[0] / shape[1]
-        held = f"{found['bytes'] / 2**30:6.2f} GiB held at most"
+        memory = f"{found['bytes'] / 2**30:6.2f} GiB held at most"
         print(
-            f"{found['faces']:6} faces {image} {1e3 * seconds:8.2f} ms {per_pixel:8.1f} ns a pixel {held}", flush=True
+            f"{found['faces']:6} faces {image} {1e3 * seconds:8.2f} ms {per_pixel:8.1f} ns a pixel {memory}",
+            flush=True,
         )
         return found
 
@@ -296,8 +348,6 @@ def cost() -> None:
 
 def compilations(number: int = 100) -> None:
     """Print how often `sense` compiles for this number of different objects, procedural ones and public meshes."""
-    from benchmarks.depth import public_meshes
-
     files = sorted(public_meshes().glob("*.obj"))
     bodies = []
     with warnings.catch_warnings():
@@ -315,20 +365,17 @@ def compilations(number: int = 100) -> None:
     print(f"{len(bodies)} objects, {len(files)} of them loaded: the balance compiled {balance} times, drawing {draw}")
 
 
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--taxim", action="store_true", help="time of tactile images from height maps, beside taxim")
-    parser.add_argument("--cost", action="store_true", help="cost per pixel and per face, memory")
-    parser.add_argument("--compile", action="store_true", help="number of compilations for a hundred objects")
-    parser.add_argument("--one", type=int, nargs=3, metavar=("FACES", "HEIGHT", "WIDTH"), help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.one:
-        one(arguments.one[0], (arguments.one[1], arguments.one[2]))
-    elif arguments.taxim:
-        beside_taxim()
-    elif arguments.cost:
+def main(args: Args) -> None:
+    """Run the chosen measurement."""
+    if args.taxim:
+        compare_taxim()
+    elif args.cost:
         cost()
-    elif arguments.compile:
+    elif args.compile:
         compilations()
     else:
         speed()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

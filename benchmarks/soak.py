@@ -1,28 +1,30 @@
 """Endurance: failures, outcomes and accuracy of very many trajectories of each scenario.
 
-    python -m benchmarks.soak                            # 30,000 trajectories, about two hours on two cores
+    python -m benchmarks.soak                            # 30,000 trajectories, about two hours on two CPU cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
     python -m benchmarks.soak --keep FOLDER              # keep finished blocks there, and resume from them
     python -m benchmarks.soak --first-block 17           # only blocks 17 to 19 of 20, if others ran elsewhere
 
 Every eight trajectories have a new object, of all classes in turn, or a bottle on the jerked pad. The benchmark counts
-discarded draws (only those that are non-finite or deeper in the pad than the limit), outcomes and unsettled
-trajectories. It compares the wrench at rest with the weight, and the energy out of contact with that of the start.
-Blocks have `BLOCK` trajectories, or fewer if fewer are requested. `benchmarks.hidden --soaked` analyses kept blocks.
+trajectories that were discarded and drawn again (only those that are non-finite or deeper in the pad than the limit),
+outcomes and unsettled trajectories. It compares the wrench at rest with the weight, and the energy out of contact with
+that of the start. Blocks have `BLOCK` trajectories, or fewer if fewer are requested. The results are printed.
+`benchmarks.hidden --soaked FOLDER` analyses kept blocks.
 """
 
-import argparse
-import functools
+import dataclasses
 import json
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from tqdm import tqdm
 
-from benchmarks.starts import Starts, bodies, rigid_of
+from benchmarks.instruments.starts import Starts, bodies, rigid_of
 from sts_jax import dataset, geometry, objects, physics
 from sts_jax.physics.scenario import G
 from sts_jax.physics.simulation import SUNK_LIMIT
@@ -35,6 +37,24 @@ SCENARIOS: dict[str, physics.Scenario] = {
 }
 NUM = 8  # trajectories of each object
 BLOCK = 504  # trajectories simulated by one call, unless fewer are requested
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line.
+
+    Raises:
+        ValueError: `first_block` is outside of the requested trajectories.
+    """
+
+    num: int = 10_000  # trajectories of each scenario
+    only: Literal["freefall", "inclined", "perturbed"] | None = None  # one scenario (default: all)
+    first_block: int = 0  # skip earlier blocks of 504 trajectories each
+    keep: Path | None = None  # folder that keeps finished blocks (default: a temporary folder)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.first_block * BLOCK < max(self.num, 1):
+            raise ValueError(f"--first-block is {self.first_block}, but must be 0 to {(self.num - 1) // BLOCK}")
 
 
 def excess_energy(
@@ -59,7 +79,13 @@ def excess_energy(
 
 
 def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
-    """Simulate a block of trajectories. Returns arrays (size, ...) of results. `size` is a multiple of NUM."""
+    """Simulate a block of trajectories of a scenario. Returns arrays (size, ...).
+
+    Args:
+        name: One of SCENARIOS.
+        index: Number of the block, from 0.
+        size: Trajectories of the block, a multiple of NUM.
+    """
     scenario = SCENARIOS[name]
     first = index * size // NUM
     items = bodies(("bottle",) if scenario.must_stand else objects.CATEGORIES, size // NUM, first)
@@ -94,17 +120,17 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
 
 def claim(folder: Path, name: str, size: int) -> None:
-    """Write the settings of a folder's blocks of a scenario, or raise an error if they differ (`dataset.claim`)."""
+    """Write the settings of a scenario's blocks to a folder, or raise an error if it has others (`dataset.claim`)."""
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     dataset.claim(folder / f"{name}.json", settings)
 
 
 def soaked(folder: Path, name: str) -> Starts:
-    """The starts and outcomes of the kept blocks of a scenario. No start was rolled again.
+    """The starts and outcomes of the kept blocks of a scenario. No start was simulated again.
 
     Raises:
-        FileNotFoundError: the folder has no blocks.
-        ValueError: the blocks were made with other settings. The message names the first that differs.
+        FileNotFoundError: The folder has no blocks.
+        ValueError: The blocks were made with other settings. The message names the first that differs.
     """
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):
@@ -143,35 +169,24 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
     return "\n".join(lines)
 
 
-def main(num: int, names: list[str], keep: Path, *, first: int = 0) -> None:
-    """Simulate the blocks from `first` on that are not kept yet, then print the results of these blocks."""
-    size = min(BLOCK, -(-num // NUM) * NUM)
-    for name in names:
-        claim(keep, name, size)
+def main(args: Args, folder: Path) -> None:
+    """Simulate the requested blocks that the folder lacks, then print the results of all requested blocks."""
+    size = min(BLOCK, -(-args.num // NUM) * NUM)
+    for name in [args.only] if args.only else list(SCENARIOS):
+        claim(folder, name, size)
         parts = []
-        for index in tqdm(range(first, -(-num // size)), unit="block", desc=name):
-            path = keep / f"{name}-{index:04d}.npz"
+        for index in tqdm(range(args.first_block, -(-args.num // size)), unit="block", desc=name):
+            path = folder / f"{name}-{index:04d}.npz"
             if not path.exists():
                 dataset.write_arrays(path, block(name, index, size))
             with np.load(path) as kept:
                 parts.append(dict(kept))
-        found = {field: np.concatenate([part[field] for part in parts])[: num - first * size] for field in parts[0]}
+        wanted = args.num - args.first_block * size
+        found = {field: np.concatenate([part[field] for part in parts])[:wanted] for field in parts[0]}
         print(report(name, found), flush=True)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--num", type=int, default=10_000, help="trajectories of each scenario")
-    parser.add_argument("--only", choices=list(SCENARIOS), help="one scenario instead of all")
-    parser.add_argument("--first-block", type=int, default=0, help=f"skip earlier blocks of {BLOCK} trajectories each")
-    parser.add_argument("--keep", type=Path, help="folder that keeps finished blocks")
-    arguments = parser.parse_args()
-    if not 0 <= arguments.first_block * BLOCK < max(arguments.num, 1):
-        parser.error(f"--first-block is {arguments.first_block}, but must be 0 to {(arguments.num - 1) // BLOCK}")
-    names = [arguments.only] if arguments.only else list(SCENARIOS)
-    run = functools.partial(main, arguments.num, names, first=arguments.first_block)
-    if arguments.keep is None:
-        with tempfile.TemporaryDirectory() as folder:
-            run(Path(folder))
-    else:
-        run(arguments.keep)
+    args = tyro.cli(Args, description=__doc__)
+    with tempfile.TemporaryDirectory() as temporary:
+        main(args, args.keep or Path(temporary))

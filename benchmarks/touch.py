@@ -1,17 +1,28 @@
 """The mass of held-out objects, read from their uint8 tactile frames at rest.
 
-    python -m benchmarks.touch [runs/freefall/dataset]
+    python -m benchmarks.touch          # about a minute, for the dataset of runs/freefall
+    python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
-Ridge regression of log mass on simple image features (sums, sizes, depths), fitted on training objects, and the share
-of imprint pixels at 0 or 255. Both use the last frames of settled objects on the pad.
+Prints the accuracy of ridge regression of the log mass on simple image features (sums, sizes, depths), which is fitted
+on training objects, and the share of imprint pixels at 0 or 255. Both use the last frames of settled objects on the
+pad. Writes no files.
 """
 
-import sys
+import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
+import tyro
 
 from sts_jax import dataset, objects, physics
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line."""
+
+    dataset: tyro.conf.Positional[Path] = Path("runs/freefall/dataset")  # a dataset of procedural objects
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
@@ -36,14 +47,14 @@ def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0)
 
 
 def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Whether a channel is at 0 or 255, for every imprint pixel of images `uint8 (n, h, w, 3)`."""
+    """For every imprint pixel of images `uint8 (n, h, w, 3)`, True if one of its channels is 0 or 255."""
     touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
     return np.any((tactile == 0) | (tactile == 255), -1)[touched]
 
 
-def main(folder: str) -> None:
+def main(args: Args) -> None:
     """Print the share of variance explained and the share of saturated pixels."""
-    data = dataset.load(folder)
+    data = dataset.load(args.dataset)
     collection = dataset.Collection(num_objects=data.collection["num_objects"], seed=data.collection["seed"])
     bodies = dataset.make_bodies(collection, np.arange(collection.num_objects))
     owner = data.trajectory["body"]
@@ -67,4 +78,4 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "runs/freefall/dataset")
+    main(tyro.cli(Args, description=__doc__))

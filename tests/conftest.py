@@ -1,10 +1,11 @@
-"""Warnings are errors, and shapes and types are checked while tests run.
+"""Set-up of the tests: run-time checks of shapes and types, and faster compilation.
 
 Most of the suite's time is compilation. Three settings shorten it:
 
-- All worker processes share one cache of compiled programs, however small. JAX_COMPILATION_CACHE_DIR keeps it.
-- XLA optimises less: compilation takes two thirds of its time, and small arrays do not need more. An XLA_FLAGS in the
-  environment, also an empty one, is respected. The notebooks are tested with XLA's defaults.
+- All worker processes share one cache of compiled programs, including small ones. If JAX_COMPILATION_CACHE_DIR is set,
+  the cache is kept there.
+- XLA optimises less, which shortens compilation by a third. The small arrays of the tests do not need more. A variable
+  XLA_FLAGS in the environment takes precedence, even if it is empty. The notebooks are tested with XLA's defaults.
 - Compiled programs stay in memory from one test file to the next, as long as there is room for them.
 """
 
@@ -22,7 +23,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="sts_jax_tests_")
     atexit.register(shutil.rmtree, os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
-if importlib.metadata.version("jaxlib").startswith("0.10."):  # XLA aborts where it does not know a flag
+if importlib.metadata.version("jaxlib").startswith("0.10."):  # XLA aborts on an unknown flag
     os.environ.setdefault(
         "XLA_FLAGS",
         "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true "
@@ -35,12 +36,12 @@ import pytest
 
 jaxtyping.install_import_hook("sts_jax", "checker.check")
 
-MOST_MAPS = 30_000  # memory maps of a process; Linux allows 65,530, beyond which XLA dies of a segmentation fault
+MOST_MAPS = 30_000  # memory maps of a process. Linux allows 65,530, and XLA crashes beyond that
 
 
 @pytest.fixture(autouse=True, scope="module")
 def release_compiled_programs():
-    """Each compiled program holds memory maps: all programs are dropped before their number reaches the limit."""
+    """Drop all compiled programs before their memory maps reach the limit of the process."""
     yield
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") > MOST_MAPS:

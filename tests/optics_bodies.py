@@ -1,4 +1,4 @@
-"""Bodies made of trimesh's primitives, for the tests of optics, tactile and frame."""
+"""Bodies from trimesh's primitives, and reference values from embree, for the tests of optics, tactile and frame."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,14 +6,15 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from benchmarks.depth import body_mesh, embree, interior, public_meshes
+from benchmarks.instruments.meshes import public_meshes
+from benchmarks.instruments.truth import body_mesh, embree, interior
 from sts_jax.objects.body import FACE_CLASSES, Body
 
 __all__ = ["body_mesh", "embree", "from_trimesh", "interior", "public_meshes", "rays_hidden"]
 
 
 def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -> Body:
-    """A body with flat normals, of the smallest size class that holds it. `colors` are per face."""
+    """A body with flat normals, in the smallest size class that fits. `colors` has a colour for each face."""
     number = len(mesh.faces)
     padded = next(size for size in FACE_CLASSES if size >= number)
     normals = np.repeat(mesh.face_normals[:, None], 3, axis=1)
@@ -42,7 +43,7 @@ def from_trimesh(mesh: trimesh.Trimesh, *, color=(0.6, 0.4, 0.3), colors=None) -
 
 
 def rays_hidden(mesh, places, num=3000):
-    """Share of cosine-distributed rays from places on the skin that hit a mesh."""
+    """Share of the cosine-distributed rays from each place of the skin that hit a mesh."""
     scene = EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(mesh.triangles, np.float32))
     index = np.arange(num)

@@ -1,4 +1,4 @@
-"""A small folder in ShapeNetSem's layout (release v0: README.txt and its archives), of shapes made here."""
+"""A small folder of generated shapes in the layout of ShapeNetSem (release v0: README.txt and its archives)."""
 
 import csv
 from collections.abc import Sequence
@@ -13,18 +13,18 @@ COLUMNS += ["surfaceVolume", "solidVolume", "supportSurfaceArea", "weight", "sta
 
 
 def wedge() -> trimesh.Trimesh:
-    """A pyramid without symmetry, in metres, with X right, Y back and Z up. Its tip leans to +x, -y."""
+    """A pyramid without symmetries, in metres: X right, Y back, Z up. Its tip leans to +x and -y."""
     base = [[-0.02, -0.015, 0], [0.02, -0.015, 0], [0.02, 0.015, 0], [-0.02, 0.015, 0]]
     return trimesh.convex.convex_hull(np.array([*base, [0.012, -0.008, 0.09]]))
 
 
 def in_file(mesh: trimesh.Trimesh, right: Sequence[float], back: Sequence[float], up: Sequence[float], unit: float):
-    """The mesh in a file's own axes and units."""
+    """The mesh in the axes and units of a file."""
     return trimesh.Trimesh(mesh.vertices @ np.array([right, back, up], float) / unit, mesh.faces, process=False)
 
 
 def row(name: str, category: str, **values: str) -> dict[str, str]:
-    """A line of the table, with a vector's commas as the release has them."""
+    """A line of the table. The commas of vectors are escaped as in the release."""
     line = dict.fromkeys(COLUMNS, "") | {"fullId": f"wss.{name}", "category": category, "name": name, "tags": "*"}
     line |= {"up": r"0.0\,0.0\,1.0", "front": r"0.0\,-1.0\,0.0", "unit": "0.0254"}
     return line | values
@@ -36,7 +36,7 @@ def build(
     meshes: dict[str, trimesh.Trimesh],
     images: dict[str, tuple[int, int, int]] | None = None,
 ) -> Path:
-    """Write the folder. The MTL file of a mesh whose id has an image names it without a path, as in the release."""
+    """Write the folder. MTL files name the image of a mesh without its folder, as those of the release do."""
     models, textures = root / "models-OBJ" / "models", root / "models-textures" / "textures"
     models.mkdir(parents=True)
     textures.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The smallest state-space models, which compile in seconds."""
+"""The smallest state-space models, which compile in seconds, and random inputs for them."""
 
 import dataclasses
 
@@ -46,7 +46,7 @@ def random_states(rng, number):
 
 
 def state_model(**changes):
-    """A predictor with a state-space model before its training."""
+    """A predictor with an untrained state-space model."""
     size = STATE.input_size
     view = {"resolution": (size, size), "condition_scale": (10.0, 10.0, 0.1)} | changes
     graphdef, params, _ = statespace.init(jax.random.key(0), STATE)

@@ -1,4 +1,4 @@
-"""How far the ends of one start lie from each other, of ends that are written out."""
+"""The spread of the ends of one start, for ends with known distances."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from benchmarks.ceiling import spread
 from sts_jax.physics import Outcome
 
 
-def test_ends_are_compared_with_their_start_and_with_each_other():
+def test_spread_reports_distances_from_the_start_and_between_ends():
     start = np.zeros((3, 7))
     end = np.zeros((2, 3, 7))
-    end[:, 0, 0] = [0.010, 0.030]  # 20 mm apart: an unbiased spread of 10 mm * sqrt(2)
-    end[:, 1, 1] = 0.005  # always there
-    end[:, 2, 0] = [0.02, 0.2]  # falls off once
+    end[:, 0, 0] = [0.010, 0.030]  # 20 mm apart, so that the unbiased spread is 10 mm * sqrt(2)
+    end[:, 1, 1] = 0.005  # both ends in one place
+    end[:, 2, 0] = [0.02, 0.2]  # one of the ends falls off
     outcome = np.array([[Outcome.RESTS] * 3, [Outcome.RESTS, Outcome.RESTS, Outcome.FELL_OFF]])
     lines = spread(start, end, outcome)
     assert lines[0] == "3 starts, 2 draws of the hidden values each"

@@ -1,4 +1,4 @@
-"""The deterministic network fits simple trajectories, and items of a batch do not influence each other."""
+"""The deterministic network fits simple trajectories, and the items of a batch do not influence each other."""
 
 import itertools
 
@@ -17,7 +17,7 @@ NUMBER, SIZE = 64, 128
 
 @pytest.fixture(scope="module")
 def arrays():
-    """Squares of some colour and place; the final pose is a function of the place, the outcome one of the colour."""
+    """Squares whose place determines the final pose, and whose colour determines the outcome."""
     rng = np.random.default_rng(0)
     grey = np.full((SIZE, SIZE, 3), 150, np.uint8)
     first, last = np.tile(grey, (NUMBER, 1, 1, 1)), np.full((NUMBER, 64, 64, 3), 150, np.uint8)
@@ -33,9 +33,9 @@ def arrays():
     )
 
 
-def test_it_learns_the_pose_the_outcome_and_the_pictures(arrays, monkeypatch):
+def test_network_learns_pose_outcome_and_images(arrays, monkeypatch):
     ticks = itertools.count()
-    monkeypatch.setattr(deterministic.time, "perf_counter", lambda: next(ticks))  # a step takes a second
+    monkeypatch.setattr(deterministic.time, "perf_counter", lambda: next(ticks))  # each step takes a second
     network, params = nnx.split(deterministic.Network(1, 12, 2, nnx.Rngs(0)))
     params, steps = deterministic.fit(arrays, network, params, seconds=150, seed=0)
     assert 140 < steps < 160
@@ -54,7 +54,7 @@ def test_it_learns_the_pose_the_outcome_and_the_pictures(arrays, monkeypatch):
     assert np.mean((drawn - target) ** 2) < 0.7 * np.mean(np.var(target, axis=0))
 
 
-def test_one_item_does_not_depend_on_its_neighbours(arrays):
+def test_prediction_does_not_depend_on_other_items_of_the_batch(arrays):
     network, params = nnx.split(deterministic.Network(1, 12, 2, nnx.Rngs(0)))
 
     @jax.jit

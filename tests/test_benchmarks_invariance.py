@@ -1,4 +1,4 @@
-"""Rest poses and outcomes on all sides of `benchmarks.invariance`: 128 runs a side, 15 points (it does 4,000, 5)."""
+"""All sides of `benchmarks.invariance`, with 128 runs a side and a margin of 15 points instead of 4,000 and 5."""
 
 import dataclasses
 
@@ -15,8 +15,8 @@ pytestmark = pytest.mark.slow
 NUM = 128  # four full chunks
 
 
-@pytest.mark.parametrize("index", [1, 2], ids=["bottle", "jerked bottles"])  # the box is a drop, as the bottle is
-def test_ends_do_not_depend_on_the_step_the_engine_or_the_hand(index: int) -> None:
+@pytest.mark.parametrize("index", [1, 2], ids=["bottle", "jerked bottles"])  # the box is dropped as the bottle is
+def test_ends_do_not_depend_on_step_engine_or_handedness(index: int) -> None:
     case = invariance.cases()[index]
     case = case._replace(
         scenario=dataclasses.replace(case.scenario, frames=20), mirrored=dataclasses.replace(case.mirrored, frames=20)
@@ -24,15 +24,15 @@ def test_ends_do_not_depend_on_the_step_the_engine_or_the_hand(index: int) -> No
     found = invariance.sides(case, NUM)
     assert {len(labels) for labels in found.values()} == {NUM}
     shares = np.bincount(found["ours"]) / NUM
-    assert np.sum(shares > 0.01) >= 2  # there is something to tell apart
+    assert np.sum(shares > 0.01) >= 2  # several outcomes occur
     assert invariance.compare(found, case.labels, margin=0.15)
     if index == 2:
-        # With the same contacts it is the same engine: what differs are the four contacts that C keeps of a mesh.
+        # With the same contacts both engines agree. C MuJoCo alone keeps only four contacts of a mesh.
         assert np.mean(found["ours"] == found["C, every vertex"]) >= 0.95
         assert np.mean(found["ours"] == found["C, every vertex, driven pad"]) >= 0.95
 
 
-def test_a_mirrored_start_is_the_mirror_image() -> None:
+def test_mirrored_scenario_starts_at_the_mirror_image() -> None:
     case = invariance.cases()[2]
     points = np.float32([[0.01, 0.02, -0.03], [0, -0.04, 0.05]])
     shape = physics.Shape(points, np.eye(3), np.ones(3) / 3, np.float32([[0, 0.01, 0]]))
@@ -43,7 +43,7 @@ def test_a_mirrored_start_is_the_mirror_image() -> None:
     np.testing.assert_allclose(mirrored.condition, seen.condition * jnp.array([1, -1, 1]), atol=1e-6)
 
 
-def test_the_interval_of_a_paired_difference() -> None:
+def test_interval_of_a_paired_difference() -> None:
     a = np.zeros(4000, bool)
     b = a.copy()
     b[:400] = True

@@ -1,4 +1,4 @@
-"""The real presses: their geometry, and a short fit that beats the background."""
+"""The geometry of the real presses, and a short fit that beats the background."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,25 +13,25 @@ def recorded():
     return presses.read()
 
 
-def test_a_balls_normals_are_those_of_its_surface():
+def test_skin_under_a_ball_has_the_points_and_normals_of_the_ball():
     row, column = np.array([50, 50, 90, 20, 60]), np.array([60, 100, 60, 50, 65])
     normals, points = presses.skin_under_ball(np.array([60.0, 50.0]), 55.0, row, column, (120, 160))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1)
     np.testing.assert_allclose(normals[0], [0, 0, -1])
-    assert normals[1][0] > 0.5  # right of the middle it faces right
-    assert normals[2][1] > 0.5  # below the middle, down
-    # one centre, a radius away along the normal
+    assert normals[1][0] > 0.5  # faces right on the right of the middle
+    assert normals[2][1] > 0.5  # faces down below the middle
+    # All points are one radius from one centre, along their normals.
     centres = points - presses.RADIUS * normals
     np.testing.assert_allclose(centres, np.tile(centres[:1], (5, 1)), atol=1e-9)
     np.testing.assert_allclose(centres[0, :2], presses.PITCH * (np.array([60, 50]) - [79.5, 59.5]), atol=1e-9)
-    # the contact's rim lies in the gel's face, its middle as deep as the ball's cap is high
+    # The rim of the contact lies in the gel's face. Its middle is as deep as the cap of the ball is high.
     _, rim = presses.skin_under_ball(np.array([60.0, 50.0]), 55.0, np.array([50]), np.array([115]), (120, 160))
     assert rim[0, 2] == pytest.approx(0, abs=1e-9)
     cap = presses.RADIUS - np.sqrt(presses.RADIUS**2 - (55 * presses.PITCH) ** 2)
     assert -points[0, 2] == pytest.approx(cap)
 
 
-def test_the_normals_are_the_differences_of_the_heights():
+def test_normals_are_the_gradients_of_the_points():
     rows, columns = np.meshgrid(np.arange(30, 70), np.arange(40, 80), indexing="ij")
     normals, points = presses.skin_under_ball(np.array([60.3, 50.7]), 60.0, rows, columns, (120, 160))
     down, across = np.gradient(points[..., 2], presses.PITCH)
@@ -40,7 +40,7 @@ def test_the_normals_are_the_differences_of_the_heights():
     np.testing.assert_allclose((-normals[..., 1] / normals[..., 2])[inner], down[inner], atol=1e-3)
 
 
-def test_every_fourth_press_is_held_out_and_the_background_alone_is_the_known_figure(recorded):
+def test_a_quarter_of_the_presses_is_held_out_and_the_background_alone_has_19_5_dB(recorded):
     held = presses.held_out(len(recorded.images))
     assert held.sum() == 12
     asked = presses.pixels(recorded, np.flatnonzero(held))
@@ -48,7 +48,7 @@ def test_every_fourth_press_is_held_out_and_the_background_alone_is_the_known_fi
 
 
 @pytest.mark.parametrize("near", [True, False], ids=["near", "far"])
-def test_changes_are_the_shaders_own_picture_less_that_of_the_flat_skin(recorded, near):
+def test_draw_equals_the_shader_of_the_library(recorded, near):
     given = presses.pixels(recorded, np.array([5]), every=8)
     place = jnp.array([[14.0, 3, -5], [-9, 12, -8]])
     colors = jnp.array([[0.5, 0.2, 0.1], [0.0, 0.3, 0.9]])
@@ -62,7 +62,7 @@ def test_changes_are_the_shaders_own_picture_less_that_of_the_flat_skin(recorded
 
 
 @pytest.mark.parametrize("near", [True, False], ids=["near", "far"])
-def test_a_short_fit_beats_the_background(recorded, near):
+def test_short_fit_beats_the_background_on_held_out_presses(recorded, near):
     some, other = (presses.pixels(recorded, np.array(which), every=16) for which in ([4, 12, 20, 28, 36], [0, 21, 33]))
     before = presses.draw(*presses.shader(presses.start(some, near=near), near=near), some)
     constants, lights = presses.fit(some, near=near, steps=50)
@@ -72,7 +72,7 @@ def test_a_short_fit_beats_the_background(recorded, near):
     assert presses.psnr(drawn, other.color) > presses.psnr(other.background, other.color) + 5
 
 
-def test_without_the_package_the_error_says_what_to_install(monkeypatch):
+def test_read_without_the_package_names_the_command_that_installs_it(monkeypatch):
     monkeypatch.setattr(presses.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(FileNotFoundError, match="bench"):
         presses.read()

@@ -1,4 +1,4 @@
-"""Endurance in small: 104 trajectories of each scenario; and what `soaked` reads of kept blocks."""
+"""Endurance with 104 trajectories of each scenario, and reading of kept blocks."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import soak
-from benchmarks.starts import Starts
+from benchmarks.instruments.starts import Starts
 from sts_jax import physics
 from sts_jax.physics.simulation import SUNK_LIMIT
 
@@ -14,9 +14,9 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize("name", soak.SCENARIOS)
-def test_trajectories_end_sound_settled_and_weigh_what_they_weigh(name):
+def test_trajectories_are_finite_settle_and_press_with_their_weight(name):
     found = soak.block(name, 0, 104)
-    assert found["resampled"].sum() == 0  # so every state was finite to the end
+    assert found["resampled"].sum() == 0  # every state was finite
     assert found["sunk"].max() <= SUNK_LIMIT
     assert np.isfinite(found["pose"]).all()
     assert found["settled"].mean() >= 0.9
@@ -35,7 +35,7 @@ def kept(folder, name, size=3):
     return blocks
 
 
-def test_soaked_blocks_are_read_in_turn(tmp_path):
+def test_soaked_reads_all_kept_blocks_in_order(tmp_path):
     blocks = kept(tmp_path, "inclined")
     starts = soak.soaked(tmp_path, "inclined")
     np.testing.assert_array_equal(starts.pose, np.concatenate([b["pose"] for b in blocks]))
@@ -44,10 +44,10 @@ def test_soaked_blocks_are_read_in_turn(tmp_path):
         soak.soaked(tmp_path, "freefall")
 
 
-def test_blocks_of_other_settings_are_refused(tmp_path, monkeypatch):
+def test_soaked_rejects_blocks_of_other_settings(tmp_path, monkeypatch):
     kept(tmp_path, "inclined", soak.BLOCK)
     with pytest.raises(ValueError, match=r"inclined.json was made with block = 504, but the current settings have 104"):
-        soak.main(100, ["inclined"], tmp_path)
+        soak.main(soak.Args(num=100, only="inclined"), tmp_path)
     monkeypatch.setattr(soak, "NUM", 4)
     with pytest.raises(ValueError, match=r"inclined.json was made with num = 8, but the current settings have 4"):
         soak.soaked(tmp_path, "inclined")

@@ -1,4 +1,4 @@
-"""Touch is readable: what lies on the gel can be weighed by its picture."""
+"""The mass of objects on the gel can be read from their tactile images."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from sts_jax import dataset, objects, physics
 pytestmark = pytest.mark.slow
 
 
-def test_mass_of_held_out_objects_is_read_from_uint8_touch_and_few_pixels_saturate():
+def test_uint8_touch_determines_the_mass_of_held_out_objects_and_rarely_saturates():
     collection = dataset.Collection(num_objects=64, num_per_object=3, seed=11)
     bodies = dataset.make_bodies(collection, np.arange(64))
     sensor = sts.Sensor()
@@ -39,10 +39,10 @@ def test_mass_of_held_out_objects_is_read_from_uint8_touch_and_few_pixels_satura
     )[0]
     assert held_out.sum() > 30
     x = touch.features(tactile, blank)
-    said = touch.ridge(x[~held_out], y[~held_out], x[held_out])
-    assert 1 - np.mean((said - y[held_out]) ** 2) / y[held_out].var() > 0.8
-    # Shuffled images say nothing: the features do not leak the answer.
+    predicted = touch.ridge(x[~held_out], y[~held_out], x[held_out])
+    assert 1 - np.mean((predicted - y[held_out]) ** 2) / y[held_out].var() > 0.8
+    # Images of other objects do not predict the mass.
     shuffled = np.random.default_rng(0).permutation(x[held_out])
-    said = touch.ridge(x[~held_out], y[~held_out], shuffled)
-    assert 1 - np.mean((said - y[held_out]) ** 2) / y[held_out].var() < 0.3
+    predicted = touch.ridge(x[~held_out], y[~held_out], shuffled)
+    assert 1 - np.mean((predicted - y[held_out]) ** 2) / y[held_out].var() < 0.3
     assert touch.saturated(tactile, blank).mean() < 0.05

@@ -21,7 +21,7 @@ pytestmark = [
 
 
 def executed(name: str) -> tuple[list[np.ndarray], str]:
-    """The pictures and the printed text of a notebook that is executed now."""
+    """Execute a notebook. Returns its images and its printed text."""
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", 4)
     nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3").execute()
     outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
@@ -41,8 +41,8 @@ def executed(name: str) -> tuple[list[np.ndarray], str]:
         ("drop_train_predict", 3, r"the predicted place is \d+ mm from the true one"),
     ],
 )
-def test_a_notebook_runs_and_shows_its_pictures(name, number, printed, monkeypatch):
-    monkeypatch.delenv("XLA_FLAGS", raising=False)  # as a user compiles, see conftest.py
+def test_notebook_runs_and_shows_its_images(name, number, printed, monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)  # as for a user, see conftest.py
     pictures, text = executed(name)
     assert len(pictures) == number
     assert all(picture.std() > 5 for picture in pictures)

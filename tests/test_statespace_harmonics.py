@@ -1,4 +1,4 @@
-"""Harmonics on the sphere: against SciPy, numerical quadrature, real rotations and sampled coefficients."""
+"""Harmonics on the sphere, compared with SciPy, quadrature, rotated directions and sampled coefficients."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,7 @@ ANGLES = np.array([0.0, 0.7, -2.4], np.float32)
 
 
 def expected_basis(direction, degree=DEGREE):
-    """SciPy's harmonics, real and of mean square 1, in float64."""
+    """SciPy's harmonics in float64, as real functions with a mean square of 1."""
     x, y, z = np.moveaxis(np.asarray(direction, np.float64), -1, 0)
     polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
     found = []
@@ -35,13 +35,13 @@ def unit(angle):
     return jnp.stack([jnp.cos(jnp.asarray(angle)), jnp.sin(jnp.asarray(angle))], axis=-1)
 
 
-def test_the_harmonics_are_those_of_scipy():
+def test_basis_equals_scipy():
     places = np.concatenate([directions(200), np.eye(3, dtype=np.float32), -np.eye(3, dtype=np.float32)])
     np.testing.assert_allclose(harmonics.basis(jnp.asarray(places), DEGREE), expected_basis(places), atol=2e-5)
 
 
-def test_the_harmonics_are_orthonormal():
-    """Gauss-Legendre in the height and equal steps of the azimuth are exact for these polynomials."""
+def test_basis_is_orthonormal():
+    """Gauss-Legendre quadrature in the height and equal steps of the azimuth are exact for these polynomials."""
     height, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
     azimuth = 2 * np.pi * np.arange(2 * DEGREE + 2) / (2 * DEGREE + 2)
     level = np.sqrt(1 - height**2)[:, None]
@@ -53,14 +53,14 @@ def test_the_harmonics_are_orthonormal():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_a_harmonic_shrinks_with_the_length_to_the_power_of_its_degree(degree):
+def test_harmonic_is_homogeneous_in_its_degree(degree):
     places = directions(20)
     power = np.repeat(np.arange(degree + 1), 2 * np.arange(degree + 1) + 1)
     whole, half = (np.asarray(harmonics.basis(jnp.asarray(scale * places), degree)) for scale in (1, 0.5))
     np.testing.assert_allclose(half, whole * 0.5**power, atol=1e-6)
 
 
-def test_the_values_of_turned_functions_are_those_at_directions_turned_back():
+def test_values_of_turned_functions_are_those_in_directions_turned_back():
     rng = np.random.default_rng(0)
     coefficients = rng.normal(size=(4, 2, COUNT)).astype(np.float32)
     rotations = Rotation.random(4, random_state=1)
@@ -71,7 +71,7 @@ def test_the_values_of_turned_functions_are_those_at_directions_turned_back():
         np.testing.assert_allclose(found[i], expected, atol=1e-3)
 
 
-def test_coefficients_turned_about_the_vertical_are_those_of_the_turned_function():
+def test_turned_coefficients_describe_the_turned_function():
     coefficients = np.random.default_rng(0).normal(size=(len(ANGLES), 2, COUNT)).astype(np.float32)
     places = directions(30)
     turned = np.asarray(harmonics.turn(unit(ANGLES), jnp.asarray(coefficients)))
@@ -81,7 +81,7 @@ def test_coefficients_turned_about_the_vertical_are_those_of_the_turned_function
         np.testing.assert_allclose(turned[i] @ expected_basis(places).T, expected[i], atol=1e-3)
 
 
-def test_turned_variances_are_those_of_sampled_coefficients():
+def test_turned_variance_equals_that_of_sampled_coefficients():
     rng = np.random.default_rng(0)
     variance = rng.uniform(0.1, 2, COUNT).astype(np.float32)
     samples = np.sqrt(variance) * rng.normal(size=(20_000, COUNT)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The state-space model: densities against SciPy, symmetries, masks, and which target each part of the loss sees."""
+"""The state-space model: densities against SciPy, symmetries, masks, and the targets of each part of the loss."""
 
 import dataclasses
 import functools
@@ -20,7 +20,7 @@ from sts_jax.statespace import harmonics, networks, objective, poses, state
 CONFIG = dataclasses.replace(
     TINY, inputs=("visual", "tactile", "pose"), outcomes=3, condition=3, input_size=32, drawn=0.5, drawn_first=0.5
 )
-NUMBER, QUARTER = 4, jnp.array([0.0, 1.0])  # samples of a batch; a turn by 90 degrees
+NUMBER, QUARTER = 4, jnp.array([0.0, 1.0])  # samples of a batch, and a rotation by 90 degrees
 
 
 class Batch(NamedTuple):
@@ -46,7 +46,7 @@ def batch(empty):
         for i in range(NUMBER):
             image[i, 5 + 2 * i : 20, 8 : 16 + 3 * i] = rng.uniform(0.1, 0.9, 3)
     small = {name: rng.uniform(0.2, 0.8, (NUMBER, 16, 16, 3)) for name in images}
-    for i, image in enumerate(small["visual"]):  # the last moment's objects cover a part of the view
+    for i, image in enumerate(small["visual"]):  # objects of the last moment cover a part of the view
         image[: 8 - i, :] = empty["visual"].reshape(16, 2, 16, 2, 3).mean((1, 3))[: 8 - i, :]
     small = {name: jnp.asarray(image, jnp.float32) for name, image in small.items()}
     code = random_states(rng, NUMBER)
@@ -60,7 +60,7 @@ def batch(empty):
 
 @pytest.fixture(scope="module")
 def complete(batch):
-    """The batch with first moments without an end and with trajectories without images."""
+    """The batch with additional first moments without an end and trajectories without images."""
     rng = np.random.default_rng(1)
     falls = {"state": random_states(rng, 5), "pose": random_codes(rng, 5), "outcome": jnp.array([2, 1, 0, 1, 2])}
     falls["condition"] = jnp.asarray(rng.normal(size=(5, 3)), jnp.float32)
@@ -76,7 +76,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def loss(model, empty):
-    """The loss, its parts and its gradient, compiled once with and once without views and falls."""
+    """The loss, its parts and its gradient. It is compiled once with and once without views and falls."""
     graphdef, params = model
 
     @jax.jit
@@ -102,7 +102,7 @@ def loss(model, empty):
 
 @pytest.fixture(scope="module")
 def sample(model, empty):
-    """Samples of a batch's first moments, compiled once; targets are no argument."""
+    """Samples for the first moments of a batch, compiled once. Targets are no argument."""
     run = jax.jit(functools.partial(statespace.sample, model[0], num=6, drawn=2))
     return lambda batch: run(model[1], jax.random.key(1), batch.inputs, batch.present, empty, batch.condition)
 
@@ -112,7 +112,7 @@ def same(a, b):
 
 
 def changed(params, path, change):
-    """Parameters with another kernel at a path."""
+    """Parameters with a changed kernel at a path."""
     module = nnx.to_pure_dict(params)
     at = functools.reduce(lambda node, name: node[name], path, module)
     at["kernel"] = change(at["kernel"])
@@ -121,10 +121,10 @@ def changed(params, path, change):
     return new
 
 
-def test_excess_is_that_of_the_metrics_and_zero_at_the_target():
+def test_excess_equals_the_metric_and_is_zero_at_the_target():
     rng = np.random.default_rng(0)
     image, target = (rng.uniform(0.01, 0.99, (2, 8, 8, 3)).astype(np.float32) for _ in range(2))
-    target[0, :4] = 1  # saturated: its own entropy is 0
+    target[0, :4] = 1  # saturated, with an entropy of 0
     found = objective.excess(jnp.asarray(image), jnp.asarray(target))
     np.testing.assert_allclose(found, metrics.image_error(image, target).excess, rtol=1e-4)
     np.testing.assert_allclose(objective.excess(jnp.asarray(image), jnp.asarray(image)), 0, atol=1e-4)
@@ -143,7 +143,7 @@ def test_reduced_images_are_means_of_blocks():
     np.testing.assert_allclose(objective.reduced(jnp.asarray(image), 3), expected, rtol=1e-5)
 
 
-def test_the_log_density_is_that_of_a_mixture_in_the_turned_frame():
+def test_log_density_is_that_of_a_mixture_in_the_turned_frame():
     rng = np.random.default_rng(0)
     angle = rng.uniform(-3, 3, 2)
     final = networks.FinalPose(
@@ -171,15 +171,15 @@ def test_the_log_density_is_that_of_a_mixture_in_the_turned_frame():
         np.testing.assert_allclose(chance[i], final.outcome[i, j])
 
 
-def test_an_expert_turns_with_the_picture(model, empty):
-    """In a quarter turn pixels map to pixels. The light does not turn: weights of the absolute angle are zero here."""
+def test_expert_turns_with_the_image(model, empty):
+    """A rotation by 90 degrees maps pixels to pixels. The weights of the absolute angle are zero here."""
     params = changed(model[1], ("encoders", "visual", "place"), lambda kernel: kernel.at[5:].set(0))
     place = (np.arange(32) - 15.5) / 32
     x, y = np.meshgrid(place - 0.1, place + 0.05)
     along, across = np.cos(-1.0) * x + np.sin(-1.0) * y, np.cos(-1.0) * y - np.sin(-1.0) * x
     inside = (np.abs(along) < 0.3) & (np.abs(across) < 0.12)
     change = inside[..., None] * np.random.default_rng(0).uniform(0.1, 0.5, (32, 32, 3))
-    both = jnp.asarray(np.stack([change, np.rot90(change, -1)]), jnp.float32)  # rows count downwards: columns to rows
+    both = jnp.asarray(np.stack([change, np.rot90(change, -1)]), jnp.float32)  # from columns to rows, downwards
     expert = jax.jit(lambda params, x: nnx.merge(model[0], params).encoders["visual"](x))(params, both)
     count = state.CODE + CONFIG.traits + CONFIG.own * harmonics.number(CONFIG.degree)
     for values, turn_state, turn_shown in (
@@ -196,8 +196,8 @@ def test_an_expert_turns_with_the_picture(model, empty):
     assert min(float(jnp.abs(x[1] - x[0]).max()) for x in (pose, shown, low)) > 0.01
 
 
-def test_the_final_pose_turns_with_state_and_condition(model):
-    """Exact where the weights of the absolute heading, place and condition are zero, for doubts that are level."""
+def test_final_pose_turns_with_state_and_condition(model):
+    """Exact if the variances are isotropic and the weights of absolute heading, place and condition are zero."""
     start = 2 * poses.CODE + 7 + 5 + 2 * CONFIG.support
     absolute = slice(start, start + 4 + 2)
     params = changed(model[1], ("transition", "first"), lambda kernel: kernel.at[absolute].set(0))
@@ -222,8 +222,8 @@ def test_the_final_pose_turns_with_state_and_condition(model):
     assert np.abs(alone[1] - before[1]).min() > 1
 
 
-def test_a_picture_is_where_the_camera_sees_the_object(model):
-    """The drawing of one object, displaced and turned: weights of the absolute place and heading are zero here."""
+def test_decoder_draws_an_object_at_its_projection(model):
+    """One object, displaced and turned. The weights of the absolute place and heading are zero here."""
     params = changed(model[1], ("decoder", "first"), lambda kernel: kernel.at[jnp.r_[0:2, 12:16]].set(0))
     params = changed(params, ("decoder", "last"), lambda kernel: 30 * kernel)
     code = random_codes(np.random.default_rng(0), 1)[0].at[:3].set(jnp.array([0, 0, 1.5]))
@@ -255,7 +255,7 @@ def test_a_picture_is_where_the_camera_sees_the_object(model):
         np.testing.assert_allclose(turned, np.rot90(here, -1), atol=1e-4)
 
 
-def test_over_all_levels_a_pixel_is_covered_as_often_as_its_probability_says():
+def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     chance = np.linspace(0.02, 0.98, 25).reshape(1, 5, 5, 1)
     logit = jnp.tile(jnp.asarray(np.log(chance / (1 - chance)), jnp.float32), (200, 1, 1, 1))
     layers = networks.Layers(logit, jnp.ones((200, 5, 5, 3)), jnp.zeros((200, 5, 5, 3)))
@@ -270,7 +270,7 @@ def test_over_all_levels_a_pixel_is_covered_as_often_as_its_probability_says():
     np.testing.assert_array_equal(sharp["tactile"], soft["tactile"])
 
 
-def test_a_true_state_is_believed(model, empty, batch):
+def test_belief_from_the_true_state_is_the_true_state(model, empty, batch):
     inputs = {"visual": batch.inputs["visual"], "state": batch.targets["state"]}
     counts = {name: jnp.ones(NUMBER, bool) for name in inputs}
 
@@ -283,7 +283,7 @@ def test_a_true_state_is_believed(model, empty, batch):
     np.testing.assert_allclose(belief.mean[:, state.CODE :], alone.mean[:, state.CODE :], atol=1e-5)
 
 
-def test_the_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, empty, batch):
+def test_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, empty, batch):
     found = jax.jit(lambda inputs: objective.experts(nnx.merge(*model), inputs, batch.present, empty))(batch.inputs)
     rows = slice(state.CODE, state.CODE + networks.TINT)
     for i, image in enumerate(np.asarray(batch.inputs["visual"], np.float64)):
@@ -296,7 +296,7 @@ def test_the_tint_is_the_mean_colour_of_the_object_in_the_visual_image(model, em
         np.testing.assert_array_equal(found[name].log_var[:, rows], networks.UNKNOWN_LOG_VAR)
 
 
-def test_an_untrained_decoder_draws_objects_in_their_tint(model, batch):
+def test_untrained_decoder_draws_objects_in_their_tint(model, batch):
     tint = jnp.array([[0.5, -1.0, 2.0]])
     look = jnp.zeros((1, CONFIG.look)).at[:, :3].set(tint)
     code = batch.targets["state"][:1]
@@ -304,7 +304,7 @@ def test_an_untrained_decoder_draws_objects_in_their_tint(model, batch):
     np.testing.assert_allclose(np.mean(layers.colour, axis=(1, 2)), 0.4 + 0.12 * tint, atol=0.1)
 
 
-def test_beliefs_are_products_of_the_single_ones(sample, batch):
+def test_belief_from_several_inputs_is_the_product_of_their_beliefs(sample, batch):
     def belief(*names):
         return sample(batch._replace(present={name: x & (name in names) for name, x in batch.present.items()})).belief
 
@@ -314,8 +314,8 @@ def test_beliefs_are_products_of_the_single_ones(sample, batch):
     fused = belief(*statespace.INPUTS)
     np.testing.assert_allclose(fused.log_var, -np.log(precision), atol=1e-3)
     np.testing.assert_allclose(fused.mean, mean, atol=1e-3)
-    np.testing.assert_allclose(parts[2].mean[:, :12], batch.inputs["pose"], atol=1e-3)  # a pose is exact,
-    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and without a shape or a look
+    np.testing.assert_allclose(parts[2].mean[:, :12], batch.inputs["pose"], atol=1e-3)  # the pose is known,
+    np.testing.assert_allclose(parts[2].log_var[:, 12:], 0, atol=1e-6)  # and shape and look are unknown
     same(belief(), jax.tree.map(jnp.zeros_like, fused))
 
 
@@ -330,7 +330,7 @@ def test_items_that_do_not_count_may_be_nan(sample, loss, batch):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((total, terms, gradient)))
 
 
-def test_an_item_does_not_depend_on_its_neighbours(sample, batch):
+def test_sample_does_not_depend_on_other_items_of_the_batch(sample, batch):
     before = sample(batch)
     after = sample(batch._replace(inputs={name: x.at[1:].set(x[1:][::-1]) for name, x in batch.inputs.items()}))
     for a, b in zip(before.belief, after.belief, strict=True):
@@ -344,13 +344,13 @@ def test_an_item_does_not_depend_on_its_neighbours(sample, batch):
     [
         ("visual", {"visual", "covered"}),
         ("tactile", {"tactile"}),
-        ("state", {"state", "doubt", "first", "covered", "pose", "visual", "tactile"}),  # the turn to the final pose
+        ("state", {"state", "doubt", "first", "covered", "pose", "visual", "tactile"}),  # also the final rotation
         ("pose", {"pose", "visual", "tactile", "covered"}),
         ("outcome", {"outcome", "pose"}),
     ],
 )
-def test_a_target_changes_its_own_parts_of_the_loss_alone(loss, batch, name, concerned):
-    """What is believed of a first moment, the look's divergence among it, never sees the end."""
+def test_target_changes_only_its_parts_of_the_loss(loss, batch, name, concerned):
+    """In particular, the end has no influence on the parts of the first moment and on the divergence of the look."""
     (_, before), _ = loss(batch)
     target = batch.targets[name]
     new = (target + 1) % 3 if name == "outcome" else target[::-1]
@@ -358,7 +358,7 @@ def test_a_target_changes_its_own_parts_of_the_loss_alone(loss, batch, name, con
     assert {part for part in before if before[part] != after[part]} == concerned
 
 
-def test_views_and_falls_change_their_own_parts_of_the_loss_alone(loss, batch, complete):
+def test_views_and_falls_change_only_their_parts_of_the_loss(loss, batch, complete):
     (_, without), _ = loss(batch)
     (_, before), gradient = loss(complete)
     for part in before:  # two compiled programs round differently
@@ -379,7 +379,7 @@ def test_views_and_falls_change_their_own_parts_of_the_loss_alone(loss, batch, c
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
-def test_views_weigh_as_much_as_other_first_moments(loss, complete):
+def test_views_have_the_weight_of_other_first_moments(loss, complete):
     """Each of three views and of the pictures that count has the same share of the squared error."""
 
     def squared(*counts):
@@ -394,8 +394,8 @@ def test_views_weigh_as_much_as_other_first_moments(loss, complete):
 
 
 @pytest.mark.parametrize("shown", ["object", "nothing"])
-def test_the_gradient_is_finite_where_nothing_is_known_of_the_rotation(loss, complete, model, empty, shown):
-    """The pose counts nowhere, and the encoders' states are zero: headings are those of vectors of length 0."""
+def test_gradient_is_finite_for_an_unknown_rotation(loss, complete, model, empty, shown):
+    """No pose counts, and the states of the encoders are zero, so that headings come from vectors of length 0."""
     params = model[1]
     for name in statespace.IMAGES:
         params = changed(params, ("encoders", name, "last"), jnp.zeros_like)
@@ -409,7 +409,7 @@ def test_the_gradient_is_finite_where_nothing_is_known_of_the_rotation(loss, com
     assert np.abs(moved).max() > 0
 
 
-def test_the_states_of_falls_are_exact_or_have_noise_of_the_size_that_their_beliefs_have():
+def test_beliefs_of_falls_are_exact_or_have_noise_of_their_variance():
     number = 400
     code = jnp.tile(random_states(np.random.default_rng(0), 8), (number // 8, 1))
     falls = {"state": code, "pose": code[:, :12], "outcome": jnp.zeros(number, jnp.int32)}
@@ -427,8 +427,8 @@ def test_the_states_of_falls_are_exact_or_have_noise_of_the_size_that_their_beli
     assert np.sqrt(noise).max() < 1.01
 
 
-def test_a_few_steps_lower_the_loss(loss, batch, model):
-    params = jax.tree.map(np.asarray, model[1])  # in NumPy there is nothing to compile
+def test_gradient_descent_lowers_the_loss(loss, batch, model):
+    params = jax.tree.map(np.asarray, model[1])  # NumPy needs no compilation
     (first, _), gradient = loss(batch)
     for _ in range(5):
         gradient = jax.tree.map(np.asarray, gradient)
@@ -438,7 +438,7 @@ def test_a_few_steps_lower_the_loss(loss, batch, model):
     assert last < first - 10
 
 
-def test_samples_are_poses_and_pictures(sample, batch):
+def test_samples_are_rotations_and_images_in_range(sample, batch):
     found = sample(batch)
     assert found.pose.shape == (6, NUMBER, 12)
     assert {name: x.shape for name, x in found.images.items()} == dict.fromkeys(
@@ -453,7 +453,7 @@ def test_samples_are_poses_and_pictures(sample, batch):
     assert np.std(found.pose, axis=0).min() > 0
 
 
-def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
+def test_rigid_finds_the_nearest_rotation():
     code = random_codes(np.random.default_rng(0), 5)
     noisy = code.at[:, 3:].multiply(1.7) + 1e-3
     u, _, vt = np.linalg.svd(np.asarray(noisy[:, 3:]).reshape(-1, 3, 3).astype(np.float64))
@@ -469,12 +469,12 @@ def test_the_nearest_rotation_of_a_scaled_and_perturbed_one():
         ({"inputs": ()}, "at least one of"),
         ({"window": 12}, "window is 12 pixels, but it must be a multiple of 8"),
         ({"input_size": 24}, "input_size is 24 pixels, but it must be a multiple of 16"),
-        ({"encoder": (4, 4)}, "encoder has 2 and decoder 3 widths, both need 3"),
-        ({"condition": 1}, "condition is 1 numbers"),
+        ({"encoder": (4, 4)}, "encoder and decoder need 3 widths each, got 2 and 3"),
+        ({"condition": 1}, "condition is 1 numbers, but it must be 0 or at least 2"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
     ],
 )
-def test_a_wrong_configuration_is_named(change, message):
+def test_config_rejects_values_out_of_range(change, message):
     values = CONFIG.to_json() | change
     with pytest.raises(ValueError, match=message):
         statespace.Config.from_json(values)

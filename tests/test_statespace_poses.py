@@ -1,4 +1,4 @@
-"""Pose codes turned about the vertical: against quaternions, a dense covariance and real rotations."""
+"""Pose codes turned about the vertical, compared with quaternions and a dense covariance."""
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ def unit(angle):
 
 
 def turned_by_quaternion(angle, pose):
-    """Each pose after the sensor's content was turned about z."""
+    """Each pose after a rotation of the scene about z."""
     zero = np.zeros_like(angle)
     quat = np.stack([np.cos(angle / 2), zero, zero, np.sin(angle / 2)], axis=1)
     position = np.einsum("nij,nj->ni", np.asarray(geometry.quat_to_matrix(jnp.asarray(quat))), pose[:, :3])
@@ -36,7 +36,7 @@ def turned_by_quaternion(angle, pose):
 ANGLES = np.linspace(-3, 3, 7, dtype=np.float32)
 
 
-def test_a_turned_code_is_the_code_of_the_turned_pose():
+def test_turned_code_is_the_code_of_the_turned_pose():
     pose = random_poses(7)
     expected = encode(turned_by_quaternion(ANGLES, pose))
     found = poses.turn_code(unit(ANGLES), encode(pose))
@@ -44,7 +44,7 @@ def test_a_turned_code_is_the_code_of_the_turned_pose():
     np.testing.assert_allclose(poses.turn_code_back(unit(ANGLES), found), encode(pose), atol=1e-5)
 
 
-def test_the_heading_turns_with_the_object():
+def test_heading_turns_with_the_object():
     pose = random_poses(200)
     code = encode(pose)
     angle = np.random.default_rng(1).uniform(-3, 3, 200).astype(np.float32)
@@ -61,18 +61,18 @@ def test_the_heading_turns_with_the_object():
         ((np.pi / 4, 0, 0), (1, 0)),  # y and z steep, x level
     ],
 )
-def test_the_heading_is_that_of_the_first_level_axis(rotation, expected):
+def test_heading_is_that_of_the_first_level_axis(rotation, expected):
     matrix = geometry.quat_to_matrix(geometry.quat_from_rotvec(jnp.array(rotation)))
     code = jnp.concatenate([jnp.zeros(3), matrix.reshape(9)])
     np.testing.assert_allclose(poses.heading(code), expected, atol=1e-6)
 
 
-def test_a_belief_without_rotation_has_the_heading_of_the_sensor_and_no_gradient():
+def test_unknown_rotation_has_the_heading_of_the_sensor_and_no_gradient():
     np.testing.assert_array_equal(poses.heading(jnp.zeros(12)), [1, 0])
     np.testing.assert_array_equal(jax.grad(lambda code: poses.heading(code).sum())(encode(random_poses(1))[0]), 0)
 
 
-def test_turned_variances_are_the_diagonal_of_the_turned_covariance():
+def test_turned_variance_is_the_diagonal_of_the_turned_covariance():
     rng = np.random.default_rng(0)
     variance = rng.uniform(0.1, 2, 12).astype(np.float32)
     angle = unit(0.7)

@@ -1,4 +1,4 @@
-"""State codes: against the support functions of rotated vertices, rotated centres of mass and a dense covariance."""
+"""State codes, compared with rotated vertices, rotated centres of mass and a dense covariance."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ def unit(angle):
 
 
 def encoded(rotations, points, mass=0.1, com=(0.0, 0.0, 0.0), position=(0.0, 0.0, 0.0)):
-    """The state codes of one hull, of its vertices `points` (m), in several rotations."""
+    """The state codes of a hull with the vertices `points` (m) in several rotations."""
     number = len(rotations)
     code = np.concatenate([np.tile(position, (number, 1)), rotations.as_matrix().reshape(number, 9)], axis=1)
     values = np.max(points @ DIRECTIONS.T, axis=0)
@@ -29,7 +29,7 @@ def encoded(rotations, points, mass=0.1, com=(0.0, 0.0, 0.0), position=(0.0, 0.0
 
 
 def fitted(points):
-    """Harmonics of the support function of some vertices, fitted in float64."""
+    """Harmonics of the support function of vertices, fitted in float64."""
     values = np.max(points @ DIRECTIONS.T, axis=0) / state.LENGTH - state.MEAN
     basis = np.asarray(harmonics.basis(jnp.asarray(DIRECTIONS, jnp.float32), state.DEGREE), np.float64)
     return np.linalg.lstsq(basis, values, rcond=None)[0]
@@ -40,7 +40,7 @@ def box(*size):
     return corners * size
 
 
-def test_a_code_is_split_and_joined():
+def test_join_inverts_split():
     code = random_states(np.random.default_rng(0), NUMBER)
     parts = state.split(code)
     assert code.shape == (NUMBER, state.CODE)
@@ -49,7 +49,7 @@ def test_a_code_is_split_and_joined():
     np.testing.assert_array_equal(parts.pose, code[:, :12])
 
 
-def test_a_ball_of_the_mean_size_and_of_the_mass_unit_is_zero():
+def test_ball_of_mean_size_and_unit_mass_has_the_code_zero():
     rotations = Rotation.random(NUMBER, random_state=0)
     ball = DIRECTIONS * state.MEAN * state.LENGTH
     parts = state.split(encoded(rotations, ball, mass=state.MASS))
@@ -61,11 +61,11 @@ def test_a_ball_of_the_mean_size_and_of_the_mass_unit_is_zero():
         np.testing.assert_allclose(part, np.eye(state.SUPPORT)[:1] * 0.1 * state.MEAN * np.ones((NUMBER, 1)), atol=1e-5)
 
 
-def test_the_shown_shape_is_that_of_the_rotated_vertices():
+def test_shown_shape_is_that_of_the_rotated_vertices():
     rng = np.random.default_rng(0)
     rotations = Rotation.random(NUMBER, random_state=2)
     points = rng.normal(size=(200, 3))
-    # A smooth hull: the harmonics of a higher degree, which a fit mixes into the lower ones, are small.
+    # The hull is smooth, because a fit mixes harmonics of higher degrees into the lower ones.
     points *= np.array([0.035, 0.025, 0.02]) / np.linalg.norm(points, axis=1)[:, None]
     parts = state.split(encoded(rotations, points))
     np.testing.assert_allclose(parts.own, np.tile(fitted(points), (NUMBER, 1)), atol=1e-4)
@@ -75,7 +75,7 @@ def test_the_shown_shape_is_that_of_the_rotated_vertices():
         assert np.abs(parts.own[i] - expected).max() > 0.1
 
 
-def test_an_object_reaches_down_to_its_lowest_vertex():
+def test_reach_is_the_depth_of_the_lowest_vertex():
     points = np.random.default_rng(0).normal(size=(2000, 3))
     points *= np.array([0.035, 0.025, 0.02]) / np.linalg.norm(points, axis=1)[:, None]
     present, since = (Rotation.random(NUMBER, random_state=seed) for seed in (5, 6))
@@ -85,7 +85,7 @@ def test_an_object_reaches_down_to_its_lowest_vertex():
     assert np.ptp(expected) > 1e-3
 
 
-def test_the_shown_centre_of_mass_is_the_rotated_one():
+def test_shown_centre_of_mass_is_the_rotated_one():
     rotations = Rotation.random(NUMBER, random_state=3)
     com = np.array([0.004, -0.002, 0.007])
     parts = state.split(encoded(rotations, box(0.04, 0.03, 0.02), com=com))
@@ -93,7 +93,7 @@ def test_the_shown_centre_of_mass_is_the_rotated_one():
     np.testing.assert_allclose(parts.low, rotations.apply(com) / state.LENGTH, atol=1e-5)
 
 
-def test_a_turned_state_is_the_state_of_the_turned_pose():
+def test_turned_state_is_the_state_of_the_turned_pose():
     rotations = Rotation.random(NUMBER, random_state=4)
     rng = np.random.default_rng(0)
     points, com = 0.02 * rng.normal(size=(30, 3)), np.array([0.004, -0.002, 0.007])
@@ -108,7 +108,7 @@ def test_a_turned_state_is_the_state_of_the_turned_pose():
         np.testing.assert_allclose(found, wanted, atol=2e-4)
 
 
-def test_turned_variances_are_the_diagonal_of_the_turned_covariance():
+def test_turned_variance_is_the_diagonal_of_the_turned_covariance():
     variance = np.random.default_rng(0).uniform(0.1, 2, state.CODE).astype(np.float32)
     angle = unit([0.7])
     # Turning is linear.
@@ -119,17 +119,17 @@ def test_turned_variances_are_the_diagonal_of_the_turned_covariance():
 
 
 @pytest.mark.parametrize("certainty", [0.0, 0.4])
-def test_the_heading_of_an_uncertain_rotation_is_the_long_axis_of_the_shown_shape(certainty):
+def test_heading_of_an_uncertain_rotation_is_the_long_axis_of_the_shown_shape(certainty):
     code = encoded(Rotation.from_euler("z", ANGLES[:, None]), box(0.08, 0.02, 0.03))
     blurred = code.at[:, 3:12].multiply(certainty)
     found = state.heading(state.split(blurred))
     line = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
-    np.testing.assert_allclose(np.abs(np.sum(found * line, axis=1)), 1, atol=1e-3)  # it has no sign
+    np.testing.assert_allclose(np.abs(np.sum(found * line, axis=1)), 1, atol=1e-3)  # up to its sign
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-5)
 
 
-def test_the_heading_of_a_known_rotation_is_that_of_the_mesh():
-    """The shape is long along another axis, and is not asked."""
+def test_heading_of_a_known_rotation_is_that_of_the_mesh():
+    """The long axis of the shape differs and has no influence."""
     code = encoded(Rotation.from_euler("z", ANGLES[:, None]), box(0.02, 0.08, 0.03))
     parts = state.split(code)
     np.testing.assert_allclose(state.heading(parts), unit(ANGLES), atol=1e-5)
@@ -137,7 +137,7 @@ def test_the_heading_of_a_known_rotation_is_that_of_the_mesh():
     np.testing.assert_array_equal(state.heading(wild), poses.heading(wild.pose))
 
 
-def test_nothing_known_has_some_heading_and_no_gradient():
+def test_unknown_state_has_a_unit_heading_and_no_gradient():
     def total(code):
         return state.heading(state.split(code)).sum()
 

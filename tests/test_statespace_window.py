@@ -1,4 +1,4 @@
-"""Windows and interpolation against drawn rectangles, SciPy and turned images."""
+"""Windows and interpolation, compared with drawn rectangles, SciPy, turned images and the renderer's mask."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ SIZE = 64
 
 
 def rectangle(centre, angle, extent, size=SIZE):
-    """An image `(size, size, 3)` of a turned rectangle. Lengths are shares of the side, the angle is in radians."""
+    """An image `(size, size, 3)` of a turned rectangle. Lengths are shares of the side, and the angle is in radians."""
     place = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(place - centre[0], place - centre[1])
     along, across = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x
@@ -23,16 +23,16 @@ def rectangle(centre, angle, extent, size=SIZE):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.5, -1.2, np.pi / 2 - 0.1])
-def test_a_window_follows_a_rectangle(angle):
+def test_window_follows_a_rectangle(angle):
     centre, extent = (0.45, 0.55), (0.5, 0.2)
     found = window.locate(jnp.asarray(rectangle(centre, angle, extent)[None]))
     np.testing.assert_allclose(found.centre[0], centre, atol=0.01)
     line = np.array([np.cos(angle), np.sin(angle)])
-    assert abs(np.dot(found.angle[0], line)) > np.cos(0.03)  # in either direction along the line
+    assert abs(np.dot(found.angle[0], line)) > np.cos(0.03)  # up to its sign
     np.testing.assert_allclose(found.side[0], window.MARGIN * extent[0], atol=2.5 / SIZE)
 
 
-def test_the_sign_of_a_change_and_its_channel_do_not_matter():
+def test_window_does_not_depend_on_the_sign_and_the_channel_of_a_change():
     change = rectangle((0.4, 0.5), 0.3, (0.4, 0.2))
     one = jnp.stack([change, -change, change * np.array([0, 0, 1], np.float32)])
     found = window.locate(one)
@@ -40,7 +40,7 @@ def test_the_sign_of_a_change_and_its_channel_do_not_matter():
         np.testing.assert_array_equal(leaf, np.broadcast_to(leaf[:1], leaf.shape))
 
 
-def test_the_window_of_an_unchanged_image_is_the_whole_image():
+def test_window_of_an_unchanged_image_is_the_whole_image():
     faint = jnp.full((1, SIZE, SIZE, 3), 0.9 * window.THRESHOLD, jnp.float32)
     found = window.locate(faint)
     np.testing.assert_array_equal(found.centre, [[0.5, 0.5]])
@@ -49,7 +49,7 @@ def test_the_window_of_an_unchanged_image_is_the_whole_image():
     np.testing.assert_allclose(window.cut(faint, found, SIZE // 2), 0.9 * window.THRESHOLD, rtol=1e-5)
 
 
-def test_a_speck_gets_the_smallest_window():
+def test_single_pixel_gets_the_smallest_window():
     change = np.zeros((1, SIZE, SIZE, 3), np.float32)
     change[0, 10, 20] = 1
     found = window.locate(jnp.asarray(change))
@@ -57,10 +57,10 @@ def test_a_speck_gets_the_smallest_window():
     np.testing.assert_allclose(found.side, window.SMALLEST)
 
 
-def test_an_image_and_the_turned_image_have_the_same_cut():
+def test_image_and_turned_image_have_the_same_cut():
     change = rectangle((0.4, 0.6), -0.9, (0.5, 0.2))
-    change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # breaks all symmetries
-    turned = np.rot90(change, -1).copy()  # turns columns into rows, by +90 degrees because rows count downwards
+    change *= np.random.default_rng(0).uniform(0.2, 1, change.shape).astype(np.float32)  # no symmetry
+    turned = np.rot90(change, -1).copy()  # from columns to rows, by +90 degrees because rows count downwards
     both = jnp.stack([change, turned])
     found = window.locate(both)
     np.testing.assert_allclose(found.angle[1], [-found.angle[0, 1], found.angle[0, 0]], atol=1e-4)
@@ -69,7 +69,7 @@ def test_an_image_and_the_turned_image_have_the_same_cut():
     assert np.std(cut[0]) > 0.1
 
 
-def test_a_cut_of_a_gradient_is_the_gradient_along_the_window():
+def test_cut_of_a_gradient_is_the_gradient_along_the_window():
     place = (np.arange(SIZE) + 0.5) / SIZE
     column, row = np.meshgrid(place, place)
     image = (0.2 * column + 0.5 * row)[None, :, :, None].astype(np.float32)
@@ -80,7 +80,7 @@ def test_a_cut_of_a_gradient_is_the_gradient_along_the_window():
     np.testing.assert_allclose(window.cut(jnp.asarray(image), square, 8)[0, ..., 0], expected, atol=1e-5)
 
 
-def test_samples_equal_scipys_and_are_zero_outside():
+def test_sample_equals_scipy_and_is_zero_outside():
     rng = np.random.default_rng(0)
     images = rng.random((2, 8, 8, 3), np.float32)
     places = rng.uniform(-3, 10, (2, 200, 2)).astype(np.float32)
@@ -96,8 +96,8 @@ def test_samples_equal_scipys_and_are_zero_outside():
 
 
 @pytest.mark.parametrize("category", ["camera", "scissors"])
-def test_an_image_shows_the_object_and_not_its_shadow(category):
-    """The truth is the segmentation of an object at rest."""
+def test_shows_includes_the_object_and_excludes_its_shadow(category):
+    """For an object at rest, compared with the renderer's segmentation."""
     sensor, body = sts.Sensor(), objects.make(jax.random.key(0), category)
     pose, wrench = physics.place(body, sensor)
     resting = sts.sense(sensor, body, pose, wrench, resolution=(SIZE, SIZE))
@@ -108,5 +108,5 @@ def test_an_image_shows_the_object_and_not_its_shadow(category):
     assert (mask & ~shown).sum() < 0.05 * mask.sum()
     faintly = np.abs(resting.visual - away.visual).max(-1) > 4 / 255
     shadow = (faintly & ~mask).sum()
-    assert shadow > 0.5 * mask.sum()  # a smaller threshold would count it
+    assert shadow > 0.5 * mask.sum()  # a smaller threshold would include it
     assert (shown & ~mask).sum() < 0.4 * shadow

@@ -1,8 +1,8 @@
 """Functions on the sphere as real spherical harmonics, which turn with an object.
 
-A function is a vector of coefficients, of degree 0, 1, 2, ..., each degree n with the orders 0, 1, -1, ..., n, -n.
-The function turned by a rotation R has, in direction d, the value that the function has in direction R' d. The
-harmonics are homogeneous polynomials of the direction, and their mean square over the sphere is 1.
+A function is a vector of coefficients of the degrees 0, 1, 2, ..., where degree n has the orders 0, 1, -1, ..., n, -n.
+A function f turned by a rotation R is d -> f(R' d). The harmonics are homogeneous polynomials of the direction d, and
+their mean square over the sphere is 1.
 """
 
 import math
@@ -13,16 +13,16 @@ from jaxtyping import Array, Float
 
 
 def number(degree: int) -> int:
-    """Coefficients of a function up to a degree."""
+    """Number of coefficients of a function up to a degree."""
     return (degree + 1) ** 2
 
 
 def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
-    """The harmonics up to a degree at some directions.
+    """Values of all harmonics up to a degree.
 
     Args:
-        direction: unit vectors. For shorter ones, harmonics of degree n shrink with the length to the power n.
-        degree: the largest.
+        direction: Unit vectors. For shorter vectors, harmonics of degree n shrink with the length to the power n.
+        degree: The largest degree.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     square = x**2 + y**2 + z**2
@@ -46,25 +46,25 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
 def values(
     coefficients: Float[Array, "n c k"], rotation: Float[Array, "n 3 3"], directions: Float[np.ndarray, "j 3"]
 ) -> Float[Array, "n c j"]:
-    """Turned functions at fixed directions.
+    """Values of turned functions in fixed directions.
 
     Args:
         coefficients: c functions of each of n objects.
-        rotation: of each object. A mean of rotations, which is shorter than one, gives about the mean of the values.
-        directions: unit vectors.
+        rotation: The rotation of each object. A mean of rotations gives approximately the mean of the values.
+        directions: Unit vectors.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Functions turned about the vertical by an angle that is given as cosine and sine."""
+    """Coefficients of functions turned about the vertical. `angle` is the cosine and the sine."""
     cosine, sine, partner = _about_vertical(angle, coefficients.shape[-1])
     return cosine * coefficients + sine * coefficients[..., partner]
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """The variances of turned coefficients, where those of the coefficients are independent."""
+    """Variances of turned coefficients, for independent coefficients with the given variances."""
     cosine, sine, partner = _about_vertical(angle, variance.shape[-1])
     return cosine**2 * variance + sine**2 * variance[..., partner]
 
@@ -74,7 +74,7 @@ def _orders(degree: int) -> list[tuple[int, int]]:
 
 
 def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Array, np.ndarray]:
-    """Factors of a coefficient and of the one of the opposite order, (n, 1, k), and the latter's index."""
+    """Factors (n, 1, k) of each coefficient and of the one of opposite order, its partner, and the partner's index."""
     orders = _orders(math.isqrt(count) - 1)
     partner = np.array([orders.index((n, -m)) for n, m in orders])
     powers = [jnp.stack([jnp.ones_like(angle[:, 0]), jnp.zeros_like(angle[:, 0])], axis=-1)]
@@ -84,6 +84,6 @@ def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Arra
             jnp.stack([angle[:, 0] * cos - angle[:, 1] * sin, angle[:, 0] * sin + angle[:, 1] * cos], axis=-1)
         )
     cosine = jnp.stack([powers[abs(m)][:, 0] for _, m in orders], axis=-1)
-    # The partner of a cosine is a sine, which enters with a minus.
+    # The partner of a cosine is a sine, which has a negative factor.
     sine = jnp.stack([powers[abs(m)][:, 1] * (-1 if m > 0 else 1 if m < 0 else 0) for _, m in orders], axis=-1)
     return cosine[:, None], sine[:, None], partner

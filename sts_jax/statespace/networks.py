@@ -1,9 +1,9 @@
 """Encoders, transition and decoder as Flax NNX modules.
 
-The latent is the present state: a state code with the pose, the shape and the mass (`statespace.state`), and a look,
-which is everything else that is seen or felt of an object. An encoder per image gives a Gaussian over both. The
-transition maps a belief about the present state to a density of the final pose and of the rotation to it. The decoder
-draws both streams of an object in a pose, given this rotation and the present state.
+The latent is the present state. It consists of a state code with the pose, the shape and the mass (`statespace.state`),
+and of a look, which describes all other visible or tactile properties of an object. An encoder for each image returns a
+Gaussian over both. The transition maps a belief about the present state to a density of the final pose and of the
+rotation to it. The decoder draws both streams of an object in a pose, given this rotation and the present state.
 
 Convolutions have stride 1, for which XLA's CPU backend is fast. Pixels are folded into channels to make an image
 smaller, and channels are unfolded into pixels to make it larger.
@@ -23,59 +23,59 @@ from sts_jax.statespace import harmonics, poses, state, window
 
 IMAGES = ("visual", "tactile")
 INPUTS = (*IMAGES, "pose")
-UNKNOWN_LOG_VAR = 30.0  # of numbers that an input does not determine: their precision is about 0
-_LOG_VAR_LIMIT = 8.0  # of an encoder
+UNKNOWN_LOG_VAR = 30.0  # of numbers that an input does not determine, whose precision is almost 0
+_LOG_VAR_LIMIT = 8.0  # largest absolute value for an encoder
 _FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
-_CONTRAST = 10.0  # of the outline of a sample, against that of the mean
-_OUTSIDE = 8.0  # by how much less the outside of the canvas is covered, in logits
-# The tint: mean change of the pixels that show the object, less _MIDDLE, over _WIDTH
-TINT = 3  # numbers of it
+_CONTRAST = 10.0  # factor of the outline's logits in a sample
+_OUTSIDE = 8.0  # decrease of the logit of being covered outside of the canvas
+# The tint is the mean change of the pixels that show the object, less _MIDDLE, divided by _WIDTH.
+TINT = 3  # numbers of the tint
 _MIDDLE, _WIDTH = -0.3, 0.12
 _TINT_LOG_VAR = -6.0  # of the tint in an image
-_BRIGHT = 0.7  # of the empty sensor, about
+_BRIGHT = 0.7  # approximate brightness of the empty sensor
 _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The size, view and loss weights of a model, as plain values, so that `dataclasses.asdict` of it is JSON.
+    """The size, view and loss weights of a model. All values are plain, so that `dataclasses.asdict` returns JSON.
 
     Raises:
-        ValueError: a field is out of range, or two fields contradict each other.
+        ValueError: A field is out of range, or two fields contradict each other.
     """
 
     inputs: tuple[str, ...] = ("visual", "pose")  # some of INPUTS
-    outcomes: int = 2  # of the scenario
+    outcomes: int = 2  # number of outcomes of the scenario
     condition: int = 0  # numbers in the scenario's condition
-    input_size: int = 128  # pixels, side of the images that are given
-    image_size: int = 64  # pixels, side of the images that are predicted
+    input_size: int = 128  # pixels, side of the input images
+    image_size: int = 64  # pixels, side of the predicted images
     camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
-    view: float = 0.15  # m, side of the square on the gel's face that an image shows
+    view: float = 0.15  # m, side of the visible square of the gel's face
     position_scale: float = 0.05  # m, see `training.Preprocessing`
     traits: int = 32  # numbers of the look that do not turn with the object, the tint first
-    own: int = 4  # functions on the sphere of the look, in the object's frame
-    shown: int = 4  # functions on the sphere of the look, as the object is turned at present
-    degree: int = 3  # of their harmonics
-    directions: int = 24  # in which their values are features
+    own: int = 4  # functions on the sphere in the look, in the object's frame
+    shown: int = 4  # functions on the sphere in the look, in the sensor's frame at present
+    degree: int = 3  # of the harmonics of these functions
+    directions: int = 24  # directions in which the values of these functions are features
     support: int = 64  # directions in which the values of the support function are features
-    components: int = 6  # Gaussians of the final pose, of each outcome
+    components: int = 6  # Gaussians of the final pose for each outcome
     window: int = 32  # pixels, side of the magnified part of an image
     encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window
     decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas
     hidden: int = 384  # width of the encoders' fully connected layers
     transition: int = 512  # width of the transition's layers
     canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
-    canvas_side: float = 0.165  # m, its side on the gel's face
+    canvas_side: float = 0.165  # m, side of this picture on the gel's face
     tactile_weight: float = 4.0  # of the tactile image's nats in the loss
-    state_weight: float = 16.0  # of the squared error of the first pose, as each image's expert has it
+    state_weight: float = 16.0  # of the squared error of the first state, for the expert of each image
     pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
     outcome_weight: float = 8.0  # of the outcome's nats
     covered_weight: float = 0.15  # of the nats of the object's outline
     first_weight: float = 0.5  # of the nats of the first moment's images
-    look_weight: float = 0.1  # of the look's divergence: below 1, samples are sharper
-    drawn: float = 0.4375  # share of a batch whose last moment is drawn (all train the other parts)
-    drawn_first: float = 0.125  # share whose first moment is drawn
-    vectors: int = 1  # vectors (x, y) of the pad's plane with which the condition begins, if there is one
+    look_weight: float = 0.1  # of the divergence of the look. Samples are sharper for weights below 1
+    drawn: float = 0.4375  # share of a batch whose last moment is drawn (the whole batch trains the other parts)
+    drawn_first: float = 0.125  # share of a batch whose first moment is drawn
+    vectors: int = 1  # vectors (x, y) in the plane of the pad at the begin of the condition, if there is one
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
@@ -116,17 +116,17 @@ class Config:
 
 
 class FinalPose(NamedTuple):
-    """The density of the final pose: a mixture of Gaussians over its code and its turn, in the frame of a heading."""
+    """The density of the final pose: a mixture of Gaussians over code and rotation, in the frame of a heading."""
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
     weight: Float[Array, "n outcomes k"]  # log weight of each component of an outcome
-    mean: Float[Array, "n outcomes k 21"]  # code of the pose, and the rotation from the present to the final one
+    mean: Float[Array, "n outcomes k 21"]  # code of the pose, and the rotation from the present to the final pose
     log_var: Float[Array, "n outcomes k 21"]
     heading: Float[Array, "n 2"]  # of the frame, see `poses.heading`
 
 
 class Layers(NamedTuple):
-    """What is drawn of an object in the view, over the images of the empty sensor."""
+    """An object drawn in the view, to be composed with the images of the empty sensor."""
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
     colour: Float[Array, "n size size 3"]  # of the object, [0, 1]
@@ -134,7 +134,7 @@ class Layers(NamedTuple):
 
 
 class _Residual(nnx.Module):
-    """`x + layer(swish(norm(x)))`, the layer a 3x3 convolution."""
+    """`x + layer(swish(norm(x)))` with a 3x3 convolution."""
 
     def __init__(self, channels: int, rngs: nnx.Rngs) -> None:
         self.norm = nnx.LayerNorm(channels, rngs=rngs)
@@ -157,7 +157,7 @@ class _ResidualDense(nnx.Module):
 
 
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
-    """Traits, functions in the object's frame and functions of its present turn: (n, traits), (n, c, k), (n, c, k)."""
+    """Traits (n, traits), functions in the object's frame (n, c, k) and in the sensor's frame (n, c, k) of looks."""
     count = harmonics.number(config.degree)
     traits, own, shown = jnp.split(look, [config.traits, config.traits + config.own * count], axis=-1)
     return traits, own.reshape(len(look), -1, count), shown.reshape(len(look), -1, count)
@@ -166,7 +166,7 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
 def _shape(
     config: Config, known: state.State, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
 ) -> list[Array]:
-    """Values of the support function, as known in the object's frame and as shown."""
+    """Values of both support functions of a state, `own` and `shown`."""
     directions = objects.lattice(config.support)
     return [
         harmonics.values(known.own[:, None], own_turn, directions),
@@ -177,7 +177,7 @@ def _shape(
 def _appearance(
     config: Config, look: Array, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
 ) -> list[Array]:
-    """Traits of the look and the values of its functions, those of the object's frame and those shown."""
+    """Traits of the look, and values of its functions in the object's frame and in the sensor's frame."""
     traits, own, shown = parts(config, look)
     directions = objects.lattice(config.directions)
     return [traits, harmonics.values(own, own_turn, directions), harmonics.values(shown, shown_turn, directions)]
@@ -200,9 +200,9 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 
 
 class Encoder(nnx.Module):
-    """One image's expert: a Gaussian over state code and look.
+    """The expert of one stream: a Gaussian over state code and look for each image.
 
-    The tint is computed from a visual image. A tactile image does not show it.
+    The tint is computed from a visual image and unknown from a tactile one.
     """
 
     def __init__(self, config: Config, name: str, rngs: nnx.Rngs) -> None:
@@ -225,7 +225,7 @@ class Encoder(nnx.Module):
         """The expert of each image.
 
         Args:
-            change: images less that of the empty sensor.
+            change: Images less that of the empty sensor.
 
         Returns:
             A Gaussian over state code and look, `(n, code + look)`.
@@ -239,7 +239,7 @@ class Encoder(nnx.Module):
         for layer in self.quarters:
             x = layer(x)
         x = jax.nn.swish(self.eighth(self.to_eighth(_fold(x))))
-        # Everything is estimated in the frame of the silhouette, and turned into the sensor's at the end.
+        # All numbers are estimated in the frame of the silhouette, and turned into the sensor's frame at the end.
         centre = poses.turn_back(place.angle, (place.centre - 0.5) * config.view / config.position_scale)
         side = place.side[:, None]
         features = jnp.concatenate([centre, 0.25 * centre / side, jnp.log(side), place.angle], axis=-1)
@@ -247,7 +247,7 @@ class Encoder(nnx.Module):
         x = self.last(jax.nn.swish(self.norm(self.residual(self.dense(x)))))
         mean, log_var = jnp.split(x, 2, axis=-1)
         log_var = _LOG_VAR_LIMIT * jnp.tanh(log_var / _LOG_VAR_LIMIT)
-        mean = mean.at[:, :2].add(centre)  # an object is where it is seen
+        mean = mean.at[:, :2].add(centre)  # an object is near its silhouette
         variance = jnp.exp(log_var)
         traits, own, shown = parts(config, mean[:, state.CODE :])
         blur = parts(config, variance[:, state.CODE :])
@@ -271,9 +271,9 @@ class Encoder(nnx.Module):
 
 
 class Transition(nnx.Module):
-    """From a belief about the present state, and the condition, to the density of the final pose.
+    """Maps a belief about the present state and the condition to the density of the final pose.
 
-    It does not see the look, which would let it recognise training objects (see docs/trials.md).
+    The look is no input, because the transition would recognise training objects by it (see docs/trials.md).
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -287,11 +287,11 @@ class Transition(nnx.Module):
         self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
-        """The density, from the means and variances of the fused posterior.
+        """The density of the final pose.
 
         Args:
-            belief: over the state code, `(n, code)`.
-            condition: each number divided by its usual size, or None if the model has none.
+            belief: Fused posterior over the state code, `(n, code)`.
+            condition: Each number divided by its typical size, or None if the scenario has no condition.
 
         Returns:
             The density in the frame of the heading of the belief's mean.
@@ -333,11 +333,11 @@ class Transition(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Draws an object of a state and a look in a pose.
+    """Draws an object with a given state and look in a pose.
 
-    A picture of the object is drawn on a canvas that follows its heading. It is placed in the view below the object's
-    origin, at the height of the object's lowest point, which the camera sees from below. `compose` puts it over the
-    images of the empty sensor.
+    A picture of the object is drawn on a canvas that follows its heading. The canvas is placed in the view under the
+    object's origin, at the height of the object's lowest point, because the camera sees the object from below.
+    `compose` adds the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -362,10 +362,10 @@ class Decoder(nnx.Module):
         """Draw each object.
 
         Args:
-            pose: pose codes.
-            turn: rotations since the present moment.
-            known: present state codes, of which the shapes are drawn.
-            look: present looks.
+            pose: Pose codes.
+            turn: Rotations since the present moment.
+            known: Present state codes, which provide the shapes.
+            look: Present looks.
         """
         config = self.config
         heading = poses.heading(pose)
@@ -383,7 +383,7 @@ class Decoder(nnx.Module):
         depth = config.camera_distance + jnp.maximum(pose[:, 2] * config.position_scale - state.reach(shape, turn), 0)
         x = window.sample(x, _on_canvas(config, pose, heading, depth))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
-        # At first, everything has the colour of the present picture, and hardly anything is covered.
+        # Before training, an object has its present colour, and hardly any pixel is covered.
         tint = jnp.clip(_BRIGHT + _MIDDLE + _WIDTH * look[:, None, None, :TINT], 0.03, 0.97)
         colour = jax.nn.sigmoid(x[..., :3] + jnp.log(tint / (1 - tint)))
         return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=colour, touch=x[..., 4:7])
@@ -397,11 +397,11 @@ def compose(
     """Both images of each object.
 
     Args:
-        layers: from the decoder.
-        empty: both images of the untouched sensor, of the same size.
-        level: the probability of being covered, from 0 to 1, above which a pixel of a sample is covered. Over uniform
-            levels, each pixel is covered with its probability, and every outline is sharp. None draws the
-            mean.
+        layers: The result of the decoder.
+        empty: Both images of the untouched sensor, of the same size.
+        level: A threshold from 0 to 1. Pixels whose probability of being covered is above it are covered, so that
+            outlines are sharp. For uniformly drawn levels, each pixel is covered with its probability. None draws the
+            mean image.
 
     Returns:
         `visual` and `tactile`, in [0, 1].
@@ -421,13 +421,13 @@ def compose(
 def _on_canvas(
     config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"], depth: Float[Array, "n"]
 ) -> Float[Array, "n m 2"]:
-    """Where on the canvas each pixel of the view lies: column and row, whole numbers at pixel centres.
+    """Column and row on the canvas of each pixel of the view. Whole numbers are pixel centres.
 
     Args:
-        config: of the model.
-        pose: pose codes.
-        heading: of the canvas.
-        depth: m, of the canvas below the object's origin, from the pinhole.
+        config: The configuration of the model.
+        pose: Pose codes.
+        heading: Headings of the canvas.
+        depth: Distance (m) of the canvas from the pinhole along the optical axis.
     """
     position = pose[:, :2] * config.position_scale
     shrunk = (config.camera_distance / depth)[:, None]
@@ -438,7 +438,7 @@ def _on_canvas(
 
 
 class Model(nnx.Module):
-    """An encoder per image that is an input, the transition and the decoder."""
+    """The transition, the decoder, and an encoder for each input that is an image."""
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
@@ -448,7 +448,7 @@ class Model(nnx.Module):
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
-    """A new model as `(graphdef, params, stats)`. Consumes `key`. There are no running statistics: `stats` is empty."""
+    """A new model as `(graphdef, params, stats)`. Consumes `key`. `stats` is empty (no running statistics)."""
 
     @jax.jit
     def draw(key: PRNGKeyArray) -> nnx.State:

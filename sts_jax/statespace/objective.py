@@ -2,20 +2,20 @@
 
 For a batch of first moments with their last moments, it is the sum of
 
-- the squared error of each image's expert at the true first state, and the nats of its variance
+- the squared error of the state of each image's expert, and the nats of its variance
 - the nats of the transition at the true outcome, the true final pose and the rotation to it, for the belief of every
   non-empty subset of the inputs
 - the excess cross-entropy of the last moment, drawn in the true final pose with a sample of the look, and that of the
-  first moment, drawn in the true first pose. It is that of the colours of the pixels that show the object and that of
-  the tactile image
+  first moment, drawn in the true first pose. Both include the colours of the pixels that show the object, and the
+  tactile image
 - the cross-entropy of the probability that a pixel shows the object, in these pictures
 - beta times the divergence of the look from its prior, in nats
 
-A moment is drawn in its true pose, so that the decoder never averages over places. The subset whose belief gives the
-look is drawn for each sample, among those with an image.
+A moment is drawn in its true pose, so that the decoder never averages over places. For each sample, the look comes from
+the belief of a random subset with an image.
 
-First moments without an end (views) add to the first part, and the first moments that are drawn are then theirs.
-Trajectories without images (falls) add to the second part, with beliefs around the true state.
+First moments without an end (views) contribute to the first part, and replace the first moments that are drawn.
+Trajectories without images (falls) contribute to the second part, with beliefs around the true state.
 """
 
 import itertools
@@ -31,8 +31,8 @@ from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state, window
 from sts_jax.statespace.networks import IMAGES, TINT, UNKNOWN_LOG_VAR, FinalPose, Model, compose
 
-EXACT_LOG_VAR = -9.2  # of a pose that is given: 0.5 mm
-_LEAST = 1 / 1020  # predicted images are kept this far from 0 and 1
+EXACT_LOG_VAR = -9.2  # of a pose that is an input, 0.5 mm
+_LEAST = 1 / 1020  # least distance of predicted images from 0 and 1
 
 
 def experts(
@@ -44,13 +44,13 @@ def experts(
     """The Gaussian of each input over state code and look.
 
     Args:
-        model: the networks.
-        inputs: some of `visual` and `tactile` `(n, size, size, 3)` in [0, 1], and `pose` `(n, 12)`, a code. Where the
-            true state is known, also `state` `(n, code)`.
-        counts: which items of each input count. The values of the others, NaN among them, have no influence.
-        empty: both images of the untouched sensor, of the same size.
+        model: The networks.
+        inputs: Some of `visual` and `tactile` `(n, size, size, 3)` in [0, 1], the pose code `pose` `(n, 12)` and, if it
+            is known, the true `state` `(n, code)`.
+        counts: The items of each input that count. All others have no influence and may be NaN.
+        empty: Both images of the untouched sensor, of the same size.
     """
-    # Replaced before the networks see them: neither the product of experts nor a gradient is safe from 0 * NaN.
+    # Items that do not count are zero before the networks, because 0 * NaN would spoil the product and its gradient.
     change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
     found = {name: model.encoders[name](x) for name, x in change.items()}
     for name in ("pose", "state"):
@@ -63,18 +63,18 @@ def experts(
 
 
 def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gaussian:
-    """The product of the standard normal prior and of the experts that count, sample by sample."""
+    """The product of the standard normal prior and of the experts that count, for each sample."""
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
 
 
 def of_state(belief: Gaussian) -> Gaussian:
-    """The part of a belief over state code and look that is about the state code."""
+    """The marginal over the state code of a belief over state code and look."""
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
 
 def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Zero in place of the items that do not count."""
+    """The values, with zeros for items that do not count."""
     return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
 
 
@@ -100,7 +100,7 @@ def excess(
     target: Float[Array, "n h w c"],
     counts: Float[Array, "n h w"] | None = None,
 ) -> Float[Array, "n"]:
-    """Binary cross-entropy less the target's own entropy, nats, summed over the pixels that count and over channels."""
+    """Binary cross-entropy minus the entropy of the target, in nats, summed over channels and the pixels that count."""
     image = jnp.clip(image, _LEAST, 1 - _LEAST)
     cross = target * jnp.log(image) + (1 - target) * jnp.log1p(-image)
     inside = jnp.clip(target, 1e-6, 1 - 1e-6)
@@ -110,25 +110,25 @@ def excess(
 
 
 def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
-    """Images at a resolution that theirs is a multiple of: means over blocks of pixels."""
+    """Means over blocks of pixels. The sides of the images must be multiples of `size`."""
     *lead, height, width, channels = images.shape
     blocks = images.reshape(*lead, size, height // size, size, width // size, channels)
     return jnp.mean(blocks, axis=(-4, -2))
 
 
 class _Ends(NamedTuple):
-    """Beliefs about first moments, with the ends that followed."""
+    """Beliefs about first moments, with the true ends."""
 
     belief: Gaussian  # over the state code
     state: Float[Array, "n code"]
-    pose: Float[Array, "n 12"]  # the final one
+    pose: Float[Array, "n 12"]  # final pose codes
     outcome: Int[Array, "n"]
     condition: Float[Array, "n c"] | None
     counts: Bool[Array, "n"]
 
 
 class _Pictures(NamedTuple):
-    """Objects to be drawn, with the images that should come of it."""
+    """Objects to be drawn, and the target images."""
 
     pose: Float[Array, "n 12"]
     turn: Float[Array, "n 3 3"]  # since the moment of the belief
@@ -151,29 +151,29 @@ def loss(
     falls: dict[str, Array] | None = None,
     beta: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """The loss of one batch (module docstring).
+    """The loss of one batch, see the docstring of the module.
 
     Args:
-        graphdef: definition of the model.
-        params: its parameters.
-        key: consumed.
-        inputs: as of `experts`: all that the model takes.
-        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1], of the size that is predicted, the state code
-            `state` `(n, code)` of the first moment, the pose code `pose` `(n, 12)` of the last, and `outcome` `(n,)`,
-            an index into the scenario's.
-        empty: as of `experts`.
-        present: which inputs count, by name (default: all). Each sample needs one. The values of those that do
-            not count, NaN among them, have no influence.
-        condition: as of `Transition`.
-        views: further first moments without an end: `visual` `(m, size, size, 3)` and `state` `(m, code)`.
-        falls: further trajectories without images: `state`, `pose`, `outcome` and, where the model has one,
+        graphdef: Definition of the model.
+        params: Its parameters.
+        key: Consumed.
+        inputs: All inputs of the model, as in `experts`.
+        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1] at the predicted size, the state code `state`
+            `(n, code)` of the first moment, the pose code `pose` `(n, 12)` of the last moment, and `outcome` `(n,)`, an
+            index into the outcomes of the scenario.
+        empty: As in `experts`.
+        present: The samples `(n,)` of each input that count (default: all). Each sample needs one input. Inputs that do
+            not count have no influence and may be NaN.
+        condition: As in `Transition`.
+        views: Further first moments without an end: `visual` `(m, size, size, 3)` and `state` `(m, code)`.
+        falls: Further trajectories without images: `state`, `pose`, `outcome` and, if the model has a condition,
             `condition`, as above.
-        beta: weight of the look's divergence.
+        beta: Weight of the divergence of the look.
 
     Returns:
-        The loss, and its parts: means over the items that count, before any weight. `state` is in units of the code
-        squared, all others are in nats. `state`, `doubt` and `first` are summed over the input images, and `covered`
-        over the first and the last moment.
+        The loss, and its parts: means over the items that count, before weighting. `state` is in squared units of the
+        code, and all others are in nats. `state`, `doubt` and `first` are sums over the input images, and `covered` is
+        a sum over the first and the last moment.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
@@ -203,12 +203,12 @@ def loss(
         ends.append(_known_ends(blur, falls))
     terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
 
-    # A picture is drawn of the belief of one subset with an image.
+    # The look of a picture comes from the belief of one subset with an image.
     usable = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
     chosen = jax.random.categorical(choice, jnp.where(usable, 0.0, -jnp.inf))
     stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
     belief = jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
-    # The tint is computed and not learnt: it has no part in the divergence.
+    # The divergence excludes the tint, which is computed and not learnt.
     terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE + TINT :], belief)))
     last = math.ceil(config.drawn * number)
     turn = _turn(targets["state"], targets["pose"])
@@ -257,7 +257,7 @@ def _state_terms(
     seen: dict[str, Gaussian],
     views: dict[str, Array] | None,
 ) -> dict[str, Float[Array, ""]]:
-    """`state` and `doubt` of all images' experts, at the first moments and at the views."""
+    """`state` and `doubt`, summed over the experts of all images, for first moments and views."""
     errors, doubts = [], []
     for name in (name for name in IMAGES if name in found):
         expert, code, valid = found[name], truth, counts[name]
@@ -272,10 +272,10 @@ def _state_terms(
 
 
 def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Array, "n"]) -> tuple[Array, Array]:
-    """Squared error of an expert's state, and the nats of its variance, means over the samples that it counts for.
+    """Squared error of an expert's state, and the nats of its variance, as means over the samples that count.
 
-    The mean is learnt from the squared error alone. The nats of a Gaussian would weigh each component by its precision,
-    and the rotation, the hardest part, would wait until the position is learnt.
+    The mean is learnt from the squared error alone. The nats of a Gaussian would weigh each component by its precision.
+    The position would soon outweigh the rotation, which is harder to learn.
     """
     mean, log_var = (x[:, : state.CODE] for x in expert)
     error = jnp.sum((code - mean) ** 2, axis=-1)
@@ -286,10 +286,7 @@ def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Ar
 
 
 def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
-    """Trajectories whose first state is known: half of them exactly, half with an uncertain shape and mass.
-
-    The uncertain ones have noise of known size added, as an expert has it.
-    """
+    """Trajectories with a known first state. In every second one, shape and mass have noise of known variance."""
     code = falls["state"]
     number = len(code)
     size, noise = jax.random.split(key)
@@ -329,7 +326,7 @@ def _present_pictures(
     images: dict[str, Array],
     counts: dict[str, Bool[Array, "n"]],
 ) -> _Pictures:
-    """Pictures of the moment of the belief itself."""
+    """Pictures of the present moment, to which the belief belongs."""
     stays = jnp.broadcast_to(jnp.eye(3), (len(code), 3, 3))
     return _Pictures(code[:, : poses.CODE], stays, belief, images, counts)
 
@@ -341,7 +338,7 @@ def _picture_terms(
     before: _Pictures,
     empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Float[Array, ""]]:
-    """The nats of the last moment's images, by name, of the first moment's, summed over the names, and of outlines."""
+    """`visual` and `tactile` of the last moment, `first`, the sum of both for the first moment, and `covered`."""
     size = model.config.image_size
     small = {name: reduced(x, size) for name, x in empty.items()}
 
@@ -352,7 +349,7 @@ def _picture_terms(
     layers = model.decoder(
         jnp.concatenate([after.pose, before.pose]),
         jnp.concatenate([after.turn, before.turn]),
-        # Pictures do not teach the shape: it has a truth.
+        # Pictures do not train the shape, because the state has its own target.
         jax.lax.stop_gradient(jnp.concatenate([x.belief.mean[:, : state.CODE] for x in (after, before)])),
         jnp.concatenate([looks(key, x.belief) for key, x in zip(keys, (after, before), strict=True)]),
     )
@@ -382,7 +379,7 @@ def _outline_nats(logit: Float[Array, "n h w 1"], seen: Float[Array, "n h w"]) -
     """Cross-entropy of the probability that a pixel shows the object, summed over pixels.
 
     Args:
-        logit: of the probability.
-        seen: 1 where a pixel shows it, else 0.
+        logit: Logit of the probability.
+        seen: 1 for pixels that show the object, else 0.
     """
     return jnp.sum(jax.nn.softplus(logit[..., 0]) - seen * logit[..., 0], axis=(1, 2))

@@ -14,7 +14,7 @@ from sts_jax.statespace.objective import experts, fuse, of_state, reduced
 
 
 class Samples(NamedTuple):
-    """Samples of the last moment: k final poses of each of n items, and both images of the first few of them."""
+    """k samples of the last moment of each of n items, of which the first few have images."""
 
     belief: Gaussian  # over the present state code and the look, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -38,15 +38,15 @@ def sample(
     """Sample the end of each first moment.
 
     Args:
-        graphdef: definition of the model.
-        params: its parameters.
-        key: consumed.
-        inputs: as of `objective.experts`, some of the model's inputs.
-        present: which items of each input count.
-        empty: as of `objective.experts`.
-        condition: as of `Transition`.
-        num: how many final poses.
-        drawn: for how many of them both images are drawn, each with its own look (at most `num`).
+        graphdef: Definition of the model.
+        params: Its parameters.
+        key: Consumed.
+        inputs: Some of the model's inputs, as in `objective.experts`.
+        present: The items of each input that count.
+        empty: As in `objective.experts`.
+        condition: As in `Transition`.
+        num: Number of final poses.
+        drawn: Number of these poses for which both images are drawn, each with its own look (at most `num`).
     """
     model = nnx.merge(graphdef, params)
     belief = fuse(experts(model, inputs, present, empty), present)
@@ -63,7 +63,7 @@ def sample(
         looks.reshape(-1, looks.shape[-1]),
     )
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    # Levels at equal distances, in another order for each item.
+    # The levels of each item are equally spaced, in random order.
     order = jax.vmap(lambda key: jax.random.permutation(key, drawn))(jax.random.split(outline, len(mean)))
     sharp = compose(layers, shown, (order.T.reshape(-1) + 0.5) / drawn)
     soft = compose(layers, shown)
@@ -77,7 +77,7 @@ def sample(
 
 
 def _final_pose(key: PRNGKeyArray, final: FinalPose) -> tuple[Float[Array, "n 12"], Float[Array, "n 3 3"]]:
-    """The code of a final pose, and the rotation from the present to it."""
+    """Draw a final pose. Returns its code and the rotation from the present pose to it."""
     which, noise = jax.random.split(key)
     number = len(final.outcome)
     joint = (final.outcome[:, :, None] + final.weight).reshape(number, -1)

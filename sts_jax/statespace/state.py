@@ -1,4 +1,4 @@
-"""The present state as the networks see it: pose, shape and mass of an object, and how its shape is turned.
+"""State codes: pose, shape and mass of an object, and its shape in the sensor's frame.
 
 A state code has these parts, in this order:
 
@@ -6,10 +6,11 @@ A state code has these parts, in this order:
 - `own`: the support function of the object's hull about the mesh origin, as harmonics in the object's frame
 - `com`: the centre of mass in the object's frame
 - `mass`: the logarithm of the mass
-- `shown`: the support function in the sensor's frame, as the object is turned at present
-- `low`: the centre of mass from the mesh origin, in the sensor's frame
+- `shown`: the support function in the sensor's frame, for the present rotation
+- `low`: the centre of mass relative to the mesh origin, in the sensor's frame
 
-The last two follow from the others. An image shows them directly, however uncertain the rotation is.
+The last two follow from the others. They are parts of the code because an image shows them directly, even if the
+rotation is uncertain.
 """
 
 import functools
@@ -45,7 +46,7 @@ class State(NamedTuple):
 
 @functools.cache
 def _fit() -> np.ndarray:
-    """From values in `objects.DIRECTIONS` to harmonics, least squares, (128, k)."""
+    """Matrix (128, k) of the least-squares fit of harmonics to values in `objects.DIRECTIONS`."""
     with jax.ensure_compile_time_eval():
         return np.linalg.pinv(np.asarray(harmonics.basis(jnp.asarray(objects.DIRECTIONS), DEGREE))).T
 
@@ -69,10 +70,10 @@ def encode(
     """State codes.
 
     Args:
-        pose: pose codes.
-        support: m, of the hull in `objects.DIRECTIONS`, see `objects.support`.
-        mass: kg.
-        com: m, mesh frame.
+        pose: Pose codes.
+        support: Support function (m) of the hull in `objects.DIRECTIONS`, see `objects.support`.
+        mass: Mass (kg).
+        com: Centre of mass (m) in the mesh frame.
     """
     own = (support / LENGTH - MEAN) @ _fit()
     rotation = poses.matrix(pose)
@@ -83,7 +84,7 @@ def encode(
 
 
 def turn(angle: Float[Array, "n 2"], state: State) -> State:
-    """States after everything was turned about the vertical through the sensor's origin."""
+    """States after a rotation of the scene about the vertical through the sensor's origin."""
     return state._replace(
         pose=poses.turn_code(angle, state.pose),
         shown=harmonics.turn(angle, state.shown[:, None])[:, 0],
@@ -92,7 +93,7 @@ def turn(angle: Float[Array, "n 2"], state: State) -> State:
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
-    """The variances of a turned state's parts, where those of the state are independent."""
+    """Variances of the parts of turned states, for independent numbers with the given variances."""
     cos, sin, (x, y, z) = angle[:, 0] ** 2, angle[:, 1] ** 2, variance.low.T
     return variance._replace(
         pose=poses.turn_variance(angle, variance.pose),
@@ -102,7 +103,7 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
 
 
 def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
-    """How far an object reaches below its origin (m), after it was turned from the present by a rotation."""
+    """Distance (m) of an object's lowest point below its origin, after a rotation from the present state."""
     down = np.array([[0.0, 0.0, -1.0]], np.float32)
     return LENGTH * (MEAN + harmonics.values(state.shown[:, None], rotation, down)[:, 0, 0])
 
@@ -110,8 +111,8 @@ def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
 def heading(state: State) -> Float[Array, "n 2"]:
     """The direction of the object in the pad's plane, as cosine and sine of its angle from x.
 
-    It is that of an axis of the mesh, see `poses.heading`. Where the rotation is too uncertain, it is the long axis of
-    the shape that is seen, which has no sign. No gradient flows through it.
+    It is the direction of an axis of the mesh, see `poses.heading`. If the rotation is too uncertain, it is the long
+    axis of the shown shape, with an arbitrary sign. No gradient flows through it.
     """
     state = jax.lax.stop_gradient(state)
     certain = poses.certainty(state.pose)[:, None] > 0.5

@@ -1,4 +1,4 @@
-"""Windows around the part of an image that differs from the empty sensor's, turned upright and magnified."""
+"""Windows around the changed part of an image, aligned with its principal axes and magnified."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,9 @@ from jaxtyping import Array, Float
 from sts_jax._sampling import bilinear_batch
 from sts_jax.statespace import poses
 
-THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (a shadow differs by less)
-MARGIN = 1.1  # side of the window over the larger extent of the silhouette
-SMALLEST = 0.08  # side of the smallest window over that of the image
+THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (shadows differ by less)
+MARGIN = 1.1  # side of the window, divided by the larger extent of the silhouette
+SMALLEST = 0.08  # side of the smallest window, divided by the side of the image
 
 
 class Window(NamedTuple):
@@ -22,19 +22,19 @@ class Window(NamedTuple):
 
 
 def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """1 where an image shows an object, else 0.
+    """1 for pixels that differ from the empty sensor, else 0.
 
     Args:
-        change: images minus that of the empty sensor.
+        change: Images less that of the empty sensor.
     """
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """The window around the pixels that show an object, or the whole image if none does.
+    """The window around all pixels that differ from the empty sensor, or the whole image if there are none.
 
     Args:
-        change: square images minus that of the empty sensor.
+        change: Square images less that of the empty sensor.
     """
     size = change.shape[1]
     weight = shows(change)
@@ -65,15 +65,12 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """Cut the windows out of images, at another resolution.
+    """The windows at another resolution. A pixel is the mean of four interpolated values, 0 outside of the image.
 
     Args:
-        images: square images.
-        window: the window of each image.
-        side: side of the result, pixels.
-
-    Returns:
-        Cut images. Each pixel is the mean of four interpolated values, which are zero outside of the image.
+        images: Square images.
+        window: The window of each image.
+        side: Side of the result in pixels.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5
@@ -84,6 +81,6 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Bilinear interpolation at some columns and rows, whole numbers at pixel centres. Zero outside of the image."""
+    """Bilinear interpolation at columns and rows, where whole numbers are pixel centres. Zero outside of the image."""
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)

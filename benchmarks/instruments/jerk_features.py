@@ -1,10 +1,10 @@
-"""Features of a lathed object that stands on the jerked pad, for a classifier: from vision and from weight."""
+"""Features of lathed objects that stand on the jerked pad, for a classifier: from vision and from weight."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.starts import Starts, filled
+from benchmarks.instruments.starts import Starts, filled
 from sts_jax import objects, physics
 from sts_jax.physics.perturbed import jerk
 from sts_jax.physics.scenario import G
@@ -15,11 +15,12 @@ NOISE = 0.05  # log kg, standard deviation of the measured mass
 
 
 class Sight(NamedTuple):
-    """Exact properties of each object that follow from its shape, one row each."""
+    """Exact properties that follow from the shape of each object, one row each."""
 
     profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radius at seven heights
     low: np.ndarray  # (b,) m, the lowest point in the mesh frame
-    rigid: np.ndarray  # (b, FILLS, 3) mass, height of the centre of mass over the base and inertia across, at each fill
+    # (b, FILLS, 3) at each fill: mass (kg), height of the centre of mass over the base (m), inertia across (kg m^2)
+    rigid: np.ndarray
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
@@ -36,19 +37,24 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """`Sight` of all objects."""
+    """The properties of all objects."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """The measurement of touch, (n, 1): the logarithm of the mass in kg."""
+    """The quantity that touch measures, (n, 1): the logarithm of the mass in kg."""
     return np.log(starts.mass)[:, None]
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (m) and pushes (m/s^2), (n, 2) each, under a symmetry of the pad that turns pushes to 0 to 45 degrees.
+    """Map starts to equivalent ones whose push points 0 to 45 degrees from +x, by a symmetry of the pad.
 
-    The push on the object is the opposite of the pad's acceleration.
+    Args:
+        pose: First poses, (n, 7).
+        condition: (n, 3). The first two columns are the acceleration of the pad (m/s^2), the opposite of the push.
+
+    Returns:
+        Places (m) and pushes (m/s^2), (n, 2) each.
     """
     push = -np.asarray(jerk(condition).acceleration)
     sign = np.where(push < 0, -1, 1)
@@ -58,10 +64,10 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndarray, friction: float) -> np.ndarray:
-    """How near a standing object comes to toppling if it turns about the edge of its base, two columns (n, 2).
+    """Two ratios (n, 2) above which a standing object topples about the edge of its base.
 
-    The first is its acceleration over that at which it begins to tip, g b / h. The second is the logarithm of its
-    energy at the end of the push over the energy that carries its centre of mass over the edge. Friction limits the
+    The first ratio is its acceleration over that at which it begins to tip, g b / h. The second one, as a logarithm, is
+    its energy at the end of the push over the energy that lifts its centre of mass over the edge. Friction limits the
     force, which then lasts longer.
 
     Args:
@@ -69,7 +75,7 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
         base: (n,) m, radius of the base.
         push: (n,) m/s^2, acceleration.
         time: (n,) s, duration of the push.
-        friction: a typical value, because the true one is hidden.
+        friction: A typical coefficient, because the true one is hidden.
     """
     mass, height, inertia = rigid.T
     force, lasts = np.minimum(push, friction * G), time * np.maximum(1, push / (friction * G))
@@ -84,7 +90,14 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
 def shaken(
     scenario: physics.Perturbed, items: list[objects.Body], starts: Starts, touch: np.ndarray | None
 ) -> np.ndarray:
-    """Features (n, k) of jerked starts of lathed objects. `touch` (n, 1) is the logarithm of the mass."""
+    """Features (n, k) of jerked starts of lathed objects.
+
+    Args:
+        scenario: The scenario.
+        items: The objects.
+        starts: Their starts.
+        touch: (n, 1) logarithm of the mass in kg, or None for features from vision alone.
+    """
     seen = sight(items)
     friction = float(np.mean(scenario.friction))
     place, push = canonical(starts.pose, starts.condition)

@@ -1,4 +1,4 @@
-"""Features of an object laid on the slope, for a classifier: statics from vision and from the centre of pressure.
+"""Features of objects laid on the slope, for a classifier: statics from vision and from the centre of pressure.
 
 Downhill is +y.
 """
@@ -11,15 +11,15 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from benchmarks.starts import Starts, filled, rigid
+from benchmarks.instruments.starts import Starts, filled, rigid
 from sts_jax import geometry, objects, physics
 from sts_jax.sensor import Sensor
 
 NOISE = 0.001  # m, standard deviation of the measured centre of pressure
 SEEN = (0.0001, 0.0017)  # m, rad, standard deviations of a pose from vision
-DRAWS = 128  # draws of the hidden contents for the features of a start, ...
-FRICTIONS = 8  # ... each combined with this many frictions
-LEVELS = (0.0001, 0.001)  # m, heights above the lowest point of points that support at once, or after rocking
+DRAWS = 128  # draws of the hidden contents for the features of a start
+FRICTIONS = 8  # coefficients of friction that are combined with each draw
+LEVELS = (0.0001, 0.001)  # m, heights over the lowest point up to which points support at once, or after rocking
 SNAP = 0.9986  # cosine of 3 degrees. An object that leans less from a stable face is taken to lie on it
 
 
@@ -34,9 +34,11 @@ def support(points: np.ndarray, level: float) -> np.ndarray:
 
 
 def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
-    """How far (m) a place (2,) lies inside a support polygon, from the nearest edge and from the nearest downhill edge.
+    """Stability margins of a place (2,) in a support polygon (k, 2), positive inside.
 
-    The list also has the length (m) of this downhill edge and the y component of its outward unit normal.
+    Returns:
+        Distance (m) from the nearest edge, distance (m) from the nearest downhill edge, length (m) of that edge, and y
+        component of its outward unit normal.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9
@@ -50,7 +52,7 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
 def balance(
     corners: np.ndarray, centre: np.ndarray, friction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Predict by statics how bodies with different hidden values move, and where they press.
+    """Motion and centre of pressure of a body on the slope by statics, for different hidden values.
 
     Args:
         corners: (k, 2) m, corners of the support polygon.
@@ -59,8 +61,8 @@ def balance(
         slope: rad, towards +y.
 
     Returns:
-        (m,) tips (0), slides (1) or sticks (2), and (m, 2) m, centres of pressure. A body that tips presses on the edge
-        over which it tips.
+        Motion (m,), which is 0 for tipping, 1 for sliding and 2 for sticking, and centre of pressure (m, 2) in m. A
+        body that tips presses on the edge over which it tips.
     """
     grip = np.minimum(friction, math.tan(slope))
     pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])
@@ -91,17 +93,23 @@ def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
 
 
 def pressed(starts: Starts) -> np.ndarray:
-    """The measurement of touch, (n, 2) in m: the centre of pressure `(-My, Mx) / Fz`, nan without contact."""
+    """The quantity that touch measures, (n, 2): the centre of pressure `(-My, Mx) / Fz` in m, nan without contact."""
     force = np.where(starts.wrench[:, 2] > 0, starts.wrench[:, 2], np.nan)
     return np.stack([-starts.wrench[:, 4], starts.wrench[:, 3]], 1) / force[:, None]
 
 
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Features (n, k) of starts on the slope, for objects of any shape. `touch` (n, 2) in m is the centre of pressure.
+    """Features (n, k) of starts on the slope, for objects of any shape.
 
-    They include the predictions of `balance` for DRAWS of the hidden contents, all equally likely from vision. Touch
-    determines which of them are likely. The pose has noise of SEEN, because an exact pose would reveal by micrometres
-    which objects have begun to slip.
+    They include the results of `balance` for DRAWS of the hidden contents. From vision, all of these draws are equally
+    likely. Touch weighs them by their likelihood. The pose has noise of SEEN, because an exact pose would reveal by
+    micrometres which objects have begun to slip.
+
+    Args:
+        scenario: The scenario.
+        items: The objects.
+        starts: Their starts.
+        touch: (n, 2) centre of pressure in m, or None for features from vision alone.
     """
     centres = [np.tile(drawn_centres(body, scenario), (FRICTIONS, 1)) for body in items]
     friction = np.repeat(np.linspace(*scenario.friction, 2 * FRICTIONS + 1)[1::2], DRAWS)

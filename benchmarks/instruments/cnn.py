@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 CHANNELS = (24, 48, 64)  # after each 3 x 3 convolution
 BATCH = 64
 RATE = 2e-3  # Adam's learning rate, which falls to zero along a cosine
+LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 Weights = list[tuple[Array, Array]]
 
@@ -40,13 +41,10 @@ def apply(weights: Weights, x: Float[Array, "n h w 3"]) -> Float[Array, "n k"]:
         if index:
             n, h, w, c = x.shape
             x = x.reshape(n, h // 2, 2, w // 2, 2, c).mean((2, 4))
-        x = jax.nn.gelu(jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT) + bias)
+        x = jax.nn.gelu(jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=LAYOUT) + bias)
     x = jnp.concatenate([x.mean((1, 2)), x.max((1, 2))], 1)
     (a, b), (c_, d) = weights[-2:]
     return jax.nn.gelu(x @ a + b) @ c_ + d
-
-
-_LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 
 def fit(
@@ -55,13 +53,13 @@ def fit(
     """Train a network to predict `targets` from `images`, and return it as a function of images.
 
     Args:
-        key: consumed.
+        key: Consumed.
         images: uint8 (n, h, w, 3).
-        targets: float (n, k), learned by squared error after standardising, or bool (n, k), by cross-entropy.
-        steps: of Adam, with `BATCH` images each.
+        targets: float (n, k), standardised and learnt by squared error, or bool (n, k), learnt by cross-entropy.
+        steps: Steps of Adam, with BATCH images each.
 
     Returns:
-        Function from images (m, h, w, 3) to (m, k): numbers, or logits if `targets` is bool.
+        Function from images (m, h, w, 3) to predictions (m, k), which are logits if `targets` is bool.
     """
     logits = targets.dtype == bool
     centre, scale = (0.0, 1.0) if logits else (targets.mean(0), targets.std(0))
@@ -73,8 +71,8 @@ def fit(
         return apply(weights, (rows.astype(jnp.float32) - mean) / spread)
 
     def loss(weights: Weights, rows: Array, target: Array) -> Array:
-        said = outputs(weights, rows)
-        each = optax.sigmoid_binary_cross_entropy(said, target) if logits else jnp.square(said - target)
+        found = outputs(weights, rows)
+        each = optax.sigmoid_binary_cross_entropy(found, target) if logits else jnp.square(found - target)
         return each.mean()
 
     optimizer = optax.adam(optax.cosine_decay_schedule(RATE, steps))
@@ -91,7 +89,7 @@ def fit(
         rows = np.asarray(jax.random.choice(own, len(images), (BATCH,)))
         weights, state = step(weights, state, images[rows], wanted[rows])
 
-    said = jax.jit(outputs)
+    predict = jax.jit(outputs)
     return lambda new: np.concatenate(
-        [np.asarray(said(weights, new[i : i + BATCH])) * scale + centre for i in range(0, len(new), BATCH)]
+        [np.asarray(predict(weights, new[i : i + BATCH])) * scale + centre for i in range(0, len(new), BATCH)]
     )

@@ -24,14 +24,14 @@ class Starts(NamedTuple):
     """Starts and outcomes of trajectories, one row each."""
 
     body: np.ndarray  # (n,) index of the object
-    pose: np.ndarray  # (n, 7) frame 0
-    wrench: np.ndarray  # (n, 6) frame 0
+    pose: np.ndarray  # (n, 7) of the first frame
+    wrench: np.ndarray  # (n, 6) of the first frame
     condition: np.ndarray  # (n, c)
     fill: np.ndarray  # (n,)
     mass: np.ndarray  # (n,) kg
-    settled: np.ndarray  # (n,)
+    settled: np.ndarray  # (n,) bool
     outcome: np.ndarray  # (n,) Outcome
-    rerolled: np.ndarray  # (n,) Outcome with other contents, -1 where it was not rolled again
+    rerolled: np.ndarray  # (n,) Outcome with other contents, -1 for starts that were not simulated again
 
 
 def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
@@ -71,12 +71,12 @@ def roll(
     """Simulate `num` starts of each object, and the first `again` of each once more with other contents.
 
     Args:
-        key: consumed.
-        items: the objects.
-        scenario: the scenario.
-        num: number of starts of each object.
-        again: number of these starts that are rolled again.
-        reroll: fields of `physics.Hidden` that are then drawn anew.
+        key: Consumed.
+        items: The objects.
+        scenario: The scenario.
+        num: Number of starts of each object.
+        again: Number of these starts that are simulated again.
+        reroll: Fields of `physics.Hidden` that are then drawn anew.
     """
     key, fresh = jax.random.split(key)
     with tqdm(total=len(items) * num, unit="starts") as bar:
@@ -88,7 +88,7 @@ def roll(
         other = jax.vmap(scenario.hidden)(jax.random.split(fresh, len(rows)))
         hidden = jax.tree.map(lambda x: x[rows], traj.hidden)
         hidden = hidden._replace(**{name: getattr(other, name) for name in reroll})
-        with tqdm(total=len(rows), unit="rolled again") as bar:
+        with tqdm(total=len(rows), unit="repeated starts") as bar:
             second = physics.simulate(
                 key, items, Sensor(), scenario, again, hidden=hidden, progress=lambda n: bar.update(n - bar.n)
             )

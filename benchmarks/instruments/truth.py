@@ -1,0 +1,62 @@
+"""Depth images traced by embree, as the truth for rendered depth."""
+
+import jax
+import numpy as np
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+import sts_jax as sts
+from sts_jax import objects
+
+
+def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
+    """The body's triangles in the sensor frame, in float64."""
+    faces = np.asarray(body.faces)
+    faces = faces[np.any(faces != faces[:, :1], axis=1)]
+    turn = trimesh.transformations.quaternion_matrix(np.asarray(pose[3:], float))[:3, :3]
+    vertices = np.asarray(body.vertices, float) @ turn.T + np.asarray(pose[:3], float)
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def embree(
+    mesh: trimesh.Trimesh, camera: sts.optics.Camera, shape: tuple[int, int], *, two_sided: bool = False
+) -> np.ndarray:
+    """Depth along the optical axis of the nearest triangle that faces the camera, `inf` where there is none.
+
+    Args:
+        mesh: The triangles in the sensor frame.
+        camera: The camera.
+        shape: Height and width of the image in pixels.
+        two_sided: Include triangles that face away from the camera.
+
+    Returns:
+        Metres, float64, `shape`.
+    """
+    towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, camera.distance]) < 0
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(mesh.triangles[towards | two_sided], np.float32))
+    height = 2 * camera.distance * np.tan(camera.fov / 2)
+    width = min(height * camera.aspect, height * shape[1] / shape[0])
+    height = width * shape[0] / shape[1]
+    x = (-width / 2 + (np.arange(shape[1]) + 0.5) / shape[1] * width) / camera.distance
+    y = (-height / 2 + (np.arange(shape[0]) + 0.5) / shape[0] * height) / camera.distance
+    slopes = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    directions = np.concatenate([slopes, np.ones((len(slopes), 1))], -1).astype(np.float32)
+    origins = np.tile(np.array([[0, 0, -camera.distance]], np.float32), (len(slopes), 1))
+    hit = scene.run(origins, directions, query="DISTANCE")
+    return np.where(hit < 1e3, hit, np.inf).astype(float).reshape(shape)
+
+
+def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
+    """Pixels whose 3x3 neighbourhood is hit throughout and spans less than `span` of depth (m)."""
+    around = neighbours(np.where(np.isfinite(depth), depth, 1e9), 1e9)
+    return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
+
+
+def neighbours(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
+    """The 3x3 neighbourhood of every pixel, (9, h, w). Outside, the image is `beyond`, or repeats its edge if None."""
+    height, width = image.shape
+    fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}
+    padded = np.pad(image, 1, **fill)
+    return np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
