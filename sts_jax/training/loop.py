@@ -22,7 +22,8 @@ from sts_jax.training.config import TrainConfig
 from sts_jax.training.learners import Config, Learner, Loss, Terms, learner
 from sts_jax.training.model import KINDS, Model, load
 
-Log = Callable[[int, dict[str, float]], None]  # takes the step and the parts of the loss of a record
+Progress = Callable[[int, int, dict[str, float]], None]  # takes the steps done, their total, and the latest record
+Log = Callable[[int, dict[str, float]], None]  # takes the step of a record, and its other numbers by name
 
 
 def initial(
@@ -86,7 +87,7 @@ def train(
     loss: Loss | None = None,
     optimiser: optax.GradientTransformation | None = None,
     notes: dict[str, Any] | None = None,
-    progress: Callable[[int, int, dict[str, float]], None] | None = None,
+    progress: Progress | None = None,
     log: Log | None = None,
 ) -> Model:
     """Train a model in `workdir`, or resume where an earlier call stopped.
@@ -148,37 +149,35 @@ def train(
     there = manifest.read(workdir)
     if there is not None and there.step == total:  # takes no lock, because a lock writes a file
         _files.claim(workdir / "config.json", settings)
-        _replay(records.read(workdir / records.NAME, total), log)
+        _send(records.read(workdir / records.NAME, total), log)
         return load(workdir)
     with _files.lock(workdir):
         _files.claim(workdir / "config.json", settings)
         optimiser = optimiser or optimisers.optimiser(config, total)
         graphdef, state = initial(config, task, total, optimiser)
         state = restore(workdir, state) or state
-        state = _run(config, task, arrays, workdir, graphdef, state, optimiser, progress, log)
+        take = jax.jit(
+            lambda state, batch: step(task, graphdef, config, total, state, batch, optimiser), donate_argnums=0
+        )
+        state = _run(config, arrays, workdir, state, take, progress, log)
     return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
 
 
 def _run(
     config: TrainConfig,
-    task: Learner,
     arrays: Arrays,
     workdir: Path,
-    graphdef: nnx.GraphDef[Any],
     state: TrainState,
-    optimiser: optax.GradientTransformation,
-    progress: Callable[[int, int, dict[str, float]], None] | None,
+    take: Callable[[TrainState, Batch], tuple[TrainState, Terms]],
+    progress: Progress | None,
     log: Log | None,
 ) -> TrainState:
-    """Take the remaining steps. Write a record every `log_every` and a checkpoint every `checkpoint_every` steps."""
+    """Take the remaining steps, with a record every `log_every` and a checkpoint every `checkpoint_every` steps."""
     start, total, path = int(state.step), config.total(len(arrays)), workdir / records.NAME
     kept = records.read(path, start)
     records.write(path, kept)  # drops the records after the checkpoint, which the steps below write again
-    _replay(kept, log)
+    _send(kept, log)
     record = kept[-1] if kept else {}
-    compiled = jax.jit(
-        lambda state, batch: step(task, graphdef, config, total, state, batch, optimiser), donate_argnums=0
-    )
     further = {
         name: order(config.seed + 1, len(own["state"]), size, start, total)
         for name, own, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
@@ -187,13 +186,13 @@ def _run(
     recent: list[Terms] = []
     for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
         rows = {name: next(batches) for name, batches in further.items()}
-        state, terms = compiled(state, arrays.take(index, **rows))
+        state, terms = take(state, arrays.take(index, **rows))
         recent.append(jax.block_until_ready(terms))
         if done % config.log_every == 0 or done == total:
             record = records.mean(done, recent)
             recent = []
             records.append(path, record)
-            _replay([record], log)
+            _send([record], log)
             if not np.isfinite(record["loss"]):
                 raise FloatingPointError(
                     f"{workdir}: the loss is {record['loss']} at step {done}: lower the learning rate, or clip the "
@@ -207,6 +206,6 @@ def _run(
     return state
 
 
-def _replay(kept: list[records.Record], log: Log | None) -> None:
-    for record in kept if log is not None else ():
+def _send(some: list[records.Record], log: Log | None) -> None:
+    for record in some if log is not None else ():
         log(int(record["step"]), {name: value for name, value in record.items() if name != "step"})
