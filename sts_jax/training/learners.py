@@ -1,7 +1,7 @@
 """The parts of a training that differ between the kinds of models: initialisation, loss and the check of the arrays."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from flax import nnx
@@ -14,6 +14,7 @@ Config = mvae.Config | statespace.Config  # of a model of either kind
 Terms = dict[str, Array]  # the parts of a loss, scalars by name
 
 
+@runtime_checkable
 class Loss(Protocol):
     """The loss of one batch, a pure function that `jax.grad` and `jax.jit` trace."""
 
