@@ -17,7 +17,7 @@ from sts_jax.evaluation.views import outside
 from sts_jax.frame import Frame
 from sts_jax.objects import Body
 from sts_jax.physics import Trajectory
-from sts_jax.predict import Prediction
+from sts_jax.prediction import Prediction
 from sts_jax.sensor import Sensor
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}

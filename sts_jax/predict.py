@@ -1,204 +1,23 @@
 """A trained model as a function from any subset of vision, touch and pose to a prediction of the last moment."""
 
 import dataclasses
-import functools
 import importlib.resources
 import math
 import operator
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray
 
-from sts_jax import _files, mvae, statespace, training
+from sts_jax import _arguments, _files, mvae, statespace, training
+from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
 MODALITIES = ("visual", "tactile", "pose")
 MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # the models of the library, one folder each
-_QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
-_FARTHEST = 10.0  # m, largest coordinate of a position (larger numbers cannot be metres)
 _LARGEST_CONDITION = 100.0  # largest condition, in units of its usual size
-_POSES = 64  # samples of the final pose, from which the prediction of a state-space model is chosen
-_DRAWN = 16  # samples that are drawn as images if `num_samples` is 0 (the predicted images are their means)
-_TURN = 0.02  # m, weight of one radian in the choice of the pose
-
-
-class Prediction(NamedTuple):
-    """A predicted last moment. Modalities that the model lacks are None."""
-
-    visual: Float[Array, "*n h w 3"] | None  # [0, 1]
-    tactile: Float[Array, "*n h w 3"] | None  # [0, 1]
-    pose: Float[Array, "*n 7"] | None  # m, unit quaternion with w >= 0, mesh frame in the sensor frame
-    mean: Float[Array, "*n latent"]  # mean of the fused posterior
-    log_var: Float[Array, "*n latent"]  # its log variance
-    samples: "Prediction | None" = None  # samples on a leading axis, each from its own latent
-    # Probability of each of the scenario's `outcomes`, in their order (None for a model of the paper's kind)
-    outcome_probability: Float[Array, "*n outcomes"] | None = None
-
-    def __repr__(self) -> str:
-        shapes = (
-            f"{name}={leaf.dtype}{list(leaf.shape)}" if isinstance(leaf, jax.Array | np.ndarray) else f"{name}={leaf!r}"
-            for name, leaf in zip(self._fields, self, strict=True)
-        )
-        return f"Prediction({', '.join(shapes)})"
-
-
-@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
-def predict(
-    graphdef: nnx.GraphDef,
-    state: nnx.State,
-    preprocessing: training.Preprocessing,
-    blank: Float[Array, "h w 3"],
-    inputs: dict[str, Float[Array, "..."]],
-    present: dict[str, Bool[Array, "*n"]],
-    condition: Float[Array, "..."] | None = None,
-    key: PRNGKeyArray | None = None,
-    num_samples: int = 0,
-    shape: tuple[int, ...] = (),
-) -> Prediction:
-    """Predict with a model of the paper's kind, from the mean of the fused posterior.
-
-    The function is pure, and is compiled once per shape and subset of the inputs.
-
-    Args:
-        graphdef: The model's definition.
-        state: Its parameters and running batch statistics.
-        preprocessing: The preprocessing of its training.
-        blank: The tactile image of the untouched sensor, [0, 1].
-        inputs: Some of `visual`, `tactile` `(*n, height, width, 3)` in [0, 1] and `pose` `(*n, 7)`.
-        present: Which items of an input count, `(*n,)` (default: all). A touch without contact never counts, unless
-            the model was trained with blank images as inputs.
-        condition: `(*n, c)`, SI units, for models that have one.
-        key: The random key of the samples, consumed.
-        num_samples: Number of latents to draw besides the mean.
-        shape: The leading axes if there is no input. The prediction is then that of the prior.
-    """
-    lead = shape
-    for name, value in inputs.items():
-        lead = value.shape[: -1 if name == "pose" else -3]
-    flat, counts = _flat(preprocessing, inputs, present, lead, blank)
-    if flat:
-        posterior = mvae.infer(graphdef, state, flat, present=counts)
-    else:
-        nothing = jnp.zeros((math.prod(shape), nnx.merge(graphdef, state).config.latent))
-        posterior = mvae.Gaussian(nothing, nothing)
-    if condition is not None:
-        condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
-
-    def decode(z: Float[Array, "... latent"], shape: tuple[int, ...]) -> Prediction:
-        wide = None if condition is None else jnp.broadcast_to(condition, (*z.shape[:-1], condition.shape[-1]))
-        out = mvae.decode(graphdef, state, z, condition=wide)
-        out = {name: value.reshape(*shape, *value.shape[z.ndim - 1 :]) for name, value in out.items()}
-        return Prediction(
-            visual=jax.nn.sigmoid(out["visual"]) if "visual" in out else None,
-            tactile=jax.nn.sigmoid(out["tactile"]) if "tactile" in out else None,
-            pose=preprocessing.decode_pose(out["pose"]) if "pose" in out else None,
-            mean=posterior.mean.reshape(*lead, -1),
-            log_var=posterior.log_var.reshape(*lead, -1),
-        )
-
-    result = decode(posterior.mean, lead)
-    if num_samples and key is not None:
-        noise = jax.random.normal(key, (num_samples, *posterior.mean.shape))
-        z = posterior.mean[None] + jnp.exp(0.5 * posterior.log_var)[None] * noise
-        result = result._replace(samples=decode(z, (num_samples, *lead)))
-    return result
-
-
-@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
-def predict_samples(
-    graphdef: nnx.GraphDef,
-    state: nnx.State,
-    preprocessing: training.Preprocessing,
-    empty: dict[str, Float[Array, "h w 3"]],
-    inputs: dict[str, Float[Array, "..."]],
-    present: dict[str, Bool[Array, "*n"]],
-    condition: Float[Array, "..."] | None = None,
-    key: PRNGKeyArray | None = None,
-    num_samples: int = 0,
-    shape: tuple[int, ...] = (),
-) -> Prediction:
-    """Predict with a state-space model. Images are means over samples, and the pose is the most central sample.
-
-    Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
-    prediction. The arguments are those of `predict`, with three differences: `empty` holds both images of the untouched
-    sensor, [0, 1], `inputs` holds all inputs of the model (see `_completed`), and `shape` is their leading axes.
-    """
-    lead = shape
-    flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
-    if condition is not None:
-        condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
-    drawn = num_samples or _DRAWN
-    key = jax.random.key(0) if key is None else key
-    found = statespace.sample(graphdef, state, key, flat, counts, empty, condition, num=max(_POSES, drawn), drawn=drawn)
-    poses = preprocessing.decode_pose(found.pose)
-    images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in found.images.items()}
-    mean, log_var = (x.reshape(*lead, -1) for x in found.belief)
-    result = Prediction(
-        visual=found.mean["visual"].reshape(*lead, *found.mean["visual"].shape[1:]),
-        tactile=found.mean["tactile"].reshape(*lead, *found.mean["tactile"].shape[1:]),
-        pose=_central(poses).reshape(*lead, 7),
-        mean=mean,
-        log_var=log_var,
-        outcome_probability=found.outcome.reshape(*lead, -1),
-    )
-    if num_samples:
-        own = poses[:drawn].reshape(drawn, *lead, 7)
-        samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=own)
-        result = result._replace(samples=samples)
-    return result
-
-
-def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
-    """The pose of each item that has the least mean distance from the item's other poses."""
-    apart = jnp.linalg.norm(poses[:, None, :, :3] - poses[None, :, :, :3], axis=-1)
-    cosine = jnp.abs(jnp.einsum("inq,jnq->ijn", poses[..., 3:], poses[..., 3:]))
-    turned = 2 * jnp.arccos(jnp.clip(cosine, 0, 1))
-    best = jnp.argmin(jnp.mean(apart + _TURN * turned, axis=1), axis=0)
-    return jnp.take_along_axis(poses, best[None, :, None], axis=0)[0]
-
-
-def _completed(
-    names: tuple[str, ...],
-    resolution: tuple[int, int],
-    inputs: dict[str, Any],
-    present: dict[str, Any],
-    lead: tuple[int, ...],
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """All inputs of a model and their masks, so that one compiled program serves every subset.
-
-    Inputs that are not given are masked for all items.
-    """
-    lying = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
-    nothing = {
-        name: np.broadcast_to(lying, (*lead, 7)) if name == "pose" else np.zeros((*lead, *resolution, 3), np.float32)
-        for name in names
-        if name not in inputs
-    }
-    counts = {name: np.full(lead, name in inputs) for name in names} | present
-    return inputs | nothing, counts
-
-
-def _flat(
-    preprocessing: training.Preprocessing,
-    inputs: dict[str, Array],
-    present: dict[str, Array],
-    lead: tuple[int, ...],
-    blank: Float[Array, "h w 3"],
-) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Encoded inputs and their masks, with one leading axis."""
-    flat, counts = {}, {}
-    for name, value in inputs.items():
-        value = preprocessing.encode_pose(value) if name == "pose" else value
-        flat[name] = value.reshape(-1, *value.shape[len(lead) :])
-        counts[name] = present.get(name, jnp.ones(lead, bool)).reshape(-1)
-    if "tactile" in flat:
-        counts["tactile"] &= preprocessing.touched(flat["tactile"], blank)
-    return flat, counts
 
 
 class Predictor:
@@ -350,24 +169,24 @@ class Predictor:
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
             raise ValueError(f"the leading axes differ: {leads}. Give the same number of items of each modality.")
-        masks = _checked_masks(present, arrays, lead)
+        masks = _arguments.checked_masks(present, arrays, lead)
         valid: Array | None = None  # valid items, (*n,), or None if no value is traced
         for name, array in arrays.items():
             mask = masks.get(name)
-            if _traced(array) or _traced(mask):
-                fine = _plausible(name, jnp.asarray(array))
+            if _arguments.traced(array) or _arguments.traced(mask):
+                fine = _arguments.plausible(name, jnp.asarray(array))
                 fine = fine if mask is None else fine | ~mask
                 valid = fine if valid is None else valid & fine
             else:
-                _check_values(name, np.asarray(array if mask is None else array[mask]))
+                _arguments.check_values(name, np.asarray(array if mask is None else array[mask]))
         if state is not None:
             arrays["state"] = self._checked_state(state, lead)
         condition, plausible = self._checked_condition(condition, lead)
         if plausible is not None:
             valid = plausible if valid is None else valid & plausible
-        num_samples = _checked_samples(num_samples, key)
+        num_samples = _arguments.checked_samples(num_samples, key)
         result = self._predicted(arrays, masks, lead, condition, key if num_samples else None, num_samples)
-        return result if valid is None else _flagged(result, valid)
+        return result if valid is None else flagged(result, valid)
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
         """Predict from the prior, without any measurement, for items of any leading `shape`.
@@ -387,7 +206,7 @@ class Predictor:
             raise ValueError(f"shape is {shape}, but each size must be at least 1.")
         condition, plausible = self._checked_condition(condition, shape)
         result = self._predicted({}, {}, shape, condition, None, 0)
-        return result if plausible is None else _flagged(result, plausible)
+        return result if plausible is None else flagged(result, plausible)
 
     def _predicted(
         self,
@@ -412,7 +231,7 @@ class Predictor:
                 num_samples,
                 () if inputs else lead,
             )
-        inputs, present = _completed(self._inputs, view.resolution, inputs, present, lead)
+        inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
         return predict_samples(
             model.graphdef, model.state, view, self._empty, inputs, present, condition, key, num_samples, lead
         )
@@ -431,7 +250,7 @@ class Predictor:
                 f"{self.name} cannot use {name}: no first moment of its training had any (in freefall nothing "
                 f"touches the pad yet). Leave {name}= out, or use a model of another scenario."
             )
-        array = _checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
+        array = _arguments.checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(
                 f"{name} is {array.dtype}: give floats" + ("." if name == "pose" else " in [0, 1] (uint8 / 255).")
@@ -445,25 +264,25 @@ class Predictor:
             )
         if math.prod(array.shape) == 0:
             raise ValueError(f"{name} has shape {array.shape}, so there is no item in it: give at least one.")
-        return _float32(array)
+        return _arguments.float32(array)
 
     def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
         """Check a state code and return it as float32."""
         if isinstance(self.model.config, mvae.Config):
             raise ValueError(f"{self.name} takes no state: it is a model of the paper's kind, which has none.")
-        array = _checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
+        array = _arguments.checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
         if array.shape != (*lead, statespace.STATE_CODE):
             raise ValueError(f"state has shape {array.shape}, but it needs {(*lead, statespace.STATE_CODE)}.")
-        if not _traced(array) and not np.isfinite(array).all():
+        if not _arguments.traced(array) and not np.isfinite(array).all():
             raise ValueError("state has NaN or infinite values, but every item needs its true state.")
-        return _float32(array)
+        return _arguments.float32(array)
 
     def _checked_condition(
         self, value: Any, lead: tuple[int, ...]
     ) -> tuple[np.ndarray | Array | None, Bool[Array, "*n"] | None]:
         """Check a condition. Return it as float32 and, if it is traced, which items are plausible."""
         width = self.model.config.condition
-        array = None if value is None else _checked_array("condition", value, f"{width} numbers in SI units")
+        array = None if value is None else _arguments.checked_array("condition", value, f"{width} numbers in SI units")
         shape = None if array is None else array.shape
         if shape != (None if width == 0 else (*lead, width)):
             raise ValueError(f"condition has shape {shape}: {self.name} needs {(*lead, width) if width else 'none'}.")
@@ -471,9 +290,9 @@ class Predictor:
             return None, None
         if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
             raise ValueError(f"condition is {array.dtype}, but it must be numbers in SI units.")
-        condition = _float32(array)
+        condition = _arguments.float32(array)
         scale = np.array(self.preprocessing.condition_scale)
-        if _traced(condition):
+        if _arguments.traced(condition):
             return condition, jnp.all(jnp.abs(condition) <= _LARGEST_CONDITION * scale, axis=-1)
         if not np.isfinite(condition).all():
             raise ValueError("condition has NaN or infinite values, but every item needs a condition.")
@@ -514,110 +333,3 @@ def _check_view(name: str, config: statespace.Config, preprocessing: training.Pr
                 f"{name}: the state-space model needs preprocessing with {field}={wanted!r}, got {found!r}: train it "
                 "with that preprocessing."
             )
-
-
-def _traced(value: object) -> bool:
-    return isinstance(value, jax.core.Tracer)
-
-
-def _checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
-    if _traced(value):
-        return value
-    if isinstance(value, str | bytes | Path):
-        raise ValueError(
-            f"{name} is {value!r}, but it must be an array of {wanted}, not a path (for a picture: "
-            "np.asarray(PIL.Image.open(path)) / 255)."
-        )
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is not an array ({error}): give an array of {wanted}.") from error
-    if array.dtype.kind in "OUSMm":
-        raise ValueError(f"{name} is a {type(value).__name__}, but it must be an array of {wanted}.")
-    return array
-
-
-def _float32(array: np.ndarray | Array) -> np.ndarray | Array:
-    with np.errstate(over="ignore"):  # a number beyond the range of float32 becomes infinite, and is refused later
-        return array.astype(np.float32)
-
-
-def _checked_masks(
-    present: Any, arrays: dict[str, np.ndarray | Array], lead: tuple[int, ...]
-) -> dict[str, np.ndarray | Array]:
-    if not isinstance(present, Mapping | None):
-        raise ValueError(f"present is a {type(present).__name__}, but it must be a dict of bool arrays by modality.")
-    masks = {}
-    for name, value in (present or {}).items():
-        mask = _checked_array(f"present[{name!r}]", value, "bool")
-        if name not in arrays or mask.shape != lead:
-            raise ValueError(
-                f"present[{name!r}] has shape {mask.shape}, but it must mask a given modality, one of "
-                f"{list(arrays)}, with shape {lead}."
-            )
-        if mask.dtype != bool:
-            raise ValueError(f"present[{name!r}] is {mask.dtype}, but it must be bool, True for the items that count.")
-        masks[name] = mask
-    return masks
-
-
-def _checked_samples(num_samples: Any, key: Any) -> int:
-    try:
-        number = operator.index(num_samples)
-    except TypeError:
-        raise ValueError(
-            f"num_samples={num_samples!r}, but it must be a whole number. Inside jax.jit it must be a constant "
-            "(static_argnames makes it one)."
-        ) from None
-    if number < 0 or (number > 0 and key is None):
-        raise ValueError(f"num_samples={number}, but it must be >= 0, and needs a key if it is > 0.")
-    if key is not None and not (
-        isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
-    ):
-        shown = f"{key.dtype} of shape {key.shape}" if isinstance(key, jax.Array | np.ndarray) else repr(key)
-        raise ValueError(f"key is {shown}, but it must be one key, such as jax.random.key(0).")
-    return number
-
-
-def _plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
-    """Which items `_check_values` would accept."""
-    if name == "pose":
-        lengths = jnp.linalg.norm(jax.lax.stop_gradient(array[..., 3:]), axis=-1)
-        return (jnp.abs(lengths - 1) <= _QUAT_TOLERANCE) & (jnp.abs(array[..., :3]) <= _FARTHEST).all(-1)
-    return ((array >= 0) & (array <= 1)).all((-3, -2, -1))
-
-
-def _check_values(name: str, array: np.ndarray) -> None:
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} has NaN or infinite values: mask such items with present={{{name!r}: ...}}.")
-    if name == "pose":
-        lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
-        if lengths.size and np.abs(lengths - 1).max() > _QUAT_TOLERANCE:
-            raise ValueError(
-                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}: "
-                "give a position (m) and a unit quaternion [w, x, y, z]."
-            )
-        if array.size and np.abs(array[..., :3]).max() > _FARTHEST:
-            raise ValueError(f"pose has a position {np.abs(array[..., :3]).max():.3g} m away: give metres, not mm.")
-    elif array.size and (array.min() < 0 or array.max() > 1):
-        raise ValueError(
-            f"{name} has values in [{array.min():.3g}, {array.max():.3g}], but images are in [0, 1] (divide by 255?)."
-        )
-
-
-def _flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
-    """Set every number of the invalid items to NaN."""
-
-    def flag(leaf: Array, axes: int) -> Array:
-        return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)
-
-    images, numbers = functools.partial(flag, axes=3), functools.partial(flag, axes=1)
-    return Prediction(
-        visual=jax.tree.map(images, prediction.visual),  # None stays None
-        tactile=jax.tree.map(images, prediction.tactile),
-        pose=jax.tree.map(numbers, prediction.pose),
-        mean=numbers(prediction.mean),
-        log_var=numbers(prediction.log_var),
-        samples=None if prediction.samples is None else _flagged(prediction.samples, valid),
-        outcome_probability=jax.tree.map(numbers, prediction.outcome_probability),
-    )

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, JSON that cannot change unnoticed, checksums, and a lock on a folder."""
+"""Atomic writes, JSON files that cannot change unnoticed, checksums, and the lock on a folder."""
 
 import errno
 import hashlib
@@ -27,7 +27,7 @@ def test_an_interrupted_write_keeps_the_previous_file(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["a.txt"]
 
 
-def test_a_full_disk_is_named_with_the_file_and_leaves_nothing(tmp_path):
+def test_a_full_disk_gives_an_error_with_the_file_and_leaves_no_file(tmp_path):
     def full(temporary: Path) -> None:
         temporary.write_bytes(b"half")
         raise OSError(28, "No space left on device")
@@ -60,7 +60,7 @@ def test_a_folder_in_the_way_is_named(tmp_path):
         _files.write_bytes(tmp_path / "x.npz", b"")
 
 
-def test_a_fault_of_the_writer_itself_passes_unchanged(tmp_path):
+def test_an_error_of_the_writer_passes_unchanged(tmp_path):
     def wrong(temporary: Path) -> None:
         raise ValueError("not of this shape")
 
@@ -68,7 +68,7 @@ def test_a_fault_of_the_writer_itself_passes_unchanged(tmp_path):
         _files.write_whole(tmp_path / "x", wrong)
 
 
-def test_json_comes_back(tmp_path):
+def test_reading_inverts_writing(tmp_path):
     content = {"seed": 0, "sizes": [1, 2.5], "name": None}
     _files.write_json(tmp_path / "a.json", content)
     assert _files.read_json(tmp_path / "a.json", "delete it") == content
@@ -87,7 +87,7 @@ def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
     assert path.read_bytes() == content
 
 
-def test_a_folder_in_the_place_of_a_file_is_named(tmp_path):
+def test_a_folder_instead_of_a_file_is_named(tmp_path):
     (tmp_path / "a.json").mkdir()
     with pytest.raises(_files.TornFileError, match=r"a\.json.*delete it"):
         _files.read_json(tmp_path / "a.json", "delete it")
@@ -131,7 +131,7 @@ with _files.lock(Path(sys.argv[1])):
 """
 
 
-def test_a_folder_held_by_another_process_is_refused_until_that_ends(tmp_path):
+def test_a_folder_is_locked_until_the_process_that_holds_it_ends(tmp_path):
     folder = tmp_path / "runs" / "one"
     command = [sys.executable, "-c", HOLD, str(folder)]
     root = str(Path(_files.__file__).parents[1])
@@ -143,7 +143,7 @@ def test_a_folder_held_by_another_process_is_refused_until_that_ends(tmp_path):
             _files.lock(folder),
         ):
             pytest.fail("held twice")
-        other.kill()  # nothing is tidied up
+        other.kill()  # without any cleaning
         other.wait()
     with _files.lock(folder), pytest.raises(_files.LockedError, match=f"process {os.getpid()}"), _files.lock(folder):
         pytest.fail("held twice")
@@ -151,13 +151,13 @@ def test_a_folder_held_by_another_process_is_refused_until_that_ends(tmp_path):
         pass
 
 
-def test_an_error_in_the_block_passes_and_frees_the_folder(tmp_path):
+def test_an_error_in_the_block_passes_and_releases_the_lock(tmp_path):
     for _ in range(2):
         with pytest.raises(OSError, match=r"^of the block$"), _files.lock(tmp_path):
             raise OSError("of the block")
 
 
-def test_a_file_in_the_place_of_a_folder_cannot_be_held(tmp_path):
+def test_a_file_instead_of_a_folder_cannot_be_locked(tmp_path):
     path = tmp_path / "file"
     path.write_text("")
     for folder in (path, path / "below"):

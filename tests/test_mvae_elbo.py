@@ -1,4 +1,4 @@
-"""The bound: equal subsets computed once, masks, and a loop over subsets as the truth."""
+"""The bound against a loop over subsets and samples, with equal subsets computed once and with masks."""
 
 from itertools import combinations
 
@@ -80,7 +80,7 @@ def close(a, b, rtol=2e-4):
         (VECTORS, "all", ("a", "b", "c")),
     ],
 )
-def test_equal_subsets_once_are_the_plain_enumeration(config, asked, absent):
+def test_computing_equal_subsets_once_equals_plain_enumeration(config, asked, absent):
     inputs, targets = batch(config), batch(config, 1)
     masks = {name: jnp.zeros(BATCH, bool) for name in absent}
     plain = gradient(config, inputs, targets, present=masks, asked=asked)
@@ -88,7 +88,7 @@ def test_equal_subsets_once_are_the_plain_enumeration(config, asked, absent):
     close(plain, quick)
 
 
-def test_a_sample_that_has_nothing_else_keeps_its_empty_subsets():
+def test_a_sample_without_any_input_keeps_its_empty_subsets():
     inputs, targets = batch(VECTORS), batch(VECTORS, 1)
     nothing = jnp.arange(BATCH) < 2
     masks = {"a": ~nothing, "b": jnp.zeros(BATCH, bool), "c": ~nothing}
@@ -106,8 +106,8 @@ def test_an_input_that_is_not_given_is_absent():
 
 
 @pytest.mark.parametrize("asked", ["all", "own"])
-def test_the_loss_is_a_loop_over_subsets_and_samples(asked):
-    """Vectors only, so that samples are independent; noise from the definition of the key."""
+def test_the_loss_equals_a_loop_over_subsets_and_samples(asked):
+    """Vectors only, so that samples are independent. The noise follows from the key as documented."""
     inputs, targets = batch(VECTORS), batch(VECTORS, 1)
     rng = np.random.default_rng(5)
     present = {name: jnp.asarray(rng.random(BATCH) < 0.6).at[0].set(False) for name in VECTORS.names}
@@ -146,7 +146,7 @@ def test_the_loss_is_a_loop_over_subsets_and_samples(asked):
     np.testing.assert_allclose(terms.kl, kl / counted, rtol=1e-4)
 
 
-def test_what_fills_the_place_of_a_missing_modality_changes_no_bit():
+def test_the_values_of_a_masked_modality_change_no_bit():
     present = {
         "visual": jnp.array([1, 1, 0, 1, 0, 1], bool),
         "tactile": jnp.array([0, 1, 0, 1, 1, 0], bool),
@@ -168,7 +168,7 @@ def test_what_fills_the_place_of_a_missing_modality_changes_no_bit():
 
 
 @pytest.mark.parametrize("fill", [0.0, np.nan])
-def test_prediction_falls_back_to_what_is_present(fill):
+def test_a_prediction_uses_only_the_modalities_that_are_present(fill):
     inputs = batch(CONFIG)
     graphdef, params, stats = mvae.init(jax.random.key(0), CONFIG)
     state = nnx.merge_state(params, stats)
@@ -185,7 +185,7 @@ def test_prediction_falls_back_to_what_is_present(fill):
         np.testing.assert_allclose(got[name][~mask], alone[name][~mask], atol=1e-5)
 
 
-def test_nothing_present_is_the_prior():
+def test_the_posterior_without_inputs_is_the_prior():
     graphdef, params, stats = mvae.init(jax.random.key(0), CONFIG)
     state = nnx.merge_state(params, stats)
     posterior = mvae.infer(graphdef, state, batch(CONFIG), present={n: jnp.zeros(BATCH, bool) for n in CONFIG.names})
@@ -215,7 +215,7 @@ def test_bad_options_are_named(options, message):
         gradient(VECTORS, inputs, inputs, **options)
 
 
-def test_nothing_given_and_unknown_names_are_errors():
+def test_no_input_and_unknown_names_are_errors():
     graphdef, params, stats = mvae.init(jax.random.key(0), VECTORS)
     state = nnx.merge_state(params, stats)
     for inputs in ({}, {"sound": jnp.ones((2, 3))}):

@@ -41,7 +41,7 @@ def test_divergence_is_the_integral(mean, log_var):
 
 @pytest.mark.parametrize("subset", [(), (0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
 def test_linear_gaussian_model_has_its_exact_posterior_and_evidence(subset):
-    """z ~ N(0, I_2), x_m = a_m z_m' + noise: with exact experts the bound is the evidence, whatever the subset.
+    """With the exact experts of z ~ N(0, I_2), x_m = a_m z + noise, the bound of every subset equals the evidence.
 
     Each x_m observes both components through an orthogonal matrix, so the posterior is diagonal and each expert
     `p(x_m | z)`, as a Gaussian in z, is too.
@@ -53,7 +53,7 @@ def test_linear_gaussian_model_has_its_exact_posterior_and_evidence(subset):
     z = rng.normal(size=2)
     x = [a @ z + s * rng.normal(size=2) for a, s in zip(loadings, noise, strict=True)]
 
-    # The truth, by dense linear algebra.
+    # The truth by dense linear algebra
     precision = np.eye(2) + sum(loadings[m].T @ loadings[m] / noise[m] ** 2 for m in subset)
     mean = np.linalg.solve(precision, sum((loadings[m].T @ x[m] / noise[m] ** 2 for m in subset), np.zeros(2)))
     evidence = 0.0

@@ -34,7 +34,7 @@ def test_sizes_are_the_papers():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", [(32, 32, 3), (48, 64, 1)])
-def test_any_size_of_image_comes_back(shape):
+def test_the_decoder_returns_images_of_the_encoders_size(shape):
     config = mvae.Config((mvae.Modality("a", "image", shape),), latent=6, hidden=9, widths=(4, 4, 4, 4), condition=2)
     graphdef, params, stats = mvae.init(jax.random.key(0), config)
     state = nnx.merge_state(params, stats)
@@ -100,5 +100,5 @@ def test_an_untrained_model_uses_a_few_quiet_latents_and_leaves_the_others_at_th
         for k in (3, 100)
     ]
     nothing = mvae.decode(graphdef, nnx.merge_state(params, stats), jnp.zeros((1, 256)))["pose"]
-    heard, quiet = (float(np.linalg.norm(d - nothing)) for d in decoded)
-    assert heard > 10 * quiet > 0
+    loud, quiet = (float(np.linalg.norm(d - nothing)) for d in decoded)
+    assert loud > 10 * quiet > 0

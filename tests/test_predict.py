@@ -1,4 +1,4 @@
-"""The predictor's promises: any subset, any batch shape, clear errors, one compilation a shape and subset."""
+"""Predictors: any subset and batch shape, clear errors, one compilation per shape and subset."""
 
 import dataclasses
 import inspect
@@ -14,10 +14,11 @@ from statespace_config import STATE, random_states, state_model
 
 import sts_jax as sts
 from sts_jax import mvae, statespace, training
-from sts_jax.predict import MODELS, predict
+from sts_jax.predict import MODELS
+from sts_jax.prediction import predict
 
 SIDE = 32
-# As its users call it: without the tests' own checks of types and shapes.
+# Without the run-time type checks of the tests, as users call it.
 call = inspect.unwrap(sts.Predictor.__call__)
 
 
@@ -86,7 +87,7 @@ def test_any_subset_and_any_leading_axes(predictor, names, lead):
     np.testing.assert_allclose(np.linalg.norm(out.pose[..., 3:], axis=-1), 1, rtol=1e-5)
     assert np.all(out.pose[..., 3] >= 0)
     assert np.all((out.visual >= 0) & (out.visual <= 1))
-    if lead:  # an item's prediction does not depend on its neighbours
+    if lead:  # a prediction does not depend on the other items
         alone = predictor(**{name: value[(0,) * len(lead)] for name, value in given.items()})
         np.testing.assert_allclose(alone.visual, out.visual[(0,) * len(lead)], atol=1e-5)
 
@@ -122,7 +123,7 @@ def test_samples_scatter_about_the_mean(predictor):
     np.testing.assert_array_equal(out.samples.pose, again.samples.pose)
 
 
-def test_one_compilation_a_shape_and_subset(predictor):
+def test_each_shape_and_subset_is_compiled_once(predictor):
     predictor(pose=measurement(4)["pose"])
     before = predict._cache_size()
     for seed in range(3):
@@ -132,7 +133,7 @@ def test_one_compilation_a_shape_and_subset(predictor):
     assert predict._cache_size() == before + 1
 
 
-def test_with_nothing_the_prior_speaks(predictor):
+def test_the_prediction_without_inputs_is_that_of_the_prior(predictor):
     out = predictor.prior((2,))
     np.testing.assert_array_equal(out.mean, 0)
     np.testing.assert_array_equal(out.visual[0], out.visual[1])
@@ -162,13 +163,13 @@ def broken(name, change):
         ({**measurement(2), "num_samples": 3}, "needs a key"),
     ],
 )
-def test_what_cannot_be_answered_is_named(predictor, given, message):
+def test_each_invalid_input_is_named(predictor, given, message):
     with pytest.raises(ValueError, match=message):
         predictor(**given)
 
 
 @pytest.mark.slow
-def test_a_touch_that_training_never_saw_is_refused(tmp_path):
+def test_an_input_that_was_absent_in_training_is_refused(tmp_path):
     predictor = sts.Predictor.load(train(tmp_path / "mvae", absent=("tactile",)))
     assert predictor.modalities == ("visual", "pose")
     with pytest.raises(ValueError, match=r"mvae cannot use tactile"):
@@ -243,7 +244,7 @@ def test_a_model_without_preprocessing_is_named(folder, tmp_path, monkeypatch):
             sts.Predictor.load(folder)
 
 
-def test_a_saved_predictor_comes_back(predictor, tmp_path):
+def test_a_saved_predictor_is_loaded_unchanged(predictor, tmp_path):
     predictor.save(tmp_path / "copy")
     again = sts.Predictor.load(tmp_path / "copy")
     given = measurement(2)
@@ -255,11 +256,11 @@ def test_a_saved_predictor_comes_back(predictor, tmp_path):
             assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes()
     with pytest.raises(FileExistsError, match="copy is not an empty folder"):
         predictor.save(tmp_path / "copy")
-    with pytest.raises(ValueError, match=r"saved by Predictor\.save"):
-        train(tmp_path / "copy")
+    train(tmp_path / "copy")  # A finished training is only read, for which the optimiser's state is not needed.
+    assert [path.name for path in (tmp_path / "copy/checkpoints/00000002").iterdir() if path.is_dir()] == ["weights"]
 
 
-def test_reprs_fit_on_a_line(predictor, folder):
+def test_reprs_fit_on_one_line(predictor, folder):
     assert repr(predictor) == (
         f"Predictor('{folder}': takes visual, tactile, pose; predicts visual, tactile, pose; resolution=(32, 32), "
         "crop=False, condition=0, steps=2)"
@@ -285,7 +286,7 @@ def test_jit_and_vmap_predict_the_same(predictor):
     close(jax.jit(lambda present: predictor(**given, present=present))(present), masked)
 
 
-def test_the_gradient_of_a_prediction_is_its_slope(predictor):
+def test_the_gradient_of_a_prediction_equals_finite_differences(predictor):
     pose, way = measurement()["pose"], np.eye(7, dtype=np.float32)[1]
     height = jax.jit(lambda pose: 1e3 * predictor(pose=pose).pose[2])
     slope = jax.grad(height)(pose)[1]
@@ -310,7 +311,7 @@ def test_the_gradient_of_a_prediction_is_its_slope(predictor):
         ("pose", lambda x: x.at[0, 2].set(jnp.inf)),
     ],
 )
-def test_a_traced_item_that_would_be_refused_gives_nan_alone(predictor, name, change):
+def test_only_an_invalid_traced_item_gives_nan(predictor, name, change):
     given = {key: jnp.asarray(value) for key, value in measurement(2).items()}
     want = predictor(**given)
     wrong = {**given, name: change(given[name])}
@@ -371,19 +372,19 @@ POSE = measurement()["pose"]
         ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, SIDE, SIDE, 3))}, "the leading axes differ"),
     ],
 )
-def test_arguments_of_another_kind_are_named(predictor, given, message):
+def test_arguments_of_a_wrong_type_are_named(predictor, given, message):
     with pytest.raises(ValueError, match=message):
         call(predictor, **given)
 
 
 @pytest.mark.parametrize("shape", [3, (0,), (-1,), (1.5,), ("two",)])
-def test_a_prior_of_no_shape_is_named(predictor, shape):
+def test_an_invalid_shape_of_a_prior_is_named(predictor, shape):
     with pytest.raises(ValueError, match="shape is"):
         inspect.unwrap(sts.Predictor.prior)(predictor, shape)
 
 
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16, np.float64])
-def test_floats_of_any_precision_are_taken(predictor, dtype):
+def test_floats_of_any_precision_are_accepted(predictor, dtype):
     pose = np.array([0, 0, 0.5, 1, 0, 0, 0], np.float32)
     close(predictor(pose=pose.astype(dtype)), predictor(pose=pose))
 
@@ -414,7 +415,7 @@ def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
     np.testing.assert_allclose(out.visual, out.samples.visual.mean(0), atol=0.05)  # of sharp outlines
     np.testing.assert_allclose(np.linalg.norm(out.samples.pose[..., 3:], axis=-1), 1, rtol=1e-5)
     assert np.std(out.samples.pose[..., :3], axis=0).min() > 0
-    # A pose that is given is believed: its expert is by far the most precise.
+    # The belief has the given pose, because its expert is by far the most precise.
     code = state_predictor.preprocessing.encode_pose(jnp.asarray(given["pose"]))
     np.testing.assert_allclose(out.mean[:, :12], code, atol=0.02)
     for i in range(2):  # the pose is the most central sample
@@ -450,7 +451,7 @@ def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
     assert np.abs(slope).max() > 0
 
 
-def test_a_true_state_is_believed_and_a_wrong_one_refused(state_predictor, predictor):
+def test_a_true_state_determines_the_belief_and_a_wrong_one_is_refused(state_predictor, predictor):
     given, code = measurement(2), np.asarray(random_states(np.random.default_rng(0), 2))
     out = state_predictor(visual=given["visual"], condition=CONDITION, state=code)
     np.testing.assert_allclose(out.mean[:, : statespace.STATE_CODE], code, atol=2e-3)
@@ -468,7 +469,7 @@ def test_the_prior_of_a_state_space_model_is_standard_normal(state_predictor):
     assert np.abs(out.outcome_probability[0] - out.outcome_probability[1]).max() > 1e-4  # the condition differs
 
 
-def test_a_saved_state_space_model_comes_back(state_predictor, tmp_path):
+def test_a_saved_state_space_model_is_loaded_unchanged(state_predictor, tmp_path):
     state_predictor.save(tmp_path / "copy")
     again = sts.Predictor.load(tmp_path / "copy")
     jax.tree.map(np.testing.assert_array_equal, again.model.state, state_predictor.model.state)
@@ -550,14 +551,14 @@ def test_a_model_of_the_library_is_loaded_by_its_name(compact, predictor, tmp_pa
     assert sts.Predictor.load("falls").model.config == predictor.model.config
 
 
-# Shipped by experiments.ship, which also checks the size.
+# experiments.ship wrote them and checked their size.
 @pytest.mark.parametrize("name", sorted(path.parent.name for path in MODELS.glob("*/config.json")))
 def test_each_model_of_the_library_predicts_from_vision(name, tmp_path, monkeypatch):
     assert sum(path.stat().st_size for path in (MODELS / name).rglob("*") if path.is_file()) <= 12e6
     monkeypatch.chdir(tmp_path)
     predictor = sts.Predictor.load(name)
     visual = training.load_blank(MODELS / name)[0].astype(np.float32) / 255
-    visual[40:80, 50:70] *= 0.3  # something dark
+    visual[40:80, 50:70] *= 0.3  # a dark object
     condition = np.array(predictor.preprocessing.condition_scale) / 2
     out = predictor(visual=visual, condition=condition if condition.size else None)
     size = predictor.model.config.image_size

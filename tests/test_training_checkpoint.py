@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
 from sts_jax import _files, mvae, training
-from sts_jax.training import checkpoint, manifest
+from sts_jax.training import checkpoint, manifest, optimisers
 
 SMALL = mvae.Config((mvae.Modality("a", "vector", (3,)), mvae.Modality("b", "vector", (2,))), latent=4, hidden=8)
 CONFIG = training.TrainConfig(steps=4, batch_size=8, log_every=1, checkpoint_every=1)
@@ -56,7 +57,7 @@ def listed(folder):
 
 
 class Killed(BaseException):
-    """Passes every `except Exception`, as the end of a process does."""
+    """Not caught by `except Exception`, like the end of a process."""
 
 
 def test_every_single_bit_flip_is_found_and_named(folder):
@@ -104,13 +105,13 @@ def test_every_flip_in_the_manifest_is_found(folder):
         (lambda f: np.savez(f / "blank.npz", visual=IMAGE, tactile=IMAGE + 1), r"blank\.npz is not the file"),
         (lambda f: (f / "blank.npz").unlink(), r"blank\.npz is missing"),
         (lambda f: next((f / "checkpoints").rglob("_METADATA")).unlink(), "_METADATA is missing"),
-        (lambda f: (f / "checkpoints/00000004/state/more").write_bytes(b""), "more is not listed.*elsewhere"),
+        (lambda f: (f / "checkpoints/00000004/weights/more").write_bytes(b""), "more is not listed.*elsewhere"),
         (lambda f: (f / "manifest.json").write_text('{"step": '), r"manifest\.json cannot be read"),
         (lambda f: (f / "manifest.json").write_bytes(b"\x80"), r"manifest\.json cannot be read"),
         (lambda f: (f / "manifest.json").write_text("[]"), r"manifest\.json is damaged"),
     ],
 )
-def test_what_does_not_match_the_manifest_is_named(folder, damage, message):
+def test_each_mismatch_with_the_manifest_is_named(folder, damage, message):
     damage(folder)
     with pytest.raises(_files.TornFileError, match=message) as caught:
         training.load(folder)
@@ -132,7 +133,7 @@ def test_a_torn_checkpoint_gives_one_short_message(folder, capfd, caplog):
     out = capfd.readouterr()
     assert out.out + out.err + caplog.text == ""
     lines = "".join(traceback.format_exception(caught.value)).splitlines()
-    assert len(lines) < 150  # 102,000 when Orbax reads it; the checks of types in these tests add frames
+    assert len(lines) < 150  # Orbax alone prints 102,000. The type checks of these tests add frames.
 
 
 def test_a_checkpoint_of_another_model_gives_one_short_message(folder, state, capfd):
@@ -149,7 +150,7 @@ def test_a_folder_without_a_manifest_can_be_sealed(folder, finished):
     for read in (training.load, train):
         with pytest.raises(ValueError, match=r"no manifest\.json.*earlier version.*training\.seal\("):
             read(folder)
-    training.seal(str(folder))  # as the message words it
+    training.seal(str(folder))  # as the message advises
     same(training.load(folder).state, finished[1].state)
     with pytest.raises(ValueError, match="has a manifest"):
         training.seal(folder)
@@ -161,8 +162,8 @@ def test_a_folder_without_a_manifest_can_be_sealed(folder, finished):
 @pytest.mark.parametrize("moment", ["before the checkpoint", "before the manifest", "before the older one goes"])
 @pytest.mark.parametrize("at", [1, 3])
 def test_a_kill_inside_a_save_loses_nothing(tmp_path, finished, monkeypatch, moment, at):
-    """`finally` does not run when a process ends, so the cleaning is switched off, too."""
-    write, keep, orbax = manifest.write, checkpoint._keep_only, checkpoint.ocp.save
+    """A killed process does not run `finally`, so the test also disables the cleaning."""
+    write, keep, orbax = manifest.write, checkpoint._keep_only, checkpoint.ocp.save_checkpointables
 
     def die(*_):
         monkeypatch.setattr(checkpoint, "_keep_only", lambda *_: None)
@@ -182,13 +183,13 @@ def test_a_kill_inside_a_save_loses_nothing(tmp_path, finished, monkeypatch, mom
             die()
         return manifest.read(folder)
 
-    monkeypatch.setattr(checkpoint.ocp, "save", save)
+    monkeypatch.setattr(checkpoint.ocp, "save_checkpointables", save)
     monkeypatch.setattr(manifest, "write", seal)
     training.save_blank(tmp_path, IMAGE, IMAGE)
     with pytest.raises(Killed):
         train(tmp_path)
     monkeypatch.setattr(checkpoint, "_keep_only", keep)
-    monkeypatch.setattr(checkpoint.ocp, "save", orbax)
+    monkeypatch.setattr(checkpoint.ocp, "save_checkpointables", orbax)
     monkeypatch.setattr(manifest, "write", write)
     kept = at if moment == "before the older one goes" else at - 1
     assert manifest.read(tmp_path).step == (kept or None)
@@ -202,7 +203,7 @@ def test_a_kill_inside_a_save_loses_nothing(tmp_path, finished, monkeypatch, mom
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_full_disk_is_one_clear_error_and_keeps_the_checkpoint(folder, state):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))  # as on a full disk, writing beyond it is refused
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))  # a write beyond the limit fails, as on a full disk
     try:
         with pytest.raises(OSError, match=r"cannot write .*00000009.*Free some disk space.*step 4 is kept") as caught:
             training.save(folder, state._replace(step=jnp.int32(9)))
@@ -220,11 +221,11 @@ def test_a_full_disk_is_one_clear_error_and_keeps_the_checkpoint(folder, state):
 @pytest.mark.parametrize(
     "error", [RuntimeError("ABORTED\n" * 1000), ValueError("NO_SPACE"), ExceptionGroup("two", [OSError()])]
 )
-def test_whatever_orbax_raises_becomes_an_os_error(tmp_path, state, monkeypatch, error):
+def test_every_error_of_orbax_becomes_an_os_error(tmp_path, state, monkeypatch, error):
     def save(*_):
         raise error
 
-    monkeypatch.setattr(checkpoint.ocp, "save", save)
+    monkeypatch.setattr(checkpoint.ocp, "save_checkpointables", save)
     with pytest.raises(OSError, match=f"cannot write {tmp_path}.*no earlier checkpoint") as caught:
         training.save(tmp_path, state)
     assert len(str(caught.value).splitlines()) == 1
@@ -260,7 +261,7 @@ def test_a_blank_written_after_the_training_is_listed(tmp_path):
     assert "blank.npz" in listed(tmp_path)
     checkpoint.verified(tmp_path)
     (tmp_path / "blank.npz").unlink()
-    training.save_blank(tmp_path, IMAGE, IMAGE + 1)  # written anew, as the message of a damaged one advises
+    training.save_blank(tmp_path, IMAGE, IMAGE + 1)  # written again, as the message about a damaged file advises
     checkpoint.verified(tmp_path)
     np.testing.assert_array_equal(training.load_blank(tmp_path)[1], IMAGE + 1)
 
@@ -272,7 +273,7 @@ def test_a_damaged_blank_is_named(tmp_path, content):
         training.load_blank(tmp_path)
 
 
-def test_blanks_of_another_kind_are_named(tmp_path):
+def test_a_missing_or_incomplete_blank_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"blank\.npz is missing.*save_blank"):
         training.load_blank(tmp_path)
     for content in (
@@ -325,5 +326,46 @@ def test_a_config_of_another_version_is_named(folder, change):
         training.load(folder)
 
 
-def test_the_repr_of_a_model_is_one_line(finished):
+def test_the_repr_of_a_model_fits_on_one_line(finished):
     assert repr(finished[1]) == "Model(a vector (3,), b vector (2,); latent=4, condition=0, 325 numbers, step=4)"
+
+
+def undivided(folder, state):
+    """Rewrite the checkpoint of a folder as sts_jax 0.1 wrote it: weights and optimiser in one part."""
+    shutil.rmtree(folder / "checkpoints")
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    plain = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    path = manifest.checkpoint(folder, int(state.step))
+    path.parent.mkdir()
+    checkpoint.ocp.save(str(path), plain)
+    (folder / "manifest.json").unlink()
+    training.seal(folder)
+    assert (path / "state").is_dir()
+
+
+@pytest.mark.parametrize("at", [2, 4])
+def test_an_undivided_checkpoint_is_loaded_and_resumed_with_the_same_bits(folder, finished, stopped, tmp_path, at):
+    if at == 2:
+        folder = shutil.copytree(stopped, tmp_path / "stopped")
+    whole = training.restore(folder, training.initial(CONFIG, training.learner(SMALL), 4)[1])
+    assert int(whole.step) == at
+    undivided(folder, whole)
+    same(training.load(folder).state, nnx.merge_state(whole.params, whole.stats))
+    same(train(folder).state, finished[1].state)
+    same(training.load(folder).state, finished[1].state)
+    parts = {path.name for path in (folder / "checkpoints/00000004").iterdir() if path.is_dir()}
+    assert parts == ({"state"} if at == 4 else {"weights", "optimiser"})  # a finished run is not written
+
+
+def test_a_model_is_loaded_without_any_optimiser(folder, finished, stopped, tmp_path, monkeypatch):
+    begun = shutil.copytree(stopped, tmp_path / "stopped")
+    for path in (folder, begun):
+        shutil.rmtree(next(path.glob("checkpoints/*/optimiser")))
+        (path / "manifest.json").unlink()
+        training.seal(path)
+    with pytest.raises(ValueError, match=r"no state of this optimiser .* Predictor\.load reads this model either way"):
+        train(begun)
+    monkeypatch.setattr(optimisers, "optimiser", lambda *_: pytest.fail("an optimiser was built"))
+    same(training.load(folder).state, finished[1].state)
+    same(train(folder).state, finished[1].state)  # a finished run
+    assert training.load(begun).step == 2

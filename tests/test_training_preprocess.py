@@ -1,4 +1,4 @@
-"""Codes of poses: there and back, and what a network that is unsure says."""
+"""Codes of poses: encoding, decoding, and the short codes of an uncertain network."""
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ def poses(count):
 
 
 @pytest.mark.parametrize(("rotation", "size"), [("matrix", 12), ("quaternion", 7)])
-def test_a_code_comes_back_as_its_pose(rotation, size):
+def test_decoding_inverts_encoding(rotation, size):
     preprocessing, pose = training.Preprocessing(rotation=rotation), poses(200)
     code = preprocessing.encode_pose(pose)
     assert code.shape == (200, size) == (200, preprocessing.pose_size)
@@ -27,7 +27,7 @@ def test_a_code_comes_back_as_its_pose(rotation, size):
     np.testing.assert_allclose(preprocessing.encode_pose(flipped), code, atol=1e-6)
 
 
-def test_a_matrix_code_has_no_jump_where_the_quaternions_sign_has_one():
+def test_a_matrix_code_is_continuous_where_the_quaternion_changes_its_sign():
     around = jnp.array([0.0, 0.0, 1.0])
     turns = [geometry.quat_from_rotvec(angle * around) for angle in (jnp.pi - 1e-3, jnp.pi + 1e-3)]
     codes = {
@@ -40,7 +40,7 @@ def test_a_matrix_code_has_no_jump_where_the_quaternions_sign_has_one():
 
 
 @pytest.mark.parametrize("rotation", ["matrix", "quaternion"])
-def test_an_unsure_code_is_still_a_pose(rotation):
+def test_an_uncertain_code_is_decoded_to_a_valid_pose(rotation):
     preprocessing = training.Preprocessing(rotation=rotation)
     pose = poses(50)
     code = preprocessing.encode_pose(pose)

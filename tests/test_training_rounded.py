@@ -1,4 +1,4 @@
-"""Rounded weights: how far a weight moves, and how small the file is."""
+"""Rounded weights: the largest change of a weight, and the size of the file."""
 
 import numpy as np
 

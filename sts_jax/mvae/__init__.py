@@ -1,6 +1,6 @@
 """A multimodal variational autoencoder with a product of experts, independent of the sensor."""
 
-from sts_jax.mvae.conv import conv, conv_transpose
+from sts_jax.mvae.convolutions import conv, conv_transpose
 from sts_jax.mvae.elbo import Terms, decode, infer, loss, predict
 from sts_jax.mvae.gaussian import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.mvae.networks import MVAE, BatchNorm, Config, Modality, init

@@ -20,7 +20,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from sts_jax.mvae.conv import conv, conv_transpose
+from sts_jax.mvae.convolutions import conv, conv_transpose
 from sts_jax.mvae.gaussian import Gaussian
 
 _SIZE = 4  # side of every kernel
@@ -118,8 +118,8 @@ class _FromLatent(_Linear):
     def __init__(self, config: Config, size: int) -> None:
         super().__init__(config.latent + config.condition, size)
         rows = jnp.arange(config.latent + config.condition)
-        heard = (rows < _ACTIVE) | (rows >= config.latent)
-        self.kernel[...] = jnp.where(heard, 1.0, _QUIET)[:, None] * _spread(
+        used = (rows < _ACTIVE) | (rows >= config.latent)
+        self.kernel[...] = jnp.where(used, 1.0, _QUIET)[:, None] * _spread(
             self.kernel.shape, min(_ACTIVE, config.latent) + config.condition
         )
 

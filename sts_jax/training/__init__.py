@@ -1,25 +1,19 @@
 """Training of `sts_jax.statespace` and `sts_jax.mvae` models: arrays, loop, schedules and checkpoints."""
 
+from sts_jax.training.arrays import Arrays, order
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
-from sts_jax.training.moments import moments, paper_model, state_codes, state_model, state_moments
+from sts_jax.training.config import TrainConfig
+from sts_jax.training.learners import Learner, Loss, learner
+from sts_jax.training.loop import initial, step, train
+from sts_jax.training.model import Model, load
+from sts_jax.training.optimisers import optimiser
 from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
-from sts_jax.training.train import (
-    Arrays,
-    Learner,
-    Model,
-    TrainConfig,
-    initial,
-    learner,
-    load,
-    optimiser,
-    order,
-    step,
-    train,
-)
+from sts_jax.training.trajectories import moments, paper_model, state_codes, state_model, state_moments
 
 __all__ = [
     "Arrays",
     "Learner",
+    "Loss",
     "Model",
     "Preprocessing",
     "TrainConfig",

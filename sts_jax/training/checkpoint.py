@@ -2,8 +2,11 @@
 
 A model's folder holds `config.json` (the model, the run and the caller's preprocessing), `metrics.jsonl`,
 `checkpoints/STEP/` and `manifest.json`, which names the current checkpoint and holds the checksums of its files
-(`sts_jax.training.manifest`). If the process is killed while it writes a checkpoint, the previous one stays current. A
-checkpoint is written by Orbax, or as one small file (`sts_jax.training.rounded`).
+(`sts_jax.training.manifest`). If the process is killed while it writes a checkpoint, the previous one stays current.
+
+A checkpoint has two parts, `weights` and `optimiser`. A prediction reads the first part alone, so that another
+optimiser, or another version of optax, leaves every model readable. Orbax writes both parts. The weights may instead be
+one small file (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 hold both parts in one, which is still read.
 """
 
 import contextlib
@@ -22,6 +25,9 @@ from orbax.checkpoint import v1 as ocp
 
 from sts_jax import _files
 from sts_jax.training import manifest, rounded
+
+WEIGHTS, OPTIMISER = "weights", "optimiser"  # the parts of a checkpoint
+_UNDIVIDED = "state"  # the only part in checkpoints of sts_jax 0.1
 
 
 class TrainState(NamedTuple):
@@ -70,7 +76,8 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
             else:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with _quiet_orbax():
-                    ocp.save(str(path.absolute()), _plain(state))
+                    parts = {part: leaves for part, leaves in _parts(state).items() if leaves}
+                    ocp.save_checkpointables(str(path.absolute()), parts)
         except Exception as error:  # Orbax and TensorStore raise many types, with pages of traceback
             left = "no earlier checkpoint exists" if kept is None else f"the checkpoint of step {kept} is kept"
             raise OSError(
@@ -117,30 +124,46 @@ def read(path: Path, like: State) -> State:
     """Read the arrays of a checkpoint that `like` contains, and no others.
 
     Raises:
-        ValueError: the checkpoint lacks one of them, or has it with another shape or dtype.
+        ValueError: the checkpoint lacks one of them, or has it with another shape or dtype. The message names the part.
     """
-    wanted = _plain(like)
-    try:
-        loaded = (_read_rounded if (path / rounded.NAME).exists() else _read_orbax)(path, wanted)
-    except Exception as error:  # Orbax, TensorStore and zipfile raise many types, some with pages of traceback
-        raise ValueError(
-            f"{path} cannot be read ({type(error).__name__}: {_first_line(error)}): it was damaged before its "
-            "checksums were taken, or belongs to another model, or was saved by Predictor.save, which leaves out the "
-            "optimiser's state that training needs. Give another folder, or delete this one and train again."
-        ) from None
-    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in wanted])
+    loaded: dict[str, Array] = {}
+    for part, wanted in _parts(like).items():
+        try:
+            if (path / rounded.NAME).exists():
+                loaded |= _read_rounded(path, wanted)
+            else:
+                loaded |= _read_orbax(path, part, wanted)
+        except Exception as error:  # Orbax, TensorStore and zipfile raise many types, some with pages of traceback
+            reason = f"({type(error).__name__}: {_first_line(error)})"
+            if part == OPTIMISER:
+                raise ValueError(
+                    f"{path} has no state of this optimiser {reason}: its training used another optimiser, or "
+                    "Predictor.save wrote it, which leaves the optimiser's state out. Give the optimiser that the "
+                    "training began with, or train in another folder. Predictor.load reads this model either way."
+                ) from None
+            raise ValueError(
+                f"{path} cannot be read {reason}: it was damaged before its checksums were taken, or belongs to "
+                "another model. Give another folder, or delete this one and train again."
+            ) from None
+    return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
 
-def _read_orbax(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
+def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Array]:
+    stored = part if (path / part).is_dir() else _UNDIVIDED
+    if not wanted and stored != part:
+        return {}  # of an optimiser without arrays
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     abstract = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in wanted.items()}
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     with _quiet_orbax():
         # Compare first, because Orbax cuts or pads arrays of another shape, or prints thousands of lines.
-        _compare(ocp.metadata(str(path.absolute())).metadata, wanted)
+        there = ocp.metadata(str(path.absolute()), stored).metadata
+        _compare(there, wanted)
+        if stored == OPTIMISER and there.keys() != wanted.keys():
+            raise ValueError(f"{min(there.keys() - wanted.keys())} belongs to another optimiser")
         with context:
-            return ocp.load(str(path.absolute()), abstract)
+            return ocp.load(str(path.absolute()), abstract, checkpointable_name=stored)
 
 
 def _read_rounded(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
@@ -220,3 +243,11 @@ def _plain(state: TrainState | Weights) -> dict[str, Any]:
     """The leaves by path, so that the files do not depend on the classes of Flax and optax."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _parts(state: TrainState | Weights) -> dict[str, dict[str, Any]]:
+    """The leaves of each part of a checkpoint."""
+    leaves = _plain(state)
+    optimiser = {name: leaf for name, leaf in leaves.items() if name.startswith(f"{OPTIMISER}/")}
+    weights = {name: leaf for name, leaf in leaves.items() if name not in optimiser}
+    return {WEIGHTS: weights, OPTIMISER: optimiser} if isinstance(state, TrainState) else {WEIGHTS: weights}

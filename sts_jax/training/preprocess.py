@@ -55,8 +55,8 @@ class Preprocessing:
             quat = geometry.quat_from_matrix(quat.reshape(*quat.shape[:-1], 3, 3))
         else:
             quat = geometry.quat_canonical(quat)
-        said = jnp.any(code[..., 3:] != 0, -1, keepdims=True)
-        quat = jnp.where(said, quat, jnp.array([1.0, 0, 0, 0]))
+        given = jnp.any(code[..., 3:] != 0, -1, keepdims=True)
+        quat = jnp.where(given, quat, jnp.array([1.0, 0, 0, 0]))
         return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
 
     def encode_condition(self, condition: Float[Array, "*n c"]) -> Float[Array, "*n c"]:

@@ -1,4 +1,4 @@
-"""The quick convolutions against XLA's own, in values and gradients."""
+"""Convolutions and their gradients against those of XLA."""
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ def agree(ours, theirs, x, kernel):
         (12, 11, 2, 3, 6, 3, 0),
     ],
 )
-def test_conv_is_that_of_xla(h, w, channels, out, size, stride, padding):
+def test_conv_equals_that_of_xla(h, w, channels, out, size, stride, padding):
     def theirs(x, k):
         return jax.lax.conv_general_dilated(x, k, (stride, stride), [(padding, padding)] * 2, dimension_numbers=LAYOUT)
 
@@ -61,7 +61,7 @@ def test_conv_is_that_of_xla(h, w, channels, out, size, stride, padding):
         (4, 3, 2, 3, 6, 3, 2),
     ],
 )
-def test_conv_transpose_is_that_of_xla(h, w, channels, out, size, stride, padding):
+def test_conv_transpose_equals_that_of_xla(h, w, channels, out, size, stride, padding):
     def theirs(x, k):
         pads = [(size - 1 - padding,) * 2] * 2
         return jax.lax.conv_transpose(x, k[::-1, ::-1], (stride, stride), pads, dimension_numbers=LAYOUT)

@@ -9,8 +9,8 @@ import numpy as np
 from sts_jax import mvae, optics, physics, statespace
 from sts_jax.dataset import Ends, Pairs, Views, reduced
 from sts_jax.sensor import Sensor
+from sts_jax.training.arrays import Arrays
 from sts_jax.training.preprocess import Preprocessing
-from sts_jax.training.train import Arrays
 
 SOME = 512  # items that are encoded at once
 

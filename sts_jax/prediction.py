@@ -1,0 +1,209 @@
+"""Predictions, and the pure functions that compute them from a model's parameters."""
+
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from sts_jax import mvae, statespace, training
+
+_POSES = 64  # samples of the final pose, from which the prediction of a state-space model is chosen
+_DRAWN = 16  # samples that are drawn as images if `num_samples` is 0 (the predicted images are their means)
+_TURN = 0.02  # m, weight of one radian in the choice of the pose
+
+
+class Prediction(NamedTuple):
+    """A predicted last moment. Modalities that the model lacks are None."""
+
+    visual: Float[Array, "*n h w 3"] | None  # [0, 1]
+    tactile: Float[Array, "*n h w 3"] | None  # [0, 1]
+    pose: Float[Array, "*n 7"] | None  # m, unit quaternion with w >= 0, mesh frame in the sensor frame
+    mean: Float[Array, "*n latent"]  # mean of the fused posterior
+    log_var: Float[Array, "*n latent"]  # its log variance
+    samples: "Prediction | None" = None  # samples on a leading axis, each from its own latent
+    # Probability of each of the scenario's `outcomes`, in their order (None for a model of the paper's kind)
+    outcome_probability: Float[Array, "*n outcomes"] | None = None
+
+    def __repr__(self) -> str:
+        shapes = (
+            f"{name}={leaf.dtype}{list(leaf.shape)}" if isinstance(leaf, jax.Array | np.ndarray) else f"{name}={leaf!r}"
+            for name, leaf in zip(self._fields, self, strict=True)
+        )
+        return f"Prediction({', '.join(shapes)})"
+
+
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
+def predict(
+    graphdef: nnx.GraphDef,
+    state: nnx.State,
+    preprocessing: training.Preprocessing,
+    blank: Float[Array, "h w 3"],
+    inputs: dict[str, Float[Array, "..."]],
+    present: dict[str, Bool[Array, "*n"]],
+    condition: Float[Array, "..."] | None = None,
+    key: PRNGKeyArray | None = None,
+    num_samples: int = 0,
+    shape: tuple[int, ...] = (),
+) -> Prediction:
+    """Predict with a model of the paper's kind, from the mean of the fused posterior.
+
+    The function is pure, and is compiled once per shape and subset of the inputs.
+
+    Args:
+        graphdef: The model's definition.
+        state: Its parameters and running batch statistics.
+        preprocessing: The preprocessing of its training.
+        blank: The tactile image of the untouched sensor, [0, 1].
+        inputs: Some of `visual`, `tactile` `(*n, height, width, 3)` in [0, 1] and `pose` `(*n, 7)`.
+        present: Which items of an input count, `(*n,)` (default: all). A touch without contact never counts, unless
+            the model was trained with blank images as inputs.
+        condition: `(*n, c)`, SI units, for models that have one.
+        key: The random key of the samples, consumed.
+        num_samples: Number of latents to draw besides the mean.
+        shape: The leading axes if there is no input. The prediction is then that of the prior.
+    """
+    lead = shape
+    for name, value in inputs.items():
+        lead = value.shape[: -1 if name == "pose" else -3]
+    flat, counts = _flat(preprocessing, inputs, present, lead, blank)
+    if flat:
+        posterior = mvae.infer(graphdef, state, flat, present=counts)
+    else:
+        nothing = jnp.zeros((math.prod(shape), nnx.merge(graphdef, state).config.latent))
+        posterior = mvae.Gaussian(nothing, nothing)
+    if condition is not None:
+        condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
+
+    def decode(z: Float[Array, "... latent"], shape: tuple[int, ...]) -> Prediction:
+        wide = None if condition is None else jnp.broadcast_to(condition, (*z.shape[:-1], condition.shape[-1]))
+        out = mvae.decode(graphdef, state, z, condition=wide)
+        out = {name: value.reshape(*shape, *value.shape[z.ndim - 1 :]) for name, value in out.items()}
+        return Prediction(
+            visual=jax.nn.sigmoid(out["visual"]) if "visual" in out else None,
+            tactile=jax.nn.sigmoid(out["tactile"]) if "tactile" in out else None,
+            pose=preprocessing.decode_pose(out["pose"]) if "pose" in out else None,
+            mean=posterior.mean.reshape(*lead, -1),
+            log_var=posterior.log_var.reshape(*lead, -1),
+        )
+
+    result = decode(posterior.mean, lead)
+    if num_samples and key is not None:
+        noise = jax.random.normal(key, (num_samples, *posterior.mean.shape))
+        z = posterior.mean[None] + jnp.exp(0.5 * posterior.log_var)[None] * noise
+        result = result._replace(samples=decode(z, (num_samples, *lead)))
+    return result
+
+
+@functools.partial(jax.jit, static_argnames=("graphdef", "preprocessing", "num_samples", "shape"))
+def predict_samples(
+    graphdef: nnx.GraphDef,
+    state: nnx.State,
+    preprocessing: training.Preprocessing,
+    empty: dict[str, Float[Array, "h w 3"]],
+    inputs: dict[str, Float[Array, "..."]],
+    present: dict[str, Bool[Array, "*n"]],
+    condition: Float[Array, "..."] | None = None,
+    key: PRNGKeyArray | None = None,
+    num_samples: int = 0,
+    shape: tuple[int, ...] = (),
+) -> Prediction:
+    """Predict with a state-space model. Images are means over samples, and the pose is the most central sample.
+
+    Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
+    prediction. The arguments are those of `predict`, with three differences: `empty` holds both images of the untouched
+    sensor, [0, 1], `inputs` holds all inputs of the model (see `completed`), and `shape` is their leading axes.
+    """
+    lead = shape
+    flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
+    if condition is not None:
+        condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
+    drawn = num_samples or _DRAWN
+    key = jax.random.key(0) if key is None else key
+    found = statespace.sample(graphdef, state, key, flat, counts, empty, condition, num=max(_POSES, drawn), drawn=drawn)
+    poses = preprocessing.decode_pose(found.pose)
+    images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in found.images.items()}
+    mean, log_var = (x.reshape(*lead, -1) for x in found.belief)
+    result = Prediction(
+        visual=found.mean["visual"].reshape(*lead, *found.mean["visual"].shape[1:]),
+        tactile=found.mean["tactile"].reshape(*lead, *found.mean["tactile"].shape[1:]),
+        pose=_central(poses).reshape(*lead, 7),
+        mean=mean,
+        log_var=log_var,
+        outcome_probability=found.outcome.reshape(*lead, -1),
+    )
+    if num_samples:
+        own = poses[:drawn].reshape(drawn, *lead, 7)
+        samples = result._replace(visual=images["visual"], tactile=images["tactile"], pose=own)
+        result = result._replace(samples=samples)
+    return result
+
+
+def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
+    """The pose of each item that has the least mean distance from the item's other poses."""
+    apart = jnp.linalg.norm(poses[:, None, :, :3] - poses[None, :, :, :3], axis=-1)
+    cosine = jnp.abs(jnp.einsum("inq,jnq->ijn", poses[..., 3:], poses[..., 3:]))
+    turned = 2 * jnp.arccos(jnp.clip(cosine, 0, 1))
+    best = jnp.argmin(jnp.mean(apart + _TURN * turned, axis=1), axis=0)
+    return jnp.take_along_axis(poses, best[None, :, None], axis=0)[0]
+
+
+def completed(
+    names: tuple[str, ...],
+    resolution: tuple[int, int],
+    inputs: dict[str, Any],
+    present: dict[str, Any],
+    lead: tuple[int, ...],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """All inputs of a model and their masks, so that one compiled program serves every subset.
+
+    Inputs that are not given are masked for all items.
+    """
+    lying = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
+    nothing = {
+        name: np.broadcast_to(lying, (*lead, 7)) if name == "pose" else np.zeros((*lead, *resolution, 3), np.float32)
+        for name in names
+        if name not in inputs
+    }
+    counts = {name: np.full(lead, name in inputs) for name in names} | present
+    return inputs | nothing, counts
+
+
+def _flat(
+    preprocessing: training.Preprocessing,
+    inputs: dict[str, Array],
+    present: dict[str, Array],
+    lead: tuple[int, ...],
+    blank: Float[Array, "h w 3"],
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Encoded inputs and their masks, with one leading axis."""
+    flat, counts = {}, {}
+    for name, value in inputs.items():
+        value = preprocessing.encode_pose(value) if name == "pose" else value
+        flat[name] = value.reshape(-1, *value.shape[len(lead) :])
+        counts[name] = present.get(name, jnp.ones(lead, bool)).reshape(-1)
+    if "tactile" in flat:
+        counts["tactile"] &= preprocessing.touched(flat["tactile"], blank)
+    return flat, counts
+
+
+def flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
+    """Set every number of the invalid items to NaN."""
+
+    def flag(leaf: Array, axes: int) -> Array:
+        return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)
+
+    images, numbers = functools.partial(flag, axes=3), functools.partial(flag, axes=1)
+    return Prediction(
+        visual=jax.tree.map(images, prediction.visual),  # None stays None
+        tactile=jax.tree.map(images, prediction.tactile),
+        pose=jax.tree.map(numbers, prediction.pose),
+        mean=numbers(prediction.mean),
+        log_var=numbers(prediction.log_var),
+        samples=None if prediction.samples is None else flagged(prediction.samples, valid),
+        outcome_probability=jax.tree.map(numbers, prediction.outcome_probability),
+    )

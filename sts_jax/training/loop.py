@@ -1,0 +1,211 @@
+"""The training loop: a Python loop over one compiled step, because convolutions in `lax.scan` are slow on a CPU."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import nnx
+from jaxtyping import Array
+
+from sts_jax import _files
+from sts_jax.training import manifest, optimisers, records
+from sts_jax.training.arrays import Arrays, Batch, order
+from sts_jax.training.checkpoint import TrainState, restore, save
+from sts_jax.training.config import TrainConfig
+from sts_jax.training.learners import Config, Learner, Loss, Terms, learner
+from sts_jax.training.model import KINDS, Model, load
+
+Progress = Callable[[int, int, dict[str, float]], None]  # takes the steps done, their total, and the latest record
+Log = Callable[[int, dict[str, float]], None]  # takes the step of a record, and its other numbers by name
+
+
+def initial(
+    config: TrainConfig, learner: Learner, total: int, optimiser: optax.GradientTransformation | None = None
+) -> tuple[nnx.GraphDef[Any], TrainState]:
+    """Initialise a model and its training state from `config.seed`. The arguments are those of `step`."""
+    graphdef, params, stats = learner.init(jax.random.key(config.seed))
+    optimiser = optimiser or optimisers.optimiser(config, total)
+    return graphdef, TrainState(params, stats, optimiser.init(params), jnp.zeros((), jnp.int32))
+
+
+def step(
+    learner: Learner,
+    graphdef: nnx.GraphDef[Any],
+    config: TrainConfig,
+    total: int,
+    state: TrainState,
+    batch: Batch,
+    optimiser: optax.GradientTransformation | None = None,
+) -> tuple[TrainState, Terms]:
+    """Take one gradient step. The state keeps its structure and dtypes.
+
+    Args:
+        learner: the loss.
+        graphdef: definition of the model.
+        config: options of the training run.
+        total: steps of the whole run, which determine beta and the learning rate.
+        state: the state before the step.
+        batch: from `Arrays.take`. Images in uint8 become float32 in [0, 1] here.
+        optimiser: the optimiser of `state` (default: that of `training.optimiser`).
+
+    Returns:
+        The state after the step, and the parts of the loss before it.
+    """
+    batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
+    # Half of the split is unused. Another stream would be as good, but the published results were made with this one.
+    noise, _ = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
+    warmup = max(config.beta_warmup * total, 1)
+    beta = jnp.minimum(state.step.astype(jnp.float32) / warmup, 1)
+
+    def objective(params: nnx.State) -> tuple[Array, tuple[nnx.State, Terms]]:
+        return learner.loss(graphdef, params, state.stats, noise, batch, beta)
+
+    gradient, (stats, terms) = jax.grad(objective, has_aux=True)(state.params)
+    if "loss" not in terms:
+        raise ValueError(f"loss returned the parts {sorted(terms)}, but one of them must be `loss`: add it, see Loss")
+    optimiser = optimiser or optimisers.optimiser(config, total)
+    update, rest = optimiser.update(gradient, state.optimiser, state.params)
+    return TrainState(optax.apply_updates(state.params, update), stats, rest, state.step + 1), terms
+
+
+def train(
+    config: TrainConfig,
+    model: Config,
+    arrays: Arrays,
+    *,
+    workdir: str | os.PathLike[str],
+    absent: tuple[str, ...] = (),
+    targets: Literal["all", "own"] = "all",
+    preprocessing: dict[str, Any] | None = None,
+    loss: Loss | None = None,
+    optimiser: optax.GradientTransformation | None = None,
+    notes: dict[str, Any] | None = None,
+    progress: Progress | None = None,
+    log: Log | None = None,
+) -> Model:
+    """Train a model in `workdir`, or resume where an earlier call stopped.
+
+    On one machine, a run that was killed and resumed gives the same parameters, to the last bit, as an uninterrupted
+    one. A finished run is only read. Other entries in `workdir` are not changed. One process at a time can train in a
+    folder.
+
+    Args:
+        config: options of the training run.
+        model: configuration of the model.
+        arrays: the training set.
+        workdir: the model's folder, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
+        absent: for `mvae` models, modalities that no sample has. `arrays.inputs` may lack them.
+        targets: for `mvae` models, `all` or `own`, see `mvae.loss`.
+        preprocessing: plain values for `config.json` that describe how images and vectors were made.
+        loss: another loss than that of `training.learner`. Its dependence on `targets` and `absent` is up to the
+            caller.
+        optimiser: another optimiser than that of `training.optimiser`. The fields of `config` for Adam, the learning
+            rate and the clipping are then not used.
+        notes: plain values for `config.json` that name the given loss and optimiser. Functions cannot be compared, but
+            a folder with other notes is refused.
+        progress: called after every step with the steps done, their total, and the latest record of
+            `metrics.jsonl` (empty before the first).
+        log: called with the step and the values of each record. Records of earlier calls on the same folder come
+            first, so that every call passes the records of the whole run, once each and in order.
+
+    Returns:
+        The trained model.
+
+    Raises:
+        ValueError: `workdir` was made with other settings or data, or holds a checkpoint without a manifest or of
+            another optimiser, or the arrays contradict `absent` or lack a modality.
+        OSError: a file in `workdir` is damaged or cannot be written.
+        LockedError: another process trains in `workdir`.
+        FloatingPointError: the loss is no longer finite.
+    """
+    workdir = Path(workdir)
+    total = config.total(len(arrays))
+    task = learner(model, targets=targets, absent=absent)
+    task.check(arrays)
+    if loss is not None:
+        task = task._replace(loss=loss)
+    settings = {
+        "kind": next(name for name, kind in KINDS.items() if isinstance(model, kind)),
+        "model": model.to_json(),
+        "training": asdict(config),
+        "targets": targets,
+        "absent": list(absent),
+        "data": {"samples": len(arrays), "checksum": arrays.checksum()},
+        "preprocessing": preprocessing or {},
+    }
+    for name, function in (("loss", loss), ("optimiser", optimiser)):
+        if function is not None:
+            settings[name] = f"given as {name}="
+    if notes:
+        settings["notes"] = notes
+    settings = json.loads(json.dumps(settings))
+    there = manifest.read(workdir)
+    if there is not None and there.step == total:  # takes no lock, because a lock writes a file
+        _files.claim(workdir / "config.json", settings)
+        _send(records.read(workdir / records.NAME, total), log)
+        return load(workdir)
+    with _files.lock(workdir):
+        _files.claim(workdir / "config.json", settings)
+        optimiser = optimiser or optimisers.optimiser(config, total)
+        graphdef, state = initial(config, task, total, optimiser)
+        state = restore(workdir, state) or state
+        take = jax.jit(
+            lambda state, batch: step(task, graphdef, config, total, state, batch, optimiser), donate_argnums=0
+        )
+        state = _run(config, arrays, workdir, state, take, progress, log)
+    return Model(model, graphdef, nnx.merge_state(state.params, state.stats), int(state.step), settings)
+
+
+def _run(
+    config: TrainConfig,
+    arrays: Arrays,
+    workdir: Path,
+    state: TrainState,
+    take: Callable[[TrainState, Batch], tuple[TrainState, Terms]],
+    progress: Progress | None,
+    log: Log | None,
+) -> TrainState:
+    """Take the remaining steps, with a record every `log_every` and a checkpoint every `checkpoint_every` steps."""
+    start, total, path = int(state.step), config.total(len(arrays)), workdir / records.NAME
+    kept = records.read(path, start)
+    records.write(path, kept)  # drops the records after the checkpoint, which the steps below write again
+    _send(kept, log)
+    record = kept[-1] if kept else {}
+    further = {
+        name: order(config.seed + 1, len(own["state"]), size, start, total)
+        for name, own, size in (("views", arrays.views, config.views), ("falls", arrays.falls, config.falls))
+        if own and size
+    }
+    recent: list[Terms] = []
+    for done, index in enumerate(order(config.seed, len(arrays), config.batch_size, start, total), start + 1):
+        rows = {name: next(batches) for name, batches in further.items()}
+        state, terms = take(state, arrays.take(index, **rows))
+        recent.append(jax.block_until_ready(terms))
+        if done % config.log_every == 0 or done == total:
+            record = records.mean(done, recent)
+            recent = []
+            records.append(path, record)
+            _send([record], log)
+            if not np.isfinite(record["loss"]):
+                raise FloatingPointError(
+                    f"{workdir}: the loss is {record['loss']} at step {done}: lower the learning rate, or clip the "
+                    f"gradient (TrainConfig has learning_rate={config.learning_rate} and clip={config.clip}, which a "
+                    "given optimiser does not use)"
+                )
+        if done % config.checkpoint_every == 0 or done == total:
+            save(workdir, state)
+        if progress is not None:
+            progress(done, total, record)
+    return state
+
+
+def _send(some: list[records.Record], log: Log | None) -> None:
+    for record in some if log is not None else ():
+        log(int(record["step"]), {name: value for name, value in record.items() if name != "step"})

@@ -1,0 +1,88 @@
+"""Trained models, and their loading from a folder. The optimiser plays no part in it."""
+
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from sts_jax import _files, mvae, statespace
+from sts_jax.training import manifest
+from sts_jax.training.checkpoint import Weights, read, verified
+from sts_jax.training.learners import Config, learner
+
+KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.Config}  # by `kind` in `config.json`
+
+
+class Model(NamedTuple):
+    """A trained model. `mvae.predict` and `statespace.sample` take its `graphdef` and `state`."""
+
+    config: Config
+    graphdef: nnx.GraphDef[Any]
+    state: nnx.State  # parameters and running batch statistics
+    step: int  # gradient steps done
+    settings: dict[str, Any]  # content of config.json: `model`, `training`, `preprocessing`, ...
+
+    def __repr__(self) -> str:
+        config, numbers = self.config, sum(x.size for x in jax.tree.leaves(self.state))
+        if isinstance(config, mvae.Config):
+            made = ", ".join(f"{m.name} {m.kind} {m.shape}" for m in config.modalities) + f"; latent={config.latent}"
+        else:
+            made = f"{', '.join(config.inputs)}; look={config.look}, outcomes={config.outcomes}"
+        return f"Model({made}, condition={config.condition}, {numbers:,} numbers, step={self.step})"
+
+
+def load(workdir: str | os.PathLike[str]) -> Model:
+    """Load a trained model from its folder alone.
+
+    Every file is compared with its checksum before it is used. A training may run in the folder meanwhile. The
+    optimiser's state is not read, so that it may be of any optimiser, or missing.
+
+    Args:
+        workdir: the `workdir` that was given to `train`.
+
+    Returns:
+        The model at its newest checkpoint.
+
+    Raises:
+        FileNotFoundError: the folder has no `config.json` or no checkpoint.
+        OSError: a file is damaged, missing or not listed in `manifest.json`.
+        ValueError: `config.json` was written by another version of sts_jax, or the folder has no manifest.
+    """
+    workdir = Path(workdir)
+    while True:
+        before = manifest.read(workdir)
+        try:
+            return _load(workdir)
+        except (OSError, ValueError):
+            if manifest.read(workdir) == before:
+                raise
+            # A training has replaced the checkpoint while it was read, so read the new one.
+
+
+def _load(workdir: Path) -> Model:
+    path = workdir / "config.json"
+    if not path.exists():
+        raise FileNotFoundError(f"{workdir} has no config.json: give the folder of a trained model, or train one there")
+    checkpoint = verified(workdir)
+    settings = _files.read_json(path, f"delete {workdir} and train again")
+    if checkpoint is None:
+        raise FileNotFoundError(f"{workdir} has no checkpoint: run its training to the first one")
+    try:
+        kind = settings.get("kind", "mvae")  # version 0.1 had no other kind
+        model = KINDS[kind].from_json(settings["model"])
+        like = jax.eval_shape(lambda: Weights(*learner(model).init(jax.random.key(0))[1:], jnp.zeros((), jnp.int32)))
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}): load it with the "
+            f"version that trained it, or delete {workdir} and train again"
+        ) from error
+    weights = read(checkpoint, like)
+    graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))
+    return Model(model, graphdef, nnx.merge_state(weights.params, weights.stats), int(weights.step), settings)
+
+
+def _module(model: Config) -> nnx.Module:
+    return mvae.MVAE(model) if isinstance(model, mvae.Config) else statespace.Model(model, nnx.Rngs(0))

@@ -1,0 +1,39 @@
+"""The default optimiser."""
+
+from typing import Any
+
+import jax
+import optax
+
+from sts_jax.training.config import TrainConfig
+
+
+def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
+    """Adam as configured, with `encoder_epsilon` for the encoders of an `mvae` model.
+
+    Args:
+        config: options of the training run.
+        total: steps of the whole run, at the end of which a cosine schedule reaches 0.
+    """
+    rate: float | optax.Schedule = config.learning_rate
+    if config.schedule == "cosine":
+        rate = optax.cosine_decay_schedule(config.learning_rate, total - config.warmup)
+    if config.warmup:
+        rise = optax.linear_schedule(0.0, config.learning_rate, config.warmup)
+        rest = rate if callable(rate) else optax.constant_schedule(rate)
+        rate = optax.join_schedules([rise, rest], [config.warmup])
+
+    def adam(epsilon: float) -> optax.GradientTransformation:
+        return optax.adam(rate, b1=config.b1, b2=config.b2, eps=epsilon)
+
+    parts = {"encoders": adam(config.encoder_epsilon), "others": adam(config.epsilon)}
+    adams = optax.partition(parts, _labels)
+    return adams if config.clip is None else optax.chain(optax.clip_by_global_norm(config.clip), adams)
+
+
+def _labels(params: Any) -> Any:
+    """The label `encoders` for the encoders of an `mvae` model, and `others` for all other parameters."""
+    paper = "decoders" in params
+    return jax.tree_util.tree_map_with_path(
+        lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params
+    )

@@ -1,0 +1,189 @@
+"""Another loss, optimiser, logger and modality, from outside the library, as `docs/extending.md` shows."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+from sts_jax import mvae, training
+
+MODEL = mvae.Config((mvae.Modality("pose", "vector", (3,)), mvae.Modality("sound", "vector", (2,))), latent=4, hidden=8)
+CONFIG = training.TrainConfig(steps=6, batch_size=8, log_every=2, checkpoint_every=4, beta_warmup=0.5)
+
+
+def arrays(samples=20):
+    rng = np.random.default_rng(0)
+    data = {"pose": rng.random((samples, 3), np.float32), "sound": rng.random((samples, 2), np.float32)}
+    return training.Arrays(data, data)
+
+
+class Killed(Exception):
+    pass
+
+
+def kill_at(step):
+    def progress(done, total, record):
+        if done == step:
+            raise Killed
+
+    return progress
+
+
+def same(a, b):
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+def half_square(graphdef, params, stats, key, batch, beta):
+    """A loss whose gradient is the parameters themselves."""
+    total = 0.5 * optax.tree.norm(params, squared=True)
+    return total, (stats, {"loss": total, "beta": beta})
+
+
+def with_penalty(model, weight):
+    """The library's loss and a penalty on the size of the parameters."""
+    usual = training.learner(model).loss
+
+    def loss(graphdef, params, stats, key, batch, beta):
+        total, (stats, parts) = usual(graphdef, params, stats, key, batch, beta)
+        penalty = weight * optax.tree.norm(params, squared=True)
+        return total + penalty, (stats, {**parts, "loss": total + penalty, "penalty": penalty})
+
+    return loss
+
+
+def records(folder):
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_gradient_descent_on_half_the_square_shrinks_the_parameters_geometrically(tmp_path):
+    learner = training.learner(MODEL)
+    _, first = training.initial(CONFIG, learner, 6)
+    model = training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, loss=half_square, optimiser=optax.sgd(0.1))
+    last = nnx.split_state(model.state, nnx.Param, nnx.BatchStat)[0]
+    for before, after in zip(jax.tree.leaves(first.params), jax.tree.leaves(last), strict=True):
+        np.testing.assert_allclose(after, 0.9**6 * before, rtol=1e-5)
+    size = sum(float(jnp.sum(x**2)) for x in jax.tree.leaves(first.params))
+    losses = [0.5 * size * 0.81**step for step in range(6)]
+    for record, step in zip(records(tmp_path), (2, 4, 6), strict=True):
+        assert record["step"] == step
+        np.testing.assert_allclose(record["loss"], np.mean(losses[step - 2 : step]), rtol=1e-5)
+        np.testing.assert_allclose(record["beta"], np.mean([min(s / 3, 1) for s in (step - 2, step - 1)]), rtol=1e-6)
+
+
+def test_a_term_is_added_to_the_usual_loss(tmp_path):
+    training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "usual")
+    training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "none", loss=with_penalty(MODEL, 0.0))
+    training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "more", loss=with_penalty(MODEL, 0.5))
+    usual, none, more = (records(tmp_path / name) for name in ("usual", "none", "more"))
+    for before, after in zip(usual, none, strict=True):
+        assert after == pytest.approx(before | {"penalty": 0.0}, rel=1e-5)
+    for record in more:
+        assert record["penalty"] > 0
+    assert more[-1]["penalty"] < more[0]["penalty"]
+
+
+@pytest.mark.parametrize("kill", [3, 5])
+def test_a_killed_run_with_another_loss_and_optimiser_gives_identical_parameters(tmp_path, kill):
+    def run(folder, **more):
+        optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(1e-2))
+        loss = with_penalty(MODEL, 1e-3)
+        return training.train(CONFIG, MODEL, arrays(), workdir=folder, loss=loss, optimiser=optimiser, **more)
+
+    whole = run(tmp_path / "whole")
+    with pytest.raises(Killed):
+        run(tmp_path / "killed", progress=kill_at(kill))
+    same(run(tmp_path / "killed").state, whole.state)
+    same(training.load(tmp_path / "killed").state, whole.state)
+    assert records(tmp_path / "killed") == records(tmp_path / "whole")
+
+
+def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
+    def run(**more):
+        return training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, **more)
+
+    adam, notes = optax.adam(1e-3), {"optimiser": "Adam, 1e-3"}
+    with pytest.raises(Killed):
+        run(optimiser=adam, notes=notes, progress=kill_at(5))
+    with pytest.raises(ValueError, match=r"made with optimiser = 'given as optimiser=', but .* None"):
+        run(notes=notes)
+    with pytest.raises(ValueError, match=r"settings have 'given as loss='"):
+        run(optimiser=adam, notes=notes, loss=half_square)
+    with pytest.raises(ValueError, match=r"notes\.optimiser = 'Adam, 1e-3', but .* 'Adam, 1e-2'"):
+        run(optimiser=optax.adam(1e-2), notes={"optimiser": "Adam, 1e-2"})
+    for other in (optax.sgd(1e-3), optax.sgd(1e-3, momentum=0.9), optax.lion(1e-3)):
+        with pytest.raises(ValueError, match=r"has no state of this optimiser .* Give the optimiser that the training"):
+            run(optimiser=other, notes=notes)
+    assert training.load(tmp_path).step == 4
+    assert run(optimiser=adam, notes=notes).step == 6
+
+
+def test_an_optimiser_without_arrays_resumes(tmp_path):
+    def run(folder, optimiser, **more):
+        return training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / folder, optimiser=optimiser, **more)
+
+    with pytest.raises(Killed):
+        run("killed", optax.sgd(1e-3), progress=kill_at(5))
+    with pytest.raises(ValueError, match="has no state of this optimiser"):
+        run("killed", optax.sgd(1e-3, momentum=0.9))
+    same(run("killed", optax.sgd(1e-3)).state, run("whole", optax.sgd(1e-3)).state)
+
+
+def test_a_loss_without_its_own_value_among_its_parts_is_refused(tmp_path):
+    def loss(graphdef, params, stats, key, batch, beta):
+        total = optax.tree.norm(params)
+        return total, (stats, {"size": total})
+
+    with pytest.raises(ValueError, match=r"loss returned the parts \['size'\], but one of them must be `loss`"):
+        training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, loss=loss)
+
+
+@pytest.mark.parametrize("kill", [1, 3, 4, 5, 6])
+def test_a_logger_receives_each_record_once_in_every_call(tmp_path, kill):
+    """Also records of earlier calls, so that a log that starts empty is complete wherever the run was killed."""
+
+    def run(folder, **more):
+        received = []
+
+        def log(step, values):
+            received.append((step, values))
+
+        try:
+            training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / folder, log=log, **more)
+        except Killed:
+            return received, True
+        return received, False
+
+    whole, _ = run("whole")
+    assert [step for step, _ in whole] == [2, 4, 6]
+    assert [{"step": step, **values} for step, values in whole] == records(tmp_path / "whole")
+    part, killed = run("killed", progress=kill_at(kill))
+    assert killed
+    assert part == whole[: kill // 2]
+    assert run("killed") == (whole, False)
+    assert run("killed") == (whole, False)  # also of a finished run
+
+
+def test_a_further_modality_trains_loads_and_predicts_without_a_change_of_the_library(tmp_path):
+    """The pose follows from the sound alone: the error is far below that of the mean pose."""
+    rng = np.random.default_rng(0)
+    sound = rng.uniform(-1, 1, (400, 2)).astype(np.float32)
+    pose = np.stack([sound[:, 0], sound[:, 1], sound[:, 0] - sound[:, 1]], axis=1)
+    pose_start = np.zeros_like(pose)
+    modalities = (
+        mvae.Modality("pose", "vector", (3,), weight=100.0),
+        mvae.Modality("sound", "vector", (2,), weight=100.0),
+    )
+    model = mvae.Config(modalities, latent=8, hidden=32)
+    data = training.Arrays({"pose": pose_start[:300], "sound": sound[:300]}, {"pose": pose[:300], "sound": sound[:300]})
+    config = training.TrainConfig(
+        steps=600, batch_size=50, learning_rate=1e-2, encoder_epsilon=1e-3, log_every=100, checkpoint_every=600
+    )
+    training.train(config, model, data, workdir=tmp_path)
+    trained = training.load(tmp_path)
+    predicted, _ = mvae.predict(trained.graphdef, trained.state, {"sound": jnp.asarray(sound[300:])})
+    error = np.mean((np.asarray(predicted["pose"]) - pose[300:]) ** 2)
+    assert error < 0.1 * np.mean((pose[300:] - pose[:300].mean(0)) ** 2)

@@ -1,0 +1,53 @@
+"""Arrays in memory: batches, their order, and the checksum."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sts_jax import training
+
+
+def arrays(*, further=True):
+    """Four samples. `further` adds three views and five falls."""
+    rng = np.random.default_rng(0)
+    views = {"visual": rng.integers(0, 256, (3, 8, 8, 3), dtype=np.uint8), "state": rng.random((3, 5), np.float32)}
+    falls = {"state": rng.random((5, 5), np.float32), "pose": rng.random((5, 12), np.float32)}
+    return training.Arrays(
+        {"pose": rng.random((4, 12), np.float32)},
+        {"pose": rng.random((4, 12), np.float32)},
+        views=views if further else {},
+        falls=falls | {"outcome": np.array([0, 1, 0, 1, 1], np.int32)} if further else {},
+    )
+
+
+@pytest.mark.parametrize(("samples", "size"), [(10, 4), (7, 7), (3, 8)])
+def test_each_epoch_has_every_sample_once_from_any_start(samples, size):
+    steps = 3 * samples
+    whole = list(training.order(0, samples, size, 0, steps))
+    flat = np.concatenate(whole)
+    for epoch in range(len(flat) // samples):
+        assert sorted(flat[epoch * samples : (epoch + 1) * samples]) == list(range(samples))
+    np.testing.assert_array_equal(whole[5:], list(training.order(0, samples, size, 5, steps)))
+    assert len({tuple(epoch) for epoch in flat[: 9 * samples].reshape(9, samples)}) > 1
+
+
+def test_views_and_falls_are_taken_by_rows_of_their_own_and_change_the_checksum():
+    data = arrays()
+    rows = {"views": np.array([2, 0]), "falls": np.array([4, 4, 1])}
+    batch = data.take(np.array([3, 1]), **rows)
+    np.testing.assert_array_equal(batch["targets"]["pose"], data.targets["pose"][[3, 1]])
+    for name, index in rows.items():
+        own = getattr(data, name)
+        assert batch[name].keys() == own.keys()
+        for key, values in own.items():
+            np.testing.assert_array_equal(batch[name][key], values[index])
+    assert not {"views", "falls"} & data.take(np.array([0])).keys()
+    sums = {data.checksum(), arrays(further=False).checksum()}
+    for name in rows:
+        for key, values in getattr(data, name).items():
+            changed = values.copy()
+            changed.reshape(-1)[-1] += 1
+            sums.add(dataclasses.replace(data, **{name: getattr(data, name) | {key: changed}}).checksum())
+    assert len(sums) == 2 + 2 + 3
+    assert arrays().checksum() == data.checksum()
