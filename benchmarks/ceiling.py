@@ -82,9 +82,7 @@ def main(args: Args) -> None:
     train, test = (dataset.reduced(part, config.image_size) for part in pairs)
     judge = evaluation.scorer(config.collection.scenario, train)
     with tqdm(total=args.times * len(test.object), desc="re-roll", unit="trajectories") as bar:
-        made = rerolls.reroll(
-            config.collection, sensor, test, args.times, judge, lambda done: bar.update(done - bar.n)
-        )
+        made = rerolls.reroll(config.collection, sensor, test, args.times, judge, lambda done: bar.update(done - bar.n))
     scores = dict(made.scores)
     for title, row in evaluation.baselines(config.collection.scenario, train, test).items():
         scores[title] = judge(row, test)
