@@ -143,7 +143,8 @@ def read(path: Path, like: State) -> State:
                 ) from None
             raise ValueError(
                 f"{path} cannot be read {reason}: it was damaged before its checksums were taken, or belongs to "
-                "another model. Give another folder, or delete this one and train again."
+                "another model, or to a version of sts_jax with other networks. Give another folder, load it with the "
+                "version that trained it, or delete it and train again."
             ) from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 

@@ -207,5 +207,6 @@ def _run(
 
 
 def _send(some: list[records.Record], log: Log | None) -> None:
-    for record in some if log is not None else ():
-        log(int(record["step"]), {name: value for name, value in record.items() if name != "step"})
+    if log is not None:
+        for record in some:
+            log(int(record["step"]), {name: value for name, value in record.items() if name != "step"})
