@@ -48,7 +48,7 @@ class _Runs(NamedTuple):
     """State of the loop over groups of faces: the list of faces that have runs."""
 
     next_face: Int[Array, ""]  # first face of the next group
-    count: Int[Array, ""]  # number of listed faces
+    listed: Int[Array, ""]  # number of listed faces
     total: Int[Array, ""]  # number of their runs
     first: Int[Array, "n"]  # number of the first run of each listed face
     face: Int[Array, "n"]  # index of the face
@@ -131,10 +131,10 @@ def _list_runs(screen: _Screen, shape: tuple[int, int], chunk: int) -> _Runs:
         face = jnp.minimum(runs.next_face, num_faces - group) + jnp.arange(group, dtype=jnp.int32)
         per_row, number = _count_runs(screen, face, runs.next_face, shape)
         nth, upto = _cpu_reductions.cumsum(number > 0), jnp.cumsum(number, dtype=jnp.int32)
-        place = jnp.where(number > 0, runs.count + nth - 1, num_faces + chunk)
+        place = jnp.where(number > 0, runs.listed + nth - 1, num_faces + chunk)
         return _Runs(
             runs.next_face + group,
-            runs.count + nth[-1],
+            runs.listed + nth[-1],
             runs.total + upto[-1],
             runs.first.at[place].set(runs.total + upto - number, mode="drop"),
             runs.face.at[place].set(face, mode="drop"),
@@ -284,7 +284,7 @@ def barycentrics(
     return jnp.where(ok, first, 1), jnp.where(ok, second, 0), jnp.where(ok, 1 - first - second, 0)
 
 
-def pixel_centres(shape: tuple[int, int]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
+def pixel_centres(shape: tuple[int, ...]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Columns and rows of an image's pixels."""
     row, column = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij")
     return column, row

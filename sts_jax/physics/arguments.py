@@ -51,7 +51,8 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
 
 
 def _is_frozen(scenario: Any) -> bool:
-    return dataclasses.is_dataclass(scenario) and scenario.__dataclass_params__.frozen  # type: ignore[attr-defined]
+    parameters = getattr(type(scenario), "__dataclass_params__", None)
+    return parameters is not None and parameters.frozen
 
 
 def check_condition(scenario: Scenario, start: Start) -> None:

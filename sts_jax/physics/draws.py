@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from sts_jax._keys import check_key
 from sts_jax.objects.body import Body
@@ -49,7 +49,7 @@ def draw(
         pad: m, size of the pad along x and y.
     """
 
-    def one(body: Int[Array, ""], nth: Int[Array, ""], attempt: Int[Array, ""]) -> tuple[Start, Hidden]:
+    def one(body: ArrayLike, nth: ArrayLike, attempt: ArrayLike) -> tuple[Start, Hidden]:
         own = jax.random.fold_in(jax.random.fold_in(jax.random.fold_in(key, body), nth), attempt)
         start, hidden = jax.random.split(own)
         return scenario.start(start, jax.tree.map(lambda x: x[body], shapes), pad), scenario.hidden(hidden)

@@ -67,7 +67,7 @@ def gravity_at(
 @functools.partial(jax.jit, static_argnames="scenario")
 def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario) -> Float[Array, "n 6"]:
     """Velocity on release (m/s, rad/s, sensor frame)."""
-    return jax.vmap(scenario.velocity)(condition)
+    return jax.vmap(scenario.velocity)(jnp.asarray(condition))
 
 
 @jax.jit

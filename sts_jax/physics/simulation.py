@@ -184,7 +184,7 @@ def _chunks(setup: Setup, pending: np.ndarray, chunk: int, engine: Engine, worke
 
 def _trajectory(setup: Setup, accepted: _Accepted) -> Trajectory:
     """The results under the names of `Trajectory`."""
-    scenario, record, ends = setup.scenario, accepted.rolled.record, accepted.rolled.ends
+    scenario, (ends, record) = setup.scenario, jax.tree.map(jnp.asarray, accepted.rolled)
     outcome = jax.vmap(scenario.outcome)(record.pose[:, 0], record.pose[:, -1])
     check_outcomes(scenario, np.asarray(outcome))
     starts = accepted.starts

@@ -151,7 +151,7 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 class _Descent(NamedTuple):
     """State of Newton's method: the plane `u0 + u1 y + u2 x`, with the gradient and the Hessian of the energy at it."""
 
-    count: Int[Array, ""]  # steps taken
+    steps: Int[Array, ""]  # taken so far
     u: Float[Array, "3"]
     step: Float[Array, ""]  # m, largest component of the last step
     gradient: Float[Array, "3"]
@@ -199,10 +199,10 @@ def _newton(
         whole = at(1.0)
         enough = jnp.abs(jnp.sum(step * whole[1][0])) <= _ENOUGH * jnp.abs(jnp.sum(step * state.gradient))
         u, (gradient, hessian) = jax.lax.cond(enough, lambda: whole, shorter)
-        return _Descent(state.count + 1, u, jnp.max(jnp.abs(step)), gradient, hessian)
+        return _Descent(state.steps + 1, u, jnp.max(jnp.abs(step)), gradient, hessian)
 
     def unsettled(state: _Descent) -> Bool[Array, ""]:
-        return (state.count < _NEWTON_STEPS) & (state.step > _SETTLED)
+        return (state.steps < _NEWTON_STEPS) & (state.step > _SETTLED)
 
     fixed = jax.lax.stop_gradient((height, x, y, target))
     first = jax.lax.stop_gradient(start)

@@ -169,7 +169,7 @@ def state_model(
         inputs=tuple(name for name in statespace.INPUTS if name not in absent),
         outcomes=len(scenario.outcomes),
         condition=len(preprocessing.condition_scale),
-        **({"vectors": scenario.vectors} if scenario.quantities else {}),
+        vectors=scenario.vectors if scenario.quantities else 1,
         input_size=height,
         camera_distance=float(sensor.camera.distance),
         view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
