@@ -1,6 +1,5 @@
 """Checks of the arguments of `simulate` and `starts`, whatever their types."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
