@@ -1,19 +1,16 @@
-"""Another metric and another image size, from outside the library, as `docs/extending-evaluation.md` describes."""
+"""Another metric and another image size, from outside the library, as `docs/extending.md` describes."""
 
 import dataclasses
 import json
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from extending_page import blocks
 from test_evaluation_scores import judged
 
 from experiments import freefall
 from experiments.shared import config, stages
 from sts_jax import dataset, evaluation, physics, training
-
-PAGE = Path(__file__).parents[1] / "docs" / "extending-evaluation.md"
 
 
 def height_error(predicted, test):
@@ -124,17 +121,11 @@ def test_a_metric_needs_a_name_of_its_own_and_one_number_per_item(items):
         evaluation.scorer(physics.Freefall(), train, metrics=(wrong,))(predicted, test)
 
 
-def code(title):
-    """The Python of a section of the page."""
-    (section,) = [part for part in PAGE.read_text().split("\n## ")[1:] if part.startswith(title)]
-    return "\n".join(re.findall(r"```python\n(.*?)```", section, re.DOTALL))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("title", ["Another metric", "Another image size"])
 def test_the_code_of_the_page_runs(title, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    exec(compile(code(title), str(PAGE), "exec"), {"__name__": "page"})
+    exec("\n".join(blocks(title)), {"__name__": "page"})
     assert "height error (mm)" in capsys.readouterr().out or title != "Another metric"
 
 

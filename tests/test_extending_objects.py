@@ -1,25 +1,25 @@
-"""The code of docs/extending-objects.md runs, and a class from outside the library behaves as the eight do."""
+"""The code of docs/extending.md runs, and a class from outside the library behaves as the eight do."""
 
 import inspect
-import re
 import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from extending_page import blocks
 
 import sts_jax as sts
 from sts_jax import dataset, objects
 from sts_jax.objects import colors, shapes
 
-PAGE = Path(__file__).parents[1] / "docs" / "extending-objects.md"
+NUMBER = 1
 
 
 @pytest.fixture
 def code(tmp_path, monkeypatch) -> list[str]:
     """The code of the page after its first block, which becomes the module `torus` in the working directory."""
-    module, *rest = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    module, *rest = blocks("A ninth object class")
     (tmp_path / "torus.py").write_text(module)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
@@ -70,7 +70,7 @@ def test_families_with_different_seeds_draw_different_numbers():
         ("teapot", r"category is 'teapot', but it must be one of bottle, .*watch, or 'module:NAME'"),
         ("torus:", "category is 'torus:', but it must be one of"),
         ("no_such_module:RING", "its module cannot be imported .*No module named 'no_such_module'.*install it"),
-        (f"{__name__}:PAGE", r"PAGE of test_extending_objects must be an objects\.Family, got PosixPath"),
+        (f"{__name__}:NUMBER", r"NUMBER of test_extending_objects must be an objects\.Family, got int"),
         (f"{__name__}:ROUND", r"ROUND of test_extending_objects must be an objects\.Family, got NoneType"),
     ],
 )

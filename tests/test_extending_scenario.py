@@ -1,24 +1,23 @@
-"""The scenarios of `docs/extending-scenario.md`, which the library does not contain, from starts to evaluation."""
+"""The scenarios of `docs/extending.md`, which the library does not contain, from starts to evaluation."""
 
 import dataclasses
 import enum
 import inspect
 import json
 import math
-import re
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from extending_page import blocks
 from PIL import Image
 
 import sts_jax as sts
-from experiments import perturbed, stages
+from experiments import perturbed
+from experiments.shared import stages
 from sts_jax import dataset, evaluation, geometry, physics
 
-PAGE = Path(__file__).parent.parent / "docs" / "extending-scenario.md"
 ENGINES = ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)]
 FRICTION = 0.4
 
@@ -27,7 +26,7 @@ FRICTION = 0.4
 def page() -> dict:
     """The names that the code of the page defines."""
     names: dict = {}
-    exec("\n".join(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)), names)
+    exec("\n".join(blocks("A new scenario")), names)
     return names
 
 
