@@ -18,7 +18,7 @@ from sts_jax._ranges import NOT_NEGATIVE, STATIC, limits
 from sts_jax.optics import Camera, Room
 from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
 
-_LIGHTS = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file
+_LIGHTS: dict[str, type[Lights] | type[Leds]] = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file
 _LARGEST = float(np.finfo(np.float32).max)  # greater numbers are inf in float32
 _ROUNDED = 1 + 1e-6  # tolerance for float32's last digit
 
