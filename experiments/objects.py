@@ -81,15 +81,13 @@ def main(config: Config) -> None:
     """Make the objects, print their descriptions, render them, and compose the sheet."""
     if config.num < 1:
         raise ValueError(f"num is {config.num}, but it must be at least 1 object per class")
-    unknown = set(config.categories) - set(sts.objects.CATEGORIES)
-    if unknown:
-        raise ValueError(f"unknown categories {sorted(unknown)}: choose among {', '.join(sts.objects.CATEGORIES)}")
+    families = {category: sts.objects.find_family(category) for category in config.categories}
     output.check_picture(config.out)
     key = jax.random.key(config.seed)
     drawn = []
-    for category in config.categories:
+    for category, family in families.items():
         for number in range(config.num):
-            own = jax.random.fold_in(jax.random.fold_in(key, sts.objects.CATEGORIES.index(category)), number)
+            own = jax.random.fold_in(jax.random.fold_in(key, family.seed), number)
             drawn.append((category, sts.objects.make(own, category)))
     if config.shuffle:
         order = np.asarray(jax.random.permutation(key, len(drawn)))

@@ -121,9 +121,8 @@ def configure(args: Args) -> Config:
     elif args.classes:
         collection = dataclasses.replace(collection, categories=tuple(dict.fromkeys(args.classes)))
     if collection.meshes is None:
-        unknown = sorted(set(collection.categories) - set(sts.objects.CATEGORIES))
-        if unknown:
-            raise ValueError(f"unknown classes {', '.join(unknown)}: choose among {', '.join(sts.objects.CATEGORIES)}")
+        for category in collection.categories:
+            sts.objects.find_family(category)
     return dataclasses.replace(args.config, collection=collection)
 
 
