@@ -46,7 +46,7 @@ def test_classes_follow_the_categories():
         ({"num_views": -1}, r"num_views must be a whole number of at least 0, got -1"),
         ({"num_views": False}, r"num_views must be .* got False"),
         ({"num_objects": 0}, r"num_objects must be a whole number of at least 1, got 0"),
-        ({"num_per_object": 1.5}, r"num_per_object must be a whole number of at least 1, got 1\.5"),
+        ({"num_per_object": True}, r"num_per_object must be a whole number of at least 1, got True"),
         ({"objects_per_shard": 0}, r"objects_per_shard must be a whole number of at least 1, got 0"),
         ({"num_full": -1}, r"num_full must be a whole number of at least 0, got -1"),
         ({"resolution": (64, 0)}, r"resolution must be two whole numbers .* got \(64, 0\)"),

@@ -4,7 +4,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -140,14 +140,7 @@ def load(
 
 
 def _check_arguments(
-    path: Path,
-    longest_side: float | None,
-    scale: float | None,
-    largest: float | None,
-    mass: float | None,
-    density: float,
-    faces: int | None,
-    category: int,
+    path: Path, longest_side: Any, scale: Any, largest: Any, mass: Any, density: Any, faces: Any, category: Any
 ) -> None:
     """Raise an error that names the first argument of `load` that is out of range."""
     for name, value, unit in (
