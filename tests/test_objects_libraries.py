@@ -50,9 +50,9 @@ def test_a_missing_and_an_empty_folder_are_refused(tmp_path):
     ("arguments", "message"),
     [
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
-        ({"scale": -1.0}, "scale must be positive"),
-        ({"longest_side": 0.3}, r"longest_side must be .* at most 0\.15 m"),
-        ({"largest": float("nan")}, "largest must be positive"),
+        ({"scale": -1.0}, "scale is -1.0 m, but it must be positive and finite"),
+        ({"longest_side": 0.3}, r"longest_side is 0\.3 m, but it must be .* at most 0\.15 m"),
+        ({"largest": float("nan")}, "largest is nan m, but it must be positive"),
         ({"faces": 3}, "faces must be at least 4"),
     ],
 )

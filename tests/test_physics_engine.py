@@ -160,7 +160,7 @@ def test_a_jerked_box_slides_by_coulombs_law(as_force: bool) -> None:
         start = Start(pose[None], np.array([0]), np.zeros((1, 0)))
         found = native.roll([model], points, start, gravity[None])[1].pose[0]
     else:
-        found = plain_loop(model, points, pose, gravity, 0, as_force=False)["pose"]
+        found = plain_loop(model, points, pose, gravity, 0, np.zeros(6), as_force=False)["pose"]
     speed = (pull - friction * G) * lasts
     distance = speed * lasts / 2 + speed**2 / (2 * friction * G)
     np.testing.assert_allclose(np.linalg.norm(found[-1, :2] - found[0, :2]), distance, rtol=0.01)

@@ -7,14 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax.objects.body import Body
 from sts_jax.physics.bodies import check_bodies
 from sts_jax.physics.scenario import Hidden, Scenario, Start
 from sts_jax.sensor import Sensor
 
 
-def listed(body: Body | Sequence[Body]) -> list[Body]:
-    """One body or several as a list."""
+def listed(body: Any) -> list[Any]:
+    """One body or several as a list, unchecked."""
     return list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
 
 
