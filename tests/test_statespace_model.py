@@ -470,7 +470,7 @@ def test_rigid_finds_the_nearest_rotation():
         ({"window": 12}, "window is 12 pixels, but it must be a multiple of 8"),
         ({"input_size": 24}, "input_size is 24 pixels, but it must be a multiple of 16"),
         ({"encoder": (4, 4)}, "encoder and decoder need 3 widths each, got 2 and 3"),
-        ({"condition": 1}, "condition is 1 numbers, but it must be 0 or at least 2"),
+        ({"condition": 1}, "condition is 1 numbers and vectors is 1, but a condition must be 0"),
         ({"drawn_first": 0.0}, r"drawn_first is 0\.0"),
     ],
 )

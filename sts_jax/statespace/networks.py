@@ -86,7 +86,7 @@ class Config:
             if getattr(self, name) % part or getattr(self, name) < part:
                 raise ValueError(f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}")
         if len(self.encoder) != 3 or len(self.decoder) != 3:
-            raise ValueError(f"encoder has {len(self.encoder)} and decoder {len(self.decoder)} widths, both need 3")
+            raise ValueError(f"encoder and decoder need 3 widths each, got {len(self.encoder)} and {len(self.decoder)}")
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
                 f"condition is {self.condition} numbers and vectors is {self.vectors}, but a condition must be 0, or "
