@@ -94,7 +94,7 @@ def test_a_model_takes_a_jerk_in_si_units(workdir):
     data = dataset.load(workdir / "dataset")
     pairs = data.pairs(np.array([0]))
     predictor = sts.Predictor.load(workdir / "models/statespace")
-    assert predictor.preprocessing.condition_scale == physics.Perturbed.condition_scale
+    assert predictor.preprocessing.condition_scale == physics.Perturbed().condition_scale
     out = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition)
     other = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition * [-1, -1, 1])
     assert np.abs(out.pose - other.pose).max() > 1e-4
