@@ -91,7 +91,9 @@ def test_a_model_is_loaded_from_its_folder(finished):
 
 def test_another_config_or_other_data_are_refused(finished):
     workdir, _ = finished
-    with pytest.raises(ValueError, match=r"config.json was made with training.steps = 12, .* but the current settings have 13"):
+    with pytest.raises(
+        ValueError, match=r"config.json was made with training.steps = 12, .* but the current settings have 13"
+    ):
         training.train(training.TrainConfig(steps=13), SMALL, arrays(), workdir=workdir, preprocessing={"view": "pad"})
     with pytest.raises(ValueError, match=r"made with data.checksum"):
         training.train(CONFIG, SMALL, arrays(seed=1), workdir=workdir, preprocessing={"view": "pad"})

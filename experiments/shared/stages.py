@@ -121,8 +121,7 @@ def jobs(
     frame = dataset.empty_frame(sensor, config.collection)
     empty = {"visual": frame.visual, "tactile": frame.tactile}
     if config.model == "statespace":
-        state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty)
-        state = dataclasses.replace(state, image_size=config.image_size)
+        state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty, image_size=config.image_size)
         arrays = training.state_moments(pairs, state, scenario, own, empty, views=views, falls=falls)
         del pairs  # as large as the arrays, which hold copies
         yield Job("statespace", config.state_training, state, arrays, own, empty)

@@ -150,13 +150,20 @@ def state_model(
     scenario: physics.Scenario,
     preprocessing: Preprocessing,
     empty: dict[str, np.ndarray],
+    *,
+    image_size: int = 64,
 ) -> tuple[statespace.Config, Preprocessing]:
     """A state-space model of the size that the experiments use, and the preprocessing with `absent` set.
 
-    Touch is not an input if no first moment has a contact. The arguments are those of `state_moments`, and the sensor.
+    Touch is not an input if no first moment has a contact. The other arguments are those of `state_moments`, and the
+    sensor.
+
+    Args:
+        image_size: side of the predicted images, pixels.
 
     Raises:
-        ValueError: the images are not square, or are cropped. The model finds the object itself.
+        ValueError: the images are not square, or are cropped (the model finds the object itself), or their side is no
+            multiple of `image_size`.
     """
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
@@ -171,6 +178,7 @@ def state_model(
         condition=len(preprocessing.condition_scale),
         vectors=scenario.vectors if scenario.quantities else 1,
         input_size=height,
+        image_size=image_size,
         camera_distance=float(sensor.camera.distance),
         view=float(optics.full_window(sensor.camera, preprocessing.resolution)[2]),
         position_scale=preprocessing.position_scale,
