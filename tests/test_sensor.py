@@ -226,7 +226,7 @@ def test_every_range_is_checked(number, limit, part, name):
         ("skin.coupling", -1e-3, ">= 0"),
     ],
 )
-def test_the_error_of_a_check_names_field_value_and_limit(field, value, says):
+def test_check_names_the_field_its_value_and_the_limit(field, value, says):
     sensor = with_field(Sensor(), field, value)
     with pytest.raises(ValueError, match=says) as error:
         sensor.check()

@@ -103,10 +103,10 @@ class Scenario(abc.ABC):
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # for type checkers: it is a dataclass
 
-    # Its outcomes, the most informative first: members of `Outcome` or of another IntEnum with other numbers.
-    # Every scenario has `Outcome.FELL_OFF`.
+    # The outcomes, the most informative first: members of `Outcome` or of another IntEnum with other numbers.
+    # `Outcome.FELL_OFF` must be one of them.
     outcomes: ClassVar[tuple[enum.IntEnum, ...]]
-    # The quantities of its condition, vectors first. The condition is all that a predictor knows beside the first frame
+    # The quantities of the condition, vectors first. A predictor gets the condition and the first frame only.
     quantities: ClassVar[tuple[Quantity, ...]] = ()
     symmetries: ClassVar[tuple[int, ...]] = (0,)  # symmetries of the square pad that leave it unchanged, `dataset.turn`
     must_stand: ClassVar[bool] = False  # whether it refuses objects that do not stand with +z up
