@@ -117,6 +117,8 @@ class Predictor:
         training.save_blank(folder, *self._images)
         _files.write_json(folder / "config.json", settings)
         training.save(folder, training.Weights(params, stats, jnp.int32(self.model.step)), compact=compact)
+        if self.model.calibration is not None:
+            training.save_calibration(folder, self.model.calibration, self._inputs)
 
     def __repr__(self) -> str:
         config, view = self.model.config, self.preprocessing
@@ -233,7 +235,17 @@ class Predictor:
             )
         inputs, present = completed(self._inputs, view.resolution, inputs, present, lead)
         return predict_samples(
-            model.graphdef, model.state, view, self._empty, inputs, present, condition, key, num_samples, lead
+            model.graphdef,
+            model.state,
+            view,
+            self._empty,
+            inputs,
+            present,
+            condition,
+            key,
+            num_samples,
+            lead,
+            model.calibration,
         )
 
     @property

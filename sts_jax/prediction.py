@@ -111,12 +111,14 @@ def predict_samples(
     key: PRNGKeyArray | None = None,
     num_samples: int = 0,
     shape: tuple[int, ...] = (),
+    calibration: statespace.Calibration | None = None,
 ) -> Prediction:
     """Predict with a state-space model. Images are means over samples, and the pose is the most central sample.
 
     Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
-    prediction. The arguments are those of `predict`, with three differences: `empty` holds both images of the untouched
-    sensor, [0, 1], `inputs` holds all inputs of the model (see `completed`), and `shape` is their leading axes.
+    prediction. The arguments are those of `predict`, with four differences: `empty` holds both images of the untouched
+    sensor, [0, 1], `inputs` holds all inputs of the model (see `completed`), `shape` is their leading axes, and
+    `calibration` corrects the density of the final pose.
     """
     lead = shape
     flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
@@ -124,7 +126,9 @@ def predict_samples(
         condition = preprocessing.encode_condition(condition).reshape(-1, condition.shape[-1])
     drawn = num_samples or _DRAWN
     key = jax.random.key(0) if key is None else key
-    found = statespace.sample(graphdef, state, key, flat, counts, empty, condition, num=max(_POSES, drawn), drawn=drawn)
+    found = statespace.sample(
+        graphdef, state, key, flat, counts, empty, condition, calibration, num=max(_POSES, drawn), drawn=drawn
+    )
     poses = preprocessing.decode_pose(found.pose)
     images = {name: x.reshape(drawn, *lead, *x.shape[2:]) for name, x in found.images.items()}
     mean, log_var = (x.reshape(*lead, -1) for x in found.belief)

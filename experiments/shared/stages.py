@@ -147,7 +147,11 @@ def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sens
             def show(done: int, total: int, record: dict[str, float], bar: Bar = bar, name: str = job.name) -> None:
                 bar(f"train {name}", done, total, f"loss {record['loss']:.4g}" if record else "")
 
-            run(job, model_folder(workdir, job.name, config, split), config.targets, show)
+            folder = model_folder(workdir, job.name, config, split)
+            run(job, folder, config.targets, show)
+            if isinstance(job.model, statespace.Config):
+                validation = data.pairs(evaluation.rows_of(data, split)["validation"])
+                calibrate(job, job.model, folder, config, validation)
 
 
 def run(
@@ -168,6 +172,12 @@ def run(
         preprocessing=dataclasses.asdict(job.preprocessing),
         progress=progress,
     )
+
+
+def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, validation: dataset.Pairs) -> None:
+    """Calibrate a trained state-space model on the trajectories of validation objects."""
+    arrays = training.state_moments(validation, model, config.collection.scenario, job.preprocessing, job.empty)
+    training.calibrate(folder, arrays)
 
 
 def preprocessing_of(config: Config) -> training.Preprocessing:

@@ -1,5 +1,7 @@
 """A multimodal state-space model: from any subset of vision, touch and pose to the final pose and both streams."""
 
+from sts_jax.statespace.calibration import Calibration
+from sts_jax.statespace.calibration import fit as fit_calibration
 from sts_jax.statespace.networks import IMAGES, INPUTS, Config, Model, init
 from sts_jax.statespace.objective import loss
 from sts_jax.statespace.poses import CODE as POSE_CODE
@@ -12,10 +14,12 @@ __all__ = [
     "INPUTS",
     "POSE_CODE",
     "STATE_CODE",
+    "Calibration",
     "Config",
     "Model",
     "Samples",
     "encode",
+    "fit_calibration",
     "init",
     "loss",
     "sample",

@@ -211,7 +211,7 @@ def loss(
     # The divergence excludes the tint, which is computed and not learnt.
     terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE + TINT :], belief)))
     last = math.ceil(config.drawn * number)
-    turn = _turn(targets["state"], targets["pose"])
+    turn = rotation_between(targets["state"], targets["pose"])
     after = _Pictures(
         pose=targets["pose"][:last],
         turn=turn[:last],
@@ -245,7 +245,7 @@ def loss(
     return total, terms
 
 
-def _turn(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
+def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
     """The rotation from a state to a final pose."""
     return poses.matrix(pose) @ jnp.swapaxes(poses.matrix(code[:, : poses.CODE]), -1, -2)
 
@@ -316,7 +316,7 @@ def _end_terms(model: Model, ends: _Ends) -> dict[str, Float[Array, ""]]:
     """The nats of the outcomes and of the final poses."""
     weights = ends.counts / jnp.maximum(jnp.sum(ends.counts), 1)
     final = model.transition(ends.belief, ends.condition)
-    outcome, pose = log_density(final, ends.pose, _turn(ends.state, ends.pose), ends.outcome)
+    outcome, pose = log_density(final, ends.pose, rotation_between(ends.state, ends.pose), ends.outcome)
     return {"outcome": -jnp.sum(weights * outcome), "pose": -jnp.sum(weights * pose)}
 
 

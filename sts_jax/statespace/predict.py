@@ -8,9 +8,9 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace import poses, state
+from sts_jax.statespace import calibration, poses, state
 from sts_jax.statespace.networks import FinalPose, Model, compose
-from sts_jax.statespace.objective import experts, fuse, of_state, reduced
+from sts_jax.statespace.objective import reduced
 
 
 class Samples(NamedTuple):
@@ -31,6 +31,7 @@ def sample(
     present: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
     condition: Float[Array, "n c"] | None = None,
+    correction: calibration.Calibration | None = None,
     *,
     num: int,
     drawn: int,
@@ -45,12 +46,12 @@ def sample(
         present: The items of each input that count.
         empty: As in `objective.experts`.
         condition: As in `Transition`.
+        correction: Corrects the density of the final pose.
         num: Number of final poses.
         drawn: Number of these poses for which both images are drawn, each with its own look (at most `num`).
     """
     model = nnx.merge(graphdef, params)
-    belief = fuse(experts(model, inputs, present, empty), present)
-    final = model.transition(of_state(belief), condition)
+    belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)
     codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
     known = jnp.broadcast_to(belief.mean[:, : state.CODE], (drawn, len(belief.mean), state.CODE))

@@ -1,6 +1,8 @@
 """Training of `sts_jax.statespace` and `sts_jax.mvae` models: arrays, loop, schedules and checkpoints."""
 
 from sts_jax.training.arrays import Arrays, order
+from sts_jax.training.calibrating import calibrate
+from sts_jax.training.calibration import write as save_calibration
 from sts_jax.training.checkpoint import TrainState, Weights, restore, save, seal
 from sts_jax.training.config import TrainConfig
 from sts_jax.training.learners import Learner, Loss, learner
@@ -19,6 +21,7 @@ __all__ = [
     "TrainConfig",
     "TrainState",
     "Weights",
+    "calibrate",
     "initial",
     "learner",
     "load",
@@ -31,6 +34,7 @@ __all__ = [
     "restore",
     "save",
     "save_blank",
+    "save_calibration",
     "seal",
     "state_codes",
     "state_model",

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from sts_jax import _files, mvae, statespace
-from sts_jax.training import manifest
+from sts_jax.training import calibration, manifest
 from sts_jax.training.checkpoint import Weights, read, verified
 from sts_jax.training.learners import Config, learner
 
@@ -24,6 +24,7 @@ class Model(NamedTuple):
     state: nnx.State  # parameters and running batch statistics
     step: int  # gradient steps done
     settings: dict[str, Any]  # content of config.json: `model`, `training`, `preprocessing`, ...
+    calibration: statespace.Calibration | None = None  # of a state-space model, from `calibrate`
 
     def __repr__(self) -> str:
         config, numbers = self.config, sum(x.size for x in jax.tree.leaves(self.state))
@@ -81,7 +82,9 @@ def _load(workdir: Path) -> Model:
         ) from error
     weights = read(checkpoint, like)
     graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))
-    return Model(model, graphdef, nnx.merge_state(weights.params, weights.stats), int(weights.step), settings)
+    own = calibration.read(workdir)
+    state = nnx.merge_state(weights.params, weights.stats)
+    return Model(model, graphdef, state, int(weights.step), settings, None if own is None else own[0])
 
 
 def _module(model: Config) -> nnx.Module:

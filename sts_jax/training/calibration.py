@@ -1,0 +1,67 @@
+"""`calibration.json`, the calibration of a state-space model in the model's folder.
+
+The file holds a checksum of its content, and the checksums of the checkpoint that it belongs to. It is written as a
+whole after the training, so that an interruption leaves the model as it was.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from sts_jax import _files, statespace
+from sts_jax.training import manifest
+
+NAME = "calibration.json"
+_FORMAT = 1
+
+
+def write(folder: Path, calibration: statespace.Calibration, inputs: tuple[str, ...], data: int | None = None) -> None:
+    """Write the calibration of the current checkpoint.
+
+    Args:
+        folder: the model's folder.
+        calibration: the calibration.
+        inputs: the inputs of the model.
+        data: the checksum of the trajectories, from `Arrays.checksum`, or None if it is unknown.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    subsets = {}
+    for number, row in enumerate(np.asarray(calibration).T.tolist()):
+        members = [name for i, name in enumerate(inputs) if number & 2**i]
+        subsets[" and ".join(members) or "no input"] = dict(zip(calibration._fields, row, strict=True))
+    content = {"format": _FORMAT, "weights": _weights(folder), "data": data, "subsets": subsets}
+    _files.write_json(folder / NAME, {**content, "checksum": _files.digest(content)})
+
+
+def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
+    """Read the calibration of the current checkpoint and the checksum of its trajectories.
+
+    Returns:
+        None if there is none, or if it belongs to an earlier checkpoint.
+
+    Raises:
+        TornFileError: the file is damaged.
+    """
+    path = folder / NAME
+    remedy = "restore it from a copy, or delete it and calibrate again (--only train, or training.calibrate)"
+    if not path.exists():
+        return None
+    content: Any = _files.read_json(path, remedy)
+    if not isinstance(content, dict) or content.pop("checksum", None) != _files.digest(content):
+        raise _files.TornFileError(f"{path} was changed or damaged (its checksum differs): {remedy}.")
+    if content["format"] != _FORMAT:
+        raise _files.TornFileError(f"{path} was written by another version of sts_jax: {remedy}.")
+    if content["weights"] != _weights(folder):
+        return None
+    rows = [[row[name] for name in statespace.Calibration._fields] for row in content["subsets"].values()]
+    return statespace.Calibration(*jnp.asarray(rows, jnp.float32).T), content["data"]
+
+
+def _weights(folder: Path) -> str | None:
+    """A checksum of the checkpoint that the manifest names."""
+    listed = manifest.read(folder)
+    return None if listed is None else _files.digest(sorted(listed.files.items()))

@@ -1,0 +1,196 @@
+"""Calibration of the final pose's density: closed forms, subsets of the inputs, and the file in a model's folder."""
+
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from scipy import special
+from statespace_config import STATE, random_codes, random_states, state_model
+
+import sts_jax as sts
+from sts_jax import _files, mvae, statespace, training
+from sts_jax.statespace import calibration, networks, poses
+
+NUMBER = 40
+SUBSETS = ((), ("visual",), ("tactile",), ("visual", "tactile"), ("pose",), ("visual", "pose"), ("tactile", "pose"))
+TRIPLE = calibration.Calibration(*(jnp.asarray(np.linspace(low, 2, 8), jnp.float32) for low in (0.5, 0.7, 0.9)))
+
+
+def arrays(**changes):
+    """Trajectories with random images."""
+    rng = np.random.default_rng(0)
+    code, size = random_states(rng, NUMBER), STATE.input_size
+    images = {name: rng.integers(0, 255, (NUMBER, size, size, 3), np.uint8) for name in statespace.IMAGES}
+    small = {name: rng.random((NUMBER, STATE.image_size, STATE.image_size, 3), np.float32) for name in images}
+    codes = {"state": np.asarray(code), "pose": np.asarray(random_codes(rng, NUMBER))}
+    parts = {
+        "inputs": images | {"pose": np.asarray(code[:, : poses.CODE])},
+        "targets": small | codes | {"outcome": rng.integers(0, 3, NUMBER)},
+        "condition": rng.normal(size=(NUMBER, 3)).astype(np.float32),
+        "empty": {name: np.full((size, size, 3), 178, np.uint8) for name in images},
+    }
+    return training.Arrays(**parts | changes)
+
+
+def density(rng, number, components=1):
+    """Random densities of the final pose, in the sensor's frame."""
+    shape = (number, 3, components)
+    return networks.FinalPose(
+        outcome=jnp.asarray(special.log_softmax(rng.normal(size=(number, 3)), axis=1), jnp.float32),
+        weight=jnp.asarray(special.log_softmax(rng.normal(size=shape), axis=2), jnp.float32),
+        mean=jnp.asarray(rng.normal(size=(*shape, poses.MOVE)), jnp.float32),
+        log_var=jnp.asarray(rng.uniform(-3, 0, (*shape, poses.MOVE)), jnp.float32),
+        heading=jnp.tile(jnp.array([1.0, 0.0]), (number, 1)),
+    )
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("saved") / "model"
+    state_model().save(path)
+    return path
+
+
+@pytest.fixture
+def folder(saved, tmp_path):
+    """A model without a calibration."""
+    return shutil.copytree(saved, tmp_path / "model")
+
+
+@pytest.fixture(scope="module")
+def fitted(saved, tmp_path_factory):
+    path = shutil.copytree(saved, tmp_path_factory.mktemp("fitted") / "model")
+    training.calibrate(path, arrays())
+    return path
+
+
+@pytest.fixture
+def calibrated(fitted, tmp_path):
+    """A model that was calibrated on `arrays()`."""
+    return shutil.copytree(fitted, tmp_path / "calibrated")
+
+
+def test_corrections_are_powers_and_a_factor():
+    final = density(np.random.default_rng(0), 5, components=2)
+    found = calibration.corrected(final, jnp.float32(0.5), jnp.float32(2.0), jnp.float32(3.0))
+    power = np.exp(np.asarray(final.outcome)) ** 0.5
+    np.testing.assert_allclose(np.exp(found.outcome), power / power.sum(1, keepdims=True), rtol=1e-5)
+    weight = np.exp(np.asarray(final.weight)) ** 2
+    np.testing.assert_allclose(np.exp(found.weight), weight / weight.sum(2, keepdims=True), rtol=1e-5)
+    np.testing.assert_allclose(np.exp(found.log_var), 3 * np.exp(final.log_var), rtol=1e-5)
+    np.testing.assert_array_equal(found.mean, final.mean)
+
+
+def test_fitted_variance_is_the_mean_of_squared_deviations():
+    """For one component, the most likely factor is the mean over items and dimensions of error^2 / variance."""
+    rng, number = np.random.default_rng(1), 400
+    code, pose = random_states(rng, number), random_codes(rng, number)
+    outcome = rng.integers(0, 3, number)
+    turn = np.asarray(calibration.rotation_between(code, pose)).reshape(number, 9)
+    own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
+    final = density(rng, number)
+    scatter = np.sqrt(1.7) * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
+    final = final._replace(mean=jnp.asarray(own - scatter, jnp.float32))
+    fitted = calibration._fitted(final, code, pose, jnp.asarray(outcome))
+    chosen = np.arange(number), outcome, 0
+    expected = np.mean((own[:, 0, 0] - np.asarray(final.mean)[chosen]) ** 2 / np.exp(np.asarray(final.log_var)[chosen]))
+    assert 1.6 < expected < 1.8
+    np.testing.assert_allclose(fitted[2], expected, rtol=0.01)
+
+
+def test_fitted_power_recovers_the_power_of_drawn_outcomes():
+    rng, number = np.random.default_rng(2), 4000
+    code, pose = random_states(rng, number), random_codes(rng, number)
+    final = density(rng, number)
+    chance = special.softmax(0.6 * np.asarray(final.outcome, np.float64), axis=1)
+    outcome = np.array([rng.choice(3, p=row) for row in chance])
+    assert abs(calibration._fitted(final, code, pose, jnp.asarray(outcome))[0] - 0.6) < 0.06
+
+
+def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
+    """Items whose masks differ give the same density as if each were alone."""
+    given, empty = arrays(), {}
+    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
+    inputs = {name: jnp.asarray(x[: len(SUBSETS)], jnp.float32) for name, x in given.inputs.items()}
+    inputs |= {name: inputs[name] / 255 for name in statespace.IMAGES}
+    empty = {name: jnp.asarray(image, jnp.float32) / 255 for name, image in given.empty.items()}
+    condition = jnp.asarray(given.condition[: len(SUBSETS)])
+    present = {name: jnp.array([name in subset for subset in SUBSETS]) for name in STATE.inputs}
+
+    @jax.jit
+    def run(present, correction):
+        return calibration.predict(nnx.merge(graphdef, params), inputs, present, empty, condition, correction)[1]
+
+    plain, found = run(present, None), run(present, TRIPLE)
+    for i, subset in enumerate(SUBSETS):
+        number = sum(2 ** STATE.inputs.index(name) for name in subset)
+        expected = calibration.corrected(plain, *(x[number] for x in TRIPLE))
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a[i], b[i], rtol=1e-5, atol=1e-5)
+
+
+def test_calibration_is_at_the_minimum_and_other_subsets_stay(folder):
+    given = arrays(present={"tactile": np.zeros(NUMBER, bool)})
+    found = training.calibrate(folder, given).calibration
+    for number, row in enumerate(np.asarray(found).T):
+        touched = bool(number & 2 ** STATE.inputs.index("tactile"))
+        assert (row == 1).all() == (touched or number == 0), number
+
+
+def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
+    before = sts.Predictor.load(folder)
+    training.save_calibration(
+        folder, calibration.Calibration(*(jnp.ones(8), jnp.ones(8), jnp.full(8, 4.0))), STATE.inputs
+    )
+    after = sts.Predictor.load(folder)
+    after.save(tmp_path / "copy", compact=True)
+    copy = sts.Predictor.load(tmp_path / "copy")
+    image = np.full((STATE.input_size, STATE.input_size, 3), 0.5, np.float32)
+    condition = np.array([1.0, 0.0, 0.05], np.float32)
+
+    def deviations(predictor):
+        drawn = predictor(visual=image, condition=condition, key=jax.random.key(0), num_samples=64).samples
+        return np.asarray(drawn.pose)[:, :3].std(0)
+
+    np.testing.assert_allclose(deviations(after) / deviations(before), 2, rtol=0.4)
+    np.testing.assert_allclose(deviations(copy), deviations(after), rtol=0.1)
+    np.testing.assert_array_equal(copy.model.calibration.variance, 4)
+
+
+def test_same_trajectories_are_not_fitted_again(calibrated, monkeypatch):
+    written = (calibrated / "calibration.json").read_bytes()
+    monkeypatch.setattr(statespace, "fit_calibration", None)  # a call would fail
+    training.calibrate(calibrated, arrays())
+    assert (calibrated / "calibration.json").read_bytes() == written
+    with pytest.raises(TypeError):
+        training.calibrate(calibrated, arrays(condition=np.ones((NUMBER, 3), np.float32)))
+
+
+def test_calibration_of_another_model_is_not_used(calibrated, tmp_path):
+    state_model(mask_blank_touch=False).save(tmp_path / "other")
+    shutil.copy(calibrated / "calibration.json", tmp_path / "other")
+    assert training.load(calibrated).calibration is not None
+    assert training.load(tmp_path / "other").calibration is None
+
+
+def test_damaged_calibration_is_named(calibrated):
+    path = calibrated / "calibration.json"
+    whole = path.read_text()
+    for damaged in (whole[:-30], whole.replace('"variance": ', '"variance": 1', 1), "[]"):
+        path.write_text(damaged)
+        with pytest.raises(_files.TornFileError, match=r"calibration\.json.*calibrate again"):
+            training.load(calibrated)
+    path.unlink()
+    assert training.load(calibrated).calibration is None
+
+
+def test_only_state_space_models_are_calibrated(tmp_path):
+    small = mvae.Config((mvae.Modality("a", "vector", (3,)),), latent=4, hidden=8)
+    data = {"a": np.random.default_rng(0).random((20, 3), np.float32)}
+    given = training.Arrays(data, data)
+    training.train(training.TrainConfig(steps=1, batch_size=8), small, given, workdir=tmp_path)
+    with pytest.raises(ValueError, match="kind mvae"):
+        training.calibrate(tmp_path, given)
