@@ -8,13 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax import mvae, statespace, training
 
-_POSES = 64  # samples of the final pose, from which the prediction of a state-space model is chosen
+_POSES = 256  # samples of the final pose, of which the prediction of a state-space model is the centre
 _DRAWN = 16  # samples that are drawn as images if `num_samples` is 0 (the predicted images are their means)
-_TURN = 0.02  # m, weight of one radian in the choice of the pose
+_TURN = 0.02  # m, weight of one radian in the choice of the most central sample
+_ITERATIONS = 30  # of Weiszfeld's method
+_CLOSE = 1e-6  # m, the distance below which a sample's weight in it no longer grows
 
 
 class Prediction(NamedTuple):
@@ -113,7 +115,7 @@ def predict_samples(
     shape: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,
 ) -> Prediction:
-    """Predict with a state-space model. Images are means over samples, and the pose is the most central sample.
+    """Predict with a state-space model. Images are means over samples, and the pose is the centre of samples.
 
     Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
     prediction. The arguments are those of `predict`, with four differences: `empty` holds both images of the untouched
@@ -148,12 +150,22 @@ def predict_samples(
 
 
 def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
-    """The pose of each item that has the least mean distance from the item's other poses."""
-    apart = jnp.linalg.norm(poses[:, None, :, :3] - poses[None, :, :, :3], axis=-1)
-    cosine = jnp.abs(jnp.einsum("inq,jnq->ijn", poses[..., 3:], poses[..., 3:]))
-    turned = 2 * jnp.arccos(jnp.clip(cosine, 0, 1))
+    """The centre of each item's poses.
+
+    Its position has the least mean distance from the poses (geometric median, by Weiszfeld's method). Its orientation
+    is that of the pose with the least mean distance from the others in position and angle.
+    """
+    place, quat = poses[..., :3], poses[..., 3:]
+
+    def improved(_: Int[Array, ""], middle: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        weight = 1 / jnp.sqrt(jnp.sum((place - middle) ** 2, axis=-1, keepdims=True) + _CLOSE**2)
+        return jnp.sum(weight * place, axis=0) / jnp.sum(weight, axis=0)
+
+    middle = jax.lax.fori_loop(0, _ITERATIONS, improved, jnp.mean(place, axis=0))
+    apart = jnp.linalg.norm(place[:, None] - place[None], axis=-1)
+    turned = 2 * jnp.arccos(jnp.clip(jnp.abs(jnp.einsum("inq,jnq->ijn", quat, quat)), 0, 1))
     best = jnp.argmin(jnp.mean(apart + _TURN * turned, axis=1), axis=0)
-    return jnp.take_along_axis(poses, best[None, :, None], axis=0)[0]
+    return jnp.concatenate([middle, jnp.take_along_axis(quat, best[None, :, None], axis=0)[0]], axis=-1)
 
 
 def completed(

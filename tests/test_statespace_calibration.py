@@ -101,6 +101,19 @@ def test_fitted_variance_is_the_mean_of_squared_deviations():
     np.testing.assert_allclose(fitted[2], expected, rtol=0.01)
 
 
+def test_calibration_never_narrows_the_density():
+    """Items whose outcomes and poses are more certain than predicted keep their density."""
+    rng, number = np.random.default_rng(3), 400
+    code, pose = random_states(rng, number), random_codes(rng, number)
+    final = density(rng, number)
+    outcome = jnp.argmax(final.outcome, axis=1)
+    turn = np.asarray(calibration.rotation_between(code, pose)).reshape(number, 9)
+    own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
+    near = own - 0.3 * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
+    final = final._replace(mean=jnp.asarray(near, jnp.float32))
+    np.testing.assert_array_equal(calibration._fitted(final, code, pose, outcome), 1)
+
+
 def test_fitted_power_recovers_the_power_of_drawn_outcomes():
     rng, number = np.random.default_rng(2), 4000
     code, pose = random_states(rng, number), random_codes(rng, number)

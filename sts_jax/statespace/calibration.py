@@ -3,7 +3,8 @@
 The density of the final pose is learnt on training objects, whose state the encoders estimate better than that of other
 objects. For other objects it is too narrow, by an amount that depends on the inputs. Three numbers for each subset of
 the inputs correct this: a power of the outcomes' probabilities, a power of the mixture's weights, and a factor of the
-variances. They are temperatures in the sense of Guo et al. (2017), On calibration of modern neural networks.
+variances. They are temperatures in the sense of Guo et al. (2017), On calibration of modern neural networks. They can
+only widen the density: the likelihood of a few objects often asks for a narrower one, which then covers too little.
 """
 
 import functools
@@ -23,8 +24,9 @@ from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import experts, fuse, log_density, of_state, rotation_between
 
 _CHUNK = 64  # items of one compiled call
-_LIMIT = math.log(4)  # largest absolute logarithm of a number of the calibration
-_PRIOR = 0.5  # standard deviation of this logarithm before the data are seen
+# Bounds of the logarithms of the three numbers, which allow a wider density and no narrower one
+_BOUNDS = ((-math.log(4), 0), (-math.log(4), 0), (0, math.log(4)))
+_PRIOR = 0.5  # standard deviation of these logarithms before the data are seen
 
 
 class Calibration(NamedTuple):
@@ -33,9 +35,9 @@ class Calibration(NamedTuple):
     The subset of index `sum of 2**i` has the inputs `Config.inputs[i]`.
     """
 
-    outcome: Float[Array, "subsets"]  # power of the probabilities of the outcomes
-    weight: Float[Array, "subsets"]  # power of the weights of an outcome's components
-    variance: Float[Array, "subsets"]  # factor of the components' variances
+    outcome: Float[Array, "subsets"]  # power of the probabilities of the outcomes, in [1/4, 1]
+    weight: Float[Array, "subsets"]  # power of the weights of an outcome's components, in [1/4, 1]
+    variance: Float[Array, "subsets"]  # factor of the components' variances, in [1, 4]
 
 
 def predict(
@@ -164,7 +166,7 @@ def _fitted(
         value, slope = _nats(jnp.asarray(log, jnp.float32), final, code, pose, outcome)
         return float(value), np.asarray(slope, np.float64)
 
-    return np.exp(optimize.minimize(evaluated, np.zeros(3), jac=True, bounds=[(-_LIMIT, _LIMIT)] * 3).x)
+    return np.exp(optimize.minimize(evaluated, np.zeros(3), jac=True, bounds=_BOUNDS).x)
 
 
 @jax.jit
