@@ -216,7 +216,7 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
 def _check_file(path: Path) -> None:
     """Raise an error unless a file exists, is readable and not empty. An STL file must also be complete."""
     if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder: give a mesh file in it, or pass it to objects.library")
+        raise IsADirectoryError(f"{path} is a folder: give a mesh file in it, or pass it to objects.library")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file")
     try:

@@ -20,6 +20,7 @@ Trajectories without images (falls) contribute to the second part, with beliefs 
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -29,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state, window
-from sts_jax.statespace.networks import IMAGES, TINT, UNKNOWN_LOG_VAR, FinalPose, Model, compose
+from sts_jax.statespace.networks import IMAGES, TINT, UNKNOWN_LOG_VAR, Config, FinalPose, Model, compose
 
 EXACT_LOG_VAR = -9.2  # of a pose that is an input, 0.5 mm
 _LEAST = 1 / 1020  # least distance of predicted images from 0 and 1
@@ -188,26 +189,12 @@ def loss(
     subsets = [s for size in range(1, len(config.inputs) + 1) for s in itertools.combinations(config.inputs, size)]
     members = [{name: counts[name] & (name in subset) for name in config.inputs} for subset in subsets]
     beliefs = [fuse(found, own) for own in members]
-    ends = [
-        _Ends(
-            of_state(belief),
-            targets["state"],
-            targets["pose"],
-            targets["outcome"],
-            condition,
-            jnp.any(jnp.stack(list(own.values())), axis=0),
-        )
-        for belief, own in zip(beliefs, members, strict=True)
-    ]
+    ends = [_ends(belief, own, targets, condition) for belief, own in zip(beliefs, members, strict=True)]
     if falls is not None:
         ends.append(_known_ends(blur, falls))
     terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
 
-    # The look of a picture comes from the belief of one subset with an image.
-    usable = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
-    chosen = jax.random.categorical(choice, jnp.where(usable, 0.0, -jnp.inf))
-    stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
-    belief = jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
+    belief = _drawn_belief(choice, images, members, beliefs)
     # The divergence excludes the tint, which is computed and not learnt.
     terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE + TINT :], belief)))
     last = math.ceil(config.drawn * number)
@@ -232,7 +219,12 @@ def loss(
         own = fuse(jax.tree.map(lambda x: x[:first], seen), known)
         before = _present_pictures(views["state"][:first], own, {"visual": views["visual"][:first]}, known)
     terms |= _picture_terms(model, (noise, other), after, before, empty)
-    total = (
+    return _weighted(config, terms, beta), terms
+
+
+def _weighted(config: Config, terms: dict[str, Float[Array, ""]], beta: float | Float[Array, ""]) -> Float[Array, ""]:
+    """The loss of some terms."""
+    return (
         terms["visual"]
         + config.tactile_weight * terms["tactile"]
         + config.covered_weight * terms["covered"]
@@ -242,7 +234,6 @@ def loss(
         + config.outcome_weight * terms["outcome"]
         + beta * config.look_weight * terms["look"]
     )
-    return total, terms
 
 
 def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
@@ -283,6 +274,30 @@ def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Ar
     nats = 0.5 * jnp.sum(scatter + log_var + math.log(2 * math.pi), axis=-1)
     number = jnp.maximum(jnp.sum(counts), 1)
     return jnp.sum(counts * error) / number, jnp.sum(counts * nats) / number
+
+
+def _ends(
+    belief: Gaussian,
+    counts: dict[str, Bool[Array, "n"]],
+    targets: dict[str, Array],
+    condition: Float[Array, "n c"] | None,
+) -> _Ends:
+    """The trajectories of a batch, predicted from the inputs that count."""
+    counted = jnp.any(jnp.stack(list(counts.values())), axis=0)
+    return _Ends(of_state(belief), targets["state"], targets["pose"], targets["outcome"], condition, counted)
+
+
+def _drawn_belief(
+    key: PRNGKeyArray,
+    images: Sequence[str],
+    members: Sequence[dict[str, Bool[Array, "n"]]],
+    beliefs: Sequence[Gaussian],
+) -> Gaussian:
+    """Each sample's belief from a random subset of the inputs with an image, which the look of a picture comes from."""
+    usable = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
+    chosen = jax.random.categorical(key, jnp.where(usable, 0.0, -jnp.inf))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
+    return jax.tree.map(lambda x: jnp.take_along_axis(x, chosen[:, None, None], axis=1)[:, 0], stacked)
 
 
 def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
