@@ -80,6 +80,7 @@ ISR(WDT_vect)
 {
     noise = ((noise << 5) | (noise >> 27)) ^ TCNT1;
     samples++;
+    WDTCSR |= _BV(WDIE); /* the interrupt has cleared it, and without it the next period would end in a reset */
 }
 
 /* A random number. The oscillator of the watchdog timer drifts against the crystal, and its interrupts sample the
@@ -93,7 +94,7 @@ static uint32_t random_number(void)
     {
         wdt_reset();
         WDTCSR = _BV(WDCE) | _BV(WDE);
-        WDTCSR = _BV(WDIE); /* an interrupt every 16 ms, no reset */
+        WDTCSR = _BV(WDE) | _BV(WDIE); /* an interrupt every 16 ms */
     }
     sei();
     while (samples < 32)
