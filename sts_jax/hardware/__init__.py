@@ -1,11 +1,10 @@
 """The real sensor as a device. Imperative, NumPy only."""
 
-from sts_jax.hardware.leds import (
+from sts_jax.hardware.leds import Leds, Lit
+from sts_jax.hardware.ports import (
     DisconnectedError,
     LedError,
-    Leds,
     LedTimeoutError,
-    Lit,
     NotALedControllerError,
     Port,
     PortInUseError,

@@ -5,6 +5,7 @@ import random
 import threading
 import time
 from collections.abc import Callable
+from typing import TypeVar
 
 import serial
 
@@ -14,6 +15,8 @@ REPEAT_S = 0.1  # wait for an answer before the request is repeated. A controlle
 _HEARD = 400  # bytes that are kept to describe another device
 
 _log = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer", protocol.Controller, protocol.State, protocol.Watching)
 
 
 class Connection:
@@ -42,9 +45,9 @@ class Connection:
             raise self._wrong_version(f"version {reply.version}")
         return reply
 
-    def exchange[R: protocol.Reply](
-        self, request: Callable[[int], protocol.Request], answer: type[R], *, timeout_s: float
-    ) -> tuple[R, float, float]:
+    def exchange(
+        self, request: Callable[[int], protocol.Request], answer: type[Answer], *, timeout_s: float
+    ) -> tuple[Answer, float, float]:
         """Send a request and wait for its answer, repeating the request with the same sequence number.
 
         Args:
@@ -88,7 +91,7 @@ class Connection:
 
     def _next_reply(self, until: float) -> protocol.Reply | None:
         """The next valid line, or None if there is none until a time. Invalid lines and the watchdog's are skipped."""
-        while (line := self._next_line(until)) is not None:
+        while (line := self._next_line(until)) is not None and time.monotonic() < until + REPEAT_S:
             try:
                 reply = protocol.decode_reply(line)
             except protocol.ProtocolError as error:
@@ -157,7 +160,7 @@ class Connection:
         strange = sum(not (32 <= byte < 127 or byte in b"\t\r\n") for byte in heard)
         if 5 * strange > len(heard):
             return (
-                f"Received {len(heard)} bytes that are not text ({heard[:24]!r}), which is typical of a wrong baud rate: "
-                f"the port was opened at {self.baud} baud, and the firmware uses {protocol.BAUD}."
+                f"Received {len(heard)} bytes that are not text ({heard[:24]!r}), which is typical of a wrong baud "
+                f"rate: the port was opened at {self.baud} baud, and the firmware uses {protocol.BAUD}."
             )
         return f"Received {heard[:80]!r}, so another device may be on this port. Choose another port."

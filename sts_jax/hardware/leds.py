@@ -8,9 +8,8 @@ import operator
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Self
 
 from sts_jax.hardware import _connection, ports, protocol
 
@@ -52,9 +51,11 @@ class Leds:
     without one, so the lights stay on while this process runs. If the process ends or hangs, the controller's watchdog
     turns them off.
 
-    Each request takes at most `answer_s`, plus the time of one request of another thread. A request is repeated with
-    the same sequence number every 0.1 s until its answer comes, and the controller executes it once. Damaged lines and
-    answers to other requests are ignored.
+    A request is repeated with the same sequence number every 0.1 s until its answer comes, and the controller executes
+    it once. Damaged lines and answers to other requests are ignored.
+
+    A request takes at most `answer_s`, and 0.2 s more if the port takes no bytes. The first one after a restart of the
+    controller takes at most twice that time. If another thread is in a request, its time is added.
     """
 
     def __init__(self, port: str, *, baud: int, timeout_s: float, answer_s: float, watchdog_ms: int):
@@ -80,7 +81,7 @@ class Leds:
         timeout_s: float = 5.0,
         answer_s: float = 1.0,
         watchdog_ms: int = protocol.DEFAULT_WATCH_MS,
-    ) -> Self:
+    ) -> "Leds":
         """Open a controller and turn its lights off.
 
         Opening restarts most boards, which takes up to 2 s.
@@ -142,7 +143,7 @@ class Leds:
             DisconnectedError: The port vanished or is closed.
         """
         checked = _checked(levels)
-        lit = self._state(functools.partial(protocol.Set, levels=checked), answer_s=self._answer_s)
+        lit = self._state(functools.partial(protocol.Set, levels=checked))
         if lit.levels != checked:
             raise ports.LedError(
                 f"the LED controller on {self._port} applied {lit.levels} instead of {checked}. "
@@ -157,7 +158,7 @@ class Leds:
             LedTimeoutError: No valid answer came within `answer_s`.
             DisconnectedError: The port vanished or is closed.
         """
-        return self._state(protocol.Ping, answer_s=self._answer_s)
+        return self._state(protocol.Ping)
 
     def close(self) -> None:
         """Turn the lights off and close the port.
@@ -206,12 +207,12 @@ class Leds:
             if time.monotonic() + wait > deadline:
                 raise ports.DisconnectedError(
                     f"controller {self.serial_number} was not found within {limit_s:g} s. Check its cable. Tried: "
-                    + "; ".join(f"{name}: {result}" for name, result in tried.items())
+                    + ", ".join(f"{name} ({result})" for name, result in tried.items())
                 )
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT_S)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Leds":
         return self
 
     def __exit__(
@@ -248,13 +249,13 @@ class Leds:
             self._thread.join()
             self._thread = None
 
-    def _state(self, request: functools.partial | type[protocol.Ping], *, answer_s: float) -> Lit:
+    def _state(self, request: Callable[[int], protocol.Request]) -> Lit:
         """Send a request about the levels. A controller that has booted gets the watchdog's period first."""
         connection = self._connection
-        reply, sent_s, acknowledged_s = connection.exchange(request, protocol.State, timeout_s=answer_s)
+        reply, sent_s, acknowledged_s = connection.exchange(request, protocol.State, timeout_s=self._answer_s)
         if reply.boot != self._boot:
             period = functools.partial(protocol.Watch, period_ms=self._watchdog_ms)
-            connection.exchange(period, protocol.Watching, timeout_s=answer_s)
+            connection.exchange(period, protocol.Watching, timeout_s=self._answer_s)
             self._boot = reply.boot
         return Lit(reply.levels, reply.counter, reply.boot, sent_s, acknowledged_s)
 

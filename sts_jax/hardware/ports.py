@@ -12,7 +12,7 @@ from serial.tools import list_ports
 from sts_jax.hardware import protocol
 
 READ_S = 0.02  # longest wait of one read
-WRITE_S = 1.0  # longest wait of one write
+WRITE_S = 0.2  # longest wait of one write
 
 
 class LedError(OSError):
