@@ -69,7 +69,8 @@ class Peer:
             *lines, self._pending = (self._pending + os.read(self._master, 4096)).split(b"\n")
             for line in lines:
                 self.requests.append(line + b"\n")
-                self.send(self._answer(line + b"\n") if self.talk is None else self.talk)
+                answer = self._answer(line + b"\n") if self.talk is None else self.talk
+                self.send(answer)
 
     def _answer(self, line: bytes) -> bytes:
         fault = self.faults.pop(0) if self.faults else "none"

@@ -70,7 +70,7 @@ def find_controllers() -> list[Port]:
     return sorted(found, key=lambda port: (port.vendor is None, port.device))
 
 
-def open_port(name: str, baud: int = protocol.BAUD) -> serial.SerialBase:
+def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
     """Open a serial port for this process alone.
 
     Args:

@@ -281,11 +281,11 @@ def _controller(sequence: int, values: list[str]) -> Controller | None:
     if version is None:
         return None
     if version != VERSION:
-        return Controller(sequence, version, *(values[1:4] + ["unknown"] * 3)[:3], channels=0)
+        return Controller(sequence, version, "unknown", "unknown", "unknown", 0)
     match values[1:]:
-        case [*names, count] if len(names) == 3 and all(re.fullmatch(r"[A-Za-z0-9._-]+", name) for name in names):
-            channels = _number(count, CHANNELS, CHANNELS)
-            return None if channels is None else Controller(sequence, version, *names, channels=channels)
+        case [firmware, board, serial_number, count] if _number(count, CHANNELS, CHANNELS) is not None:
+            if all(re.fullmatch(r"[A-Za-z0-9._-]+", name) for name in (firmware, board, serial_number)):
+                return Controller(sequence, version, firmware, board, serial_number, CHANNELS)
     return None
 
 
