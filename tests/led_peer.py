@@ -36,11 +36,12 @@ class Peer:
         self.controller = EmulatedController(serial_number=serial_number, now_s=self._now_s())
         self.faults: list[str] = []
         self.requests: list[bytes] = []
-        self.talk = talk  # what another device says instead of any answer
+        self.talk = talk  # what another device sends, asked or not, instead of any answer
         self._held = b""
         self._pending = b""
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
         path.unlink(missing_ok=True)
         path.symlink_to(os.ttyname(self._slave))
         self._stop = threading.Event()
@@ -57,7 +58,8 @@ class Peer:
         self.path.unlink(missing_ok=True)
 
     def send(self, data: bytes):
-        os.write(self._master, data)
+        with contextlib.suppress(BlockingIOError):  # the host reads nothing
+            os.write(self._master, data)
 
     def _now_s(self):
         return time.monotonic() / 100
@@ -65,6 +67,7 @@ class Peer:
     def _serve(self):
         while not self._stop.is_set():
             if not select.select([self._master], [], [], 0.01)[0]:
+                self.send(self.talk or b"")
                 continue
             *lines, self._pending = (self._pending + os.read(self._master, 4096)).split(b"\n")
             for line in lines:

@@ -227,13 +227,15 @@ def test_watchdog_turns_the_lights_off_once_and_counts():
     assert device.levels == protocol.DARK
 
 
-def test_a_repeated_request_is_executed_once():
+def test_a_repeated_request_is_answered_alike_and_not_executed_again():
     device = emulation.EmulatedController()
     line = protocol.encode("1 SET 9 9 9 9")
     first = device.receive(line, 0.0)
     assert device.receive(line[:5], 0.1) == b""
     assert device.receive(line[5:], 0.2) == first
-    assert device.counter == 1
+    assert device.tick(1.3) == protocol.encode("0 OFF watchdog 2")
+    assert device.receive(line, 1.4) == first
+    assert device.levels == protocol.DARK
 
 
 # ---- Host
@@ -417,13 +419,15 @@ def test_a_file_is_no_serial_port(tmp_path):
         (b"$GPGGA,092750.000,5321.6802,N*76\r\n", r"Received b'\$GPGGA.*another device"),
         (b"\x80\xf8\x00\xfe\x87\x00\xf0" * 30, "not text.*typical of a wrong baud rate.*opened at 9600 baud.*115200"),
         (protocol.encode("1 OK SET 0 0 0 0 0 0"), "no LED controller answered"),
+        (protocol.encode("0 ERR 1 checksum"), "no LED controller answered"),
+        (b"\x00" * 4000, "typical of a wrong baud rate"),
     ],
-    ids=["silence", "text", "garbage", "answers to nobody"],
+    ids=["silence", "text", "garbage", "answers to nobody", "refusals of nothing", "flood"],
 )
 def test_another_device_is_described(tmp_path, talk, message):
     other = Peer(tmp_path / "port", talk=talk)
     with pytest.raises(hardware.NotALedControllerError, match=message):
-        connect(other.path, timeout_s=0.5, baud=9600)
+        connect(other.path, timeout_s=0.4, baud=9600)
     other.vanish()
 
 
@@ -552,24 +556,24 @@ def test_firmware_turns_the_lights_off_when_the_host_is_killed(simulated):
 def test_firmware_executes_repeated_requests_once(simulated, monkeypatch):
     with connect(simulated.path) as leds:
         connection = leds._connection
-        write, read, damage = connection._write, connection._read, {"request": 2, "answer": 2}
+        write, next_line, damage = connection._write, connection._next_line, {"request": 2, "answer": 2}
 
         def damaged_write(line):
             damage["request"] -= 1
             write(line if damage["request"] < 0 else line.replace(b"SET", b"SAT"))
 
-        def damaged_read():
-            data = read()
-            if b"SET" in data and damage["answer"] > 0:
+        def damaged_line(until):
+            line = next_line(until)
+            if line is not None and b"SET" in line and damage["answer"] > 0:
                 damage["answer"] -= 1
-                return data.replace(b"SET", b"SAT")
-            return data
+                return line.replace(b"SET", b"SAT")
+            return line
 
         before = leds.ping()
         monkeypatch.setattr(connection, "_write", damaged_write)
-        monkeypatch.setattr(connection, "_read", damaged_read)
+        monkeypatch.setattr(connection, "_next_line", damaged_line)
         lit = leds.set(ON)
-        assert damage["request"] < -1
+        assert damage == {"request": -3, "answer": 0}  # two damaged requests, and three for two damaged answers
         assert (lit.levels, lit.counter) == (ON, before.counter + 1)
         assert leds.ping().unchanged_since(lit)
 
@@ -597,6 +601,43 @@ def test_firmware_draws_its_serial_number_once(built):
     with connect(chip.path) as leds:
         assert (leds.serial_number, leds.ping().boot) == (number, boot + 1)
     chip.stop()
+
+
+def exchanged(port, line):
+    """The answer to a line. The newline of the boot is skipped."""
+    port.write(line)
+    while (answer := port.readline()) == b"\n":
+        pass
+    return answer
+
+
+def booted(path):
+    """The port of a simulated controller that has booted, with its watchdog at 10 s."""
+    port = serial.Serial(path, timeout=0.2, exclusive=True)
+    until(lambda: b" OK WATCH " in exchanged(port, protocol.encode("1 WATCH 10000")))
+    port.timeout = 0.5
+    while port.readline():  # answers to requests that were repeated during the boot
+        pass
+    port.timeout = 20.0
+    return port
+
+
+@pytest.mark.slow
+def test_firmware_answers_a_repeated_request_alike_and_does_not_execute_it_again(simulated):
+    with booted(simulated.path) as port:
+        ping, on = protocol.encode("2 PING"), protocol.encode("4 SET 9 9 9 9")
+        first = exchanged(port, ping)
+        time.sleep(0.05)
+        assert exchanged(port, ping) == first
+        assert exchanged(port, protocol.encode("3 PING")).split()[-1] != first.split()[-1]  # the time went on
+        exchanged(port, protocol.encode("3 WATCH 100"))
+        answer = exchanged(port, on)
+        simulated.wait_for((9, 9, 9, 9))
+        assert port.readline() == protocol.encode("0 OFF watchdog 2")
+        simulated.wait_for(protocol.DARK)
+        assert exchanged(port, on) == answer
+        state = protocol.decode_reply(exchanged(port, protocol.encode("5 PING")))
+        assert (state.levels, state.counter) == (protocol.DARK, 2)
 
 
 def random_lines(rng, number):
@@ -645,21 +686,15 @@ def random_lines(rng, number):
 @pytest.mark.slow
 def test_firmware_and_emulation_answer_alike(simulated):
     """The texts of HELLO and the time since the boot differ, and everything else is the same."""
-    with serial.Serial(simulated.path, timeout=20.0, exclusive=True) as port:
-        port.write(protocol.encode("1 WATCH 10000"))
-        answer = port.readline()
-        while answer == b"\n" or b"OK" not in answer:  # the boot
-            answer = port.readline()
-        port.write(protocol.encode("2 PING"))
-        state = protocol.decode_reply(port.readline())
+    with booted(simulated.path) as port:
+        state = protocol.decode_reply(exchanged(port, protocol.encode("2 PING")))
         device = emulation.EmulatedController(boot=state.boot)
         device.receive(protocol.encode("1 WATCH 10000"), 0.0)
         device.receive(protocol.encode("2 PING"), 0.0)
         rng = random.Random(5)
         lines = [line for line in random_lines(rng, 400) if line.strip(b"\n") and b"WATCH 9999" not in line]
         for line in lines:
-            port.write(line)
-            assert comparable(port.readline()) == comparable(device.receive(line, 0.0)), line
+            assert comparable(exchanged(port, line)) == comparable(device.receive(line, 0.0)), line
         assert device.counter > 50
 
 

@@ -91,7 +91,9 @@ class Connection:
 
     def _next_reply(self, until: float) -> protocol.Reply | None:
         """The next valid line, or None if there is none until a time. Invalid lines and the watchdog's are skipped."""
-        while (line := self._next_line(until)) is not None and time.monotonic() < until + REPEAT_S:
+        while (line := self._next_line(until)) is not None:
+            if time.monotonic() >= until + REPEAT_S:  # a device that sends without end
+                return None
             try:
                 reply = protocol.decode_reply(line)
             except protocol.ProtocolError as error:
@@ -106,6 +108,7 @@ class Connection:
 
     def _next_line(self, until: float) -> bytes | None:
         """The next line that is not empty. Bytes without a newline are cut to pieces longer than any valid line."""
+        expired = False
         while True:
             line, newline, rest = self._buffer.partition(b"\n")
             if newline or len(line) > protocol.LONGEST_LINE:
@@ -113,8 +116,9 @@ class Connection:
                 if line:
                     return line + newline
                 continue
-            if time.monotonic() >= until:
+            if expired:
                 return None
+            expired = time.monotonic() >= until  # one read more, in case this process slept meanwhile
             self._buffer += self._read()
 
     def _read(self) -> bytes:

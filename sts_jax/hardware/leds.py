@@ -54,8 +54,9 @@ class Leds:
     A request is repeated with the same sequence number every 0.1 s until its answer comes, and the controller executes
     it once. Damaged lines and answers to other requests are ignored.
 
-    A request takes at most `answer_s`, and 0.2 s more if the port takes no bytes. The first one after a restart of the
-    controller takes at most twice that time. If another thread is in a request, its time is added.
+    A request takes at most `answer_s`, and 0.3 s more if the port takes no bytes or brings bytes without end. The first
+    one after a restart of the controller takes at most twice that time. If another thread is in a request, its time is
+    added.
     """
 
     def __init__(self, port: str, *, baud: int, timeout_s: float, answer_s: float, watchdog_ms: int):
@@ -200,6 +201,7 @@ class Leds:
                         tried[name] = f"controller {controller.serial_number}"
                         continue
                     self._port, self._controller, self._boot = name, controller, None
+                    self._usb = _usb_port(name) or self._usb
                     self._start(connection)
                     return
                 except ports.LedError as error:
