@@ -1,0 +1,30 @@
+"""The real sensor as a device. Imperative, NumPy only."""
+
+from sts_jax.hardware.leds import Leds, Lit
+from sts_jax.hardware.ports import (
+    DisconnectedError,
+    LedError,
+    LedTimeoutError,
+    NotALedControllerError,
+    Port,
+    PortInUseError,
+    PortNotFoundError,
+    PortPermissionError,
+    WrongVersionError,
+    find_controllers,
+)
+
+__all__ = [
+    "DisconnectedError",
+    "LedError",
+    "LedTimeoutError",
+    "Leds",
+    "Lit",
+    "NotALedControllerError",
+    "Port",
+    "PortInUseError",
+    "PortNotFoundError",
+    "PortPermissionError",
+    "WrongVersionError",
+    "find_controllers",
+]

@@ -1,0 +1,170 @@
+"""One open port to the LED controller: requests with repetition, and the answers that belong to them."""
+
+import logging
+import random
+import threading
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import serial
+
+from sts_jax.hardware import ports, protocol
+
+REPEAT_S = 0.1  # wait for an answer before the request is repeated. A controller answers within 15 ms
+_HEARD = 400  # bytes that are kept to describe another device
+
+_log = logging.getLogger(__name__)
+
+Answer = TypeVar("Answer", protocol.Controller, protocol.State, protocol.Watching)
+
+
+class Connection:
+    """An open port. Threads may share it."""
+
+    def __init__(self, name: str, baud: int):
+        self.name = name
+        self.baud = baud
+        self.answered_s = time.monotonic()  # time of the last valid answer
+        self.stopped = threading.Event()
+        self._serial = ports.open_port(name, baud)
+        self._lock = threading.Lock()
+        self._sequence = random.randrange(protocol.LAST_SEQUENCE)  # stale answers of an earlier process differ
+        self._buffer = b""
+        self._heard = b""  # bytes of the current exchange that are no valid line
+
+    def handshake(self, timeout_s: float) -> protocol.Controller:
+        """Exchange versions. Boards restart when a port is opened, so the request is repeated until `timeout_s`."""
+        try:
+            reply, _, _ = self.exchange(protocol.Hello, protocol.Controller, timeout_s=timeout_s)
+        except ports.LedTimeoutError as error:
+            raise ports.NotALedControllerError(
+                f"no LED controller answered on {self.name} within {timeout_s:g} s. {self._description()}"
+            ) from error
+        if reply.version != protocol.VERSION:
+            raise self._wrong_version(f"version {reply.version}")
+        return reply
+
+    def exchange(
+        self, request: Callable[[int], protocol.Request], answer: type[Answer], *, timeout_s: float
+    ) -> tuple[Answer, float, float]:
+        """Send a request and wait for its answer, repeating the request with the same sequence number.
+
+        Args:
+            request: Makes the request of a sequence number.
+            answer: Type of the answer. Other lines are ignored.
+            timeout_s: Longest total time (s).
+
+        Returns:
+            The answer, the time before the first sending, and the time of the answer (s, `time.monotonic`).
+        """
+        with self._lock:
+            self._sequence = self._sequence % protocol.LAST_SEQUENCE + 1
+            line = protocol.encode_request(request(self._sequence))
+            self._heard = b""
+            sent_s = time.monotonic()
+            deadline = sent_s + timeout_s
+            while (now := time.monotonic()) < deadline:
+                self._write(line)
+                until = min(deadline, now + REPEAT_S)
+                while (reply := self._next_reply(until)) is not None:
+                    if isinstance(reply, protocol.Refused) and reply.sequence in (0, self._sequence):
+                        if reply.sequence == 0:  # the request was damaged on its way
+                            break
+                        raise self._refusal(reply, line)
+                    if isinstance(reply, answer) and reply.sequence == self._sequence:
+                        self.answered_s = time.monotonic()
+                        return reply, sent_s, self.answered_s
+            raise ports.LedTimeoutError(
+                f"the LED controller on {self.name} gave no valid answer to {line.decode().strip()} within "
+                f"{timeout_s:g} s. {self._description()}"
+            )
+
+    def close(self) -> None:
+        """Close the port. The controller's watchdog turns the lights off if they are on."""
+        self.stopped.set()
+        with self._lock:
+            try:
+                self._serial.close()
+            except OSError as error:
+                _log.debug("closing %s: %s", self.name, error)
+
+    def _next_reply(self, until: float) -> protocol.Reply | None:
+        """The next valid line, or None if there is none until a time. Invalid lines and the watchdog's are skipped."""
+        while (line := self._next_line(until)) is not None:
+            if time.monotonic() >= until + REPEAT_S:  # a device that sends without end
+                return None
+            try:
+                reply = protocol.decode_reply(line)
+            except protocol.ProtocolError as error:
+                self._heard = (self._heard + line)[:_HEARD]
+                _log.debug("%s: %s", self.name, error)
+                continue
+            if isinstance(reply, protocol.TurnedOff):
+                _log.warning("the watchdog of the LED controller on %s turned the lights off", self.name)
+                continue
+            return reply
+        return None
+
+    def _next_line(self, until: float) -> bytes | None:
+        """The next line that is not empty. Bytes without a newline are cut to pieces longer than any valid line."""
+        expired = False
+        while True:
+            line, newline, rest = self._buffer.partition(b"\n")
+            if newline or len(line) > protocol.LONGEST_LINE:
+                self._buffer = rest
+                if line:
+                    return line + newline
+                continue
+            if expired:
+                return None
+            expired = time.monotonic() >= until  # one read more, in case this process slept meanwhile
+            self._buffer += self._read()
+
+    def _read(self) -> bytes:
+        try:
+            return self._serial.read(max(1, self._serial.in_waiting))
+        except (OSError, TypeError) as error:  # TypeError: pyserial reads from a port that was closed meanwhile
+            raise self._vanished(error) from error
+
+    def _write(self, line: bytes) -> None:
+        try:
+            self._serial.write(line)
+        except serial.SerialTimeoutException as error:
+            raise ports.LedTimeoutError(
+                f"{self.name} took no bytes for {ports.WRITE_S:g} s. Unplug the controller and plug it in again."
+            ) from error
+        except (OSError, TypeError) as error:
+            raise self._vanished(error) from error
+
+    def _vanished(self, error: Exception) -> ports.DisconnectedError:
+        return ports.DisconnectedError(
+            f"{self.name} is gone or closed ({error}). Check the cable, then call `reconnect()`."
+        )
+
+    def _refusal(self, reply: protocol.Refused, line: bytes) -> ports.LedError:
+        if reply.code == protocol.Code.VERSION:
+            return self._wrong_version(reply.text)
+        return ports.LedError(
+            f"the LED controller on {self.name} refused {line.decode().strip()} with error {int(reply.code)} "
+            f"({reply.text}). Flash the firmware of this version of sts_jax."
+        )
+
+    def _wrong_version(self, found: str) -> ports.WrongVersionError:
+        return ports.WrongVersionError(
+            f"the LED controller on {self.name} speaks {found} of the protocol, and this version of sts_jax needs "
+            f"{protocol.VERSION}. Flash its firmware: `make flash PORT={self.name}` in sts_jax/hardware/firmware."
+        )
+
+    def _description(self) -> str:
+        """A description of the bytes that are no valid answer, with their likely cause."""
+        heard = self._heard + self._buffer
+        if not heard:
+            return "Nothing was received. Check the cable, the port, and that the firmware is flashed."
+        strange = sum(not (32 <= byte < 127 or byte in b"\t\r\n") for byte in heard)
+        if 5 * strange > len(heard):
+            return (
+                f"Received {len(heard)} bytes that are not text ({heard[:24]!r}), which is typical of a wrong baud "
+                f"rate: the port was opened at {self.baud} baud, and the firmware uses {protocol.BAUD}."
+            )
+        return f"Received {heard[:80]!r}, so another device may be on this port. Choose another port."

@@ -1,0 +1,707 @@
+"""The LED controller: lines of the protocol, the host against faults on the line, and the firmware in a simulator."""
+
+import binascii
+import importlib.resources
+import itertools
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import serial
+from led_peer import Peer, Simulated, until
+from serial.tools import list_ports_common
+
+from sts_jax import hardware
+from sts_jax.hardware import emulation, protocol
+
+ON = (255, 0, 128, 1)
+PAGE = Path(__file__).parents[1] / "docs" / "hardware" / "protocol.md"
+FIRMWARE = Path(str(importlib.resources.files("sts_jax"))) / "hardware" / "firmware"
+REQUESTS = [
+    protocol.Hello(1),
+    protocol.Hello(65535, 65535),
+    protocol.Set(7, (0, 0, 0, 0)),
+    protocol.Set(65535, (255, 255, 255, 255)),
+    protocol.Ping(10),
+    protocol.Watch(11, 100),
+    protocol.Watch(12, 10_000),
+]
+REPLIES = [
+    protocol.Controller(1, 1, "1.0.0", "atmega328p", "0123456789ABCDEF", 4),
+    protocol.State(7, ON, 3, 0),
+    protocol.State(65535, (255,) * 4, 2**32 - 1, 65535, 2**32 - 1),
+    protocol.State(9, (0, 0, 0, 0), 0, 65535, 0),
+    protocol.Watching(11, 1000),
+    protocol.Refused(0, protocol.Code.CHECKSUM, "checksum"),
+    protocol.Refused(5, protocol.Code.VERSION, "protocol 1"),
+    protocol.TurnedOff(12),
+]
+
+
+@pytest.fixture
+def peer(tmp_path):
+    peers = Peer(tmp_path / "port")
+    yield peers
+    peers.vanish()
+
+
+def connect(path, **options):
+    return hardware.Leds.connect(str(path), **({"timeout_s": 20.0, "answer_s": 20.0, "watchdog_ms": 10_000} | options))
+
+
+# ---- Protocol
+
+
+def bitwise_checksum(text):
+    """CRC-16/CCITT-FALSE, bit by bit."""
+    value = 0xFFFF
+    for byte in text:
+        value ^= byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ (0x1021 if value & 0x8000 else 0)
+        value &= 0xFFFF
+    return value
+
+
+def test_checksum_equals_the_published_value_and_a_bitwise_computation():
+    assert protocol.checksum(b"123456789") == 0x29B1  # check value of CRC-16/CCITT-FALSE
+    assert protocol.checksum(b"") == 0xFFFF
+    rng = random.Random(0)
+    for length in range(60):
+        text = rng.randbytes(length)
+        assert protocol.checksum(text) == bitwise_checksum(text) == binascii.crc_hqx(text, 0xFFFF)
+
+
+@pytest.mark.parametrize("request_", REQUESTS, ids=str)
+def test_requests_survive_the_line(request_):
+    assert protocol.decode_request(protocol.encode_request(request_)) == request_
+
+
+@pytest.mark.parametrize("reply", REPLIES, ids=str)
+def test_replies_survive_the_line(reply):
+    line = protocol.encode_reply(reply)
+    assert len(line) <= protocol.LONGEST_LINE
+    assert protocol.decode_reply(line) == reply
+
+
+LINES = [protocol.encode_request(x) for x in REQUESTS] + [protocol.encode_reply(x) for x in REPLIES]
+
+
+@pytest.mark.parametrize("line", LINES, ids=str)
+def test_every_flip_of_one_or_two_neighbouring_bits_is_rejected(line):
+    for width, bit in itertools.product((1, 3), range(8 * len(line) - 1)):
+        damaged = (int.from_bytes(line) ^ (width << bit)).to_bytes(len(line))
+        with pytest.raises(protocol.ProtocolError, match=re.escape(repr(damaged))):
+            protocol.decode(damaged)
+
+
+@pytest.mark.parametrize("line", LINES, ids=str)
+def test_cut_joined_swapped_and_extended_lines_are_rejected(line):
+    rng = random.Random(0)
+    damaged = [line[:end] for end in range(len(line))] + [line[start:] for start in range(1, len(line))]
+    damaged += [line + line, line[:-1] + line, line + b" ", b" " + line, line[:-1] + b"\r\n", line.lower()]
+    for _ in range(200):
+        i, j = sorted(rng.sample(range(len(line)), 2))
+        damaged.append(line[:i] + line[j : j + 1] + line[i + 1 : j] + line[i : i + 1] + line[j + 1 :])
+    for text in damaged:
+        if text != line:
+            with pytest.raises(protocol.ProtocolError):
+                protocol.decode(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "sequence"),
+    [
+        ("0 PING", protocol.Code.ARGUMENTS, 0),
+        ("65536 PING", protocol.Code.ARGUMENTS, 0),
+        ("01 PING", protocol.Code.ARGUMENTS, 0),
+        (" 1 PING", protocol.Code.ARGUMENTS, 0),
+        ("PING", protocol.Code.ARGUMENTS, 0),
+        ("1", protocol.Code.COMMAND, 1),
+        ("2 ping", protocol.Code.COMMAND, 2),
+        ("2  PING", protocol.Code.COMMAND, 2),
+        ("3 PING ", protocol.Code.ARGUMENTS, 3),
+        ("3 PING 1", protocol.Code.ARGUMENTS, 3),
+        ("4 SET 1 2 3", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 4 5", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 4 ", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 256", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 -1", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 +1", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 04", protocol.Code.ARGUMENTS, 4),
+        ("4 SET 1 2 3 4294967297", protocol.Code.ARGUMENTS, 4),
+        ("5 WATCH 99", protocol.Code.ARGUMENTS, 5),
+        ("5 WATCH 10001", protocol.Code.ARGUMENTS, 5),
+        ("5 WATCH", protocol.Code.ARGUMENTS, 5),
+        ("6 HELLO", protocol.Code.ARGUMENTS, 6),
+        ("6 HELLO x", protocol.Code.ARGUMENTS, 6),
+    ],
+)
+def test_bad_requests_name_the_line_and_the_error_code(text, code, sequence):
+    line = protocol.encode(text)
+    with pytest.raises(protocol.ProtocolError, match=re.escape(repr(line))) as caught:
+        protocol.decode_request(line)
+    assert (caught.value.code, caught.value.sequence) == (code, sequence)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1 OK",
+        "1 OK SET 1 2 3 4 5",
+        "1 OK SET 1 2 3 4 5 65536",
+        "1 OK SET 1 2 3 256 5 6",
+        "1 OK PING 1 2 3 4 5 6",
+        "1 OK PING 1 2 3 4 4294967296 6 7",
+        "1 OK WATCH 5",
+        "1 OK HELLO 1 1.0 uno",
+        "1 OK HELLO 1 1.0 uno X 3",
+        "1 OK HELLO 1 1.0 uno X/Y 4",
+        "0 OK SET 1 2 3 4 5 6",
+        "1 ERR 9 text",
+        "1 ERR 0 text",
+        "1 ERR 1",
+        "1 OFF watchdog 5",
+        "0 OFF watchdog 0",
+        "hello",
+    ],
+)
+def test_bad_replies_are_rejected(text):
+    with pytest.raises(protocol.ProtocolError, match="not a reply"):
+        protocol.decode_reply(protocol.encode(text))
+
+
+def test_messages_that_do_not_fit_a_line_are_not_sent():
+    with pytest.raises(protocol.ProtocolError, match="at most 64 bytes"):
+        protocol.encode("x" * 60)
+    with pytest.raises(protocol.ProtocolError, match="printable ASCII"):
+        protocol.encode("1 PING*")
+    with pytest.raises(protocol.ProtocolError, match="bad arguments"):
+        protocol.encode_request(protocol.Set(1, (0, 0, 0, 300)))
+
+
+def test_examples_of_the_page_are_valid_lines():
+    """Each line of the page's exchanges is a message, and the emulated controller gives the same answers."""
+    exchanges = re.findall(r"```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    assert len(exchanges) >= 3
+    for exchange in exchanges:
+        device = emulation.EmulatedController(boot=17, serial_number="1A2B3C4D")
+        now, answers = 0.0, []
+        for row in exchange.splitlines():
+            direction, text = row[:2], row[2:]
+            if direction == "> ":
+                assert not answers, row
+                now += 0.25
+                answers = device.receive(text.encode() + b"\n", now).splitlines()
+            elif direction == "< ":
+                if not answers:
+                    now += 60
+                    answers = device.tick(now).splitlines()
+                given = answers.pop(0).decode()
+                if " OK HELLO " in given:
+                    given = text if protocol.decode_reply(text.encode() + b"\n").serial_number == "1A2B3C4D" else given
+                assert given == text
+            else:
+                assert row.startswith("# "), row
+        assert not answers
+
+
+# ---- Emulated controller
+
+
+def test_watchdog_turns_the_lights_off_once_and_counts():
+    device = emulation.EmulatedController(now_s=5.0)
+    device.receive(protocol.encode("1 SET 9 9 9 9"), 6.0)
+    assert device.tick(6.999) == b""
+    assert device.receive(b"1 PING*0000\n", 6.999) == protocol.encode("0 ERR 1 checksum")  # feeds no watchdog
+    assert device.tick(7.0) == protocol.encode("0 OFF watchdog 2")
+    assert device.tick(99.0) == b""
+    assert device.levels == protocol.DARK
+
+
+def test_a_repeated_request_is_answered_alike_and_not_executed_again():
+    device = emulation.EmulatedController()
+    line = protocol.encode("1 SET 9 9 9 9")
+    first = device.receive(line, 0.0)
+    assert device.receive(line[:5], 0.1) == b""
+    assert device.receive(line[5:], 0.2) == first
+    assert device.tick(1.3) == protocol.encode("0 OFF watchdog 2")
+    assert device.receive(line, 1.4) == first
+    assert device.levels == protocol.DARK
+
+
+# ---- Host
+
+
+def test_lights_are_set_and_acknowledged(peer):
+    with connect(peer.path) as leds:
+        assert (leds.serial_number, leds.board, leds.firmware) == ("EMULATED", "emulation", "emulated")
+        before = time.monotonic()
+        lit = leds.set(ON)
+        assert lit.levels == ON == peer.controller.levels
+        assert before <= lit.sent_s <= lit.acknowledged_s <= time.monotonic()
+        assert leds.ping().unchanged_since(lit)
+        other = leds.set([0, 0, 0, 7])
+        assert other.counter == lit.counter + 1
+        assert not leds.set(ON).unchanged_since(lit)
+        leds.set(ON)
+    assert peer.controller.levels == protocol.DARK
+    leds.close()
+    with pytest.raises(hardware.DisconnectedError, match="gone or closed"):
+        leds.set(ON)
+
+
+FAULTS = ["deaf", "damaged", "lost", "late", "doubled", "garbled", "cut", "joined", "noise", "watchdog", "stale"]
+
+
+@pytest.mark.parametrize("first", FAULTS)
+def test_each_request_is_executed_once_whatever_happens_to_its_answer(peer, first):
+    with connect(peer.path) as leds:
+        for i, second in enumerate([*FAULTS, "none"]):
+            levels = (1 + i, 2, 3, 4)
+            counter = peer.controller.counter
+            peer.faults = [first, second]
+            lit = leds.set(levels)
+            assert (lit.levels, lit.counter) == (levels, counter + 1)
+            assert peer.controller.counter == counter + 1
+            peer.faults = []
+            assert leds.ping().unchanged_since(lit)
+
+
+def test_repetitions_have_the_same_sequence_number(peer):
+    with connect(peer.path) as leds:
+        peer.requests.clear()
+        peer.faults = ["lost", "garbled", "deaf"]
+        leds.set(ON)
+        sent = [line for line in peer.requests if b"SET" in line]
+        assert len(sent) == 4
+        assert len(set(sent)) == 1
+
+
+def test_a_silent_controller_gives_a_timeout_and_works_again_later(peer):
+    with connect(peer.path, answer_s=0.3) as leds:
+        peer.faults = ["deaf"] * 100
+        with pytest.raises(hardware.LedTimeoutError, match=r"no valid answer to .* SET 255 .*within 0\.3 s.*Nothing"):
+            leds.set(ON)
+        peer.faults.clear()
+        leds._answer_s = 20.0
+        assert leds.set(ON).levels == ON
+
+
+@pytest.mark.parametrize("levels", [(1, 2, 3), (0, 0, 0, 256), (0, 0, 0, -1), (0, 0, 0, 1, 2)])
+def test_bad_levels_are_named(peer, levels):
+    with connect(peer.path) as leds, pytest.raises(ValueError, match="levels must be 4 integers"):
+        leds.set(levels)
+
+
+def test_bad_times_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"watchdog_ms must be in 100\.\.10000, got 50"):
+        connect(tmp_path / "port", watchdog_ms=50)
+    with pytest.raises(ValueError, match="answer_s must be positive and finite, got 0"):
+        connect(tmp_path / "port", answer_s=0.0)
+
+
+def test_lights_stay_on_while_the_host_lives(peer):
+    with connect(peer.path, watchdog_ms=300) as leds:
+        lit = leds.set(ON)
+        peer.requests.clear()
+        until(lambda: sum(b"PING" in line for line in peer.requests) >= 4)
+        assert leds.ping().unchanged_since(lit)
+        assert peer.controller.watch_ms == 300
+
+
+def test_threads_share_a_controller(peer):
+    with connect(peer.path, watchdog_ms=100) as leds:
+        failed = []
+
+        def work(number):
+            for i in range(20):
+                levels = (number, i, 0, 1)
+                if leds.set(levels).levels != levels:
+                    failed.append(levels)
+
+        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert not failed
+        assert leds.ping().counter == 80
+
+
+def test_a_controller_that_restarts_gets_the_watchdog_period_again(peer):
+    with connect(peer.path, watchdog_ms=5000) as leds:
+        lit = leds.set(ON)
+        peer.controller = emulation.EmulatedController(boot=2, now_s=peer.controller._valid_s)
+        now = leds.ping()
+        assert now.levels == protocol.DARK
+        assert not now.unchanged_since(lit)
+        assert peer.controller.watch_ms == 5000
+
+
+def test_a_vanished_port_is_named_and_found_again(peer, tmp_path):
+    leds = connect(peer.path)
+    leds.set(ON)
+    peer.faults = ["vanish"]
+    with pytest.raises(hardware.DisconnectedError, match=r"port is gone.*reconnect\(\)"):
+        leds.set(ON)
+    with pytest.raises(hardware.DisconnectedError, match=r"EMULATED was not found within 0\.2 s.*Tried: .*port"):
+        leds.reconnect(limit_s=0.2)
+    returned = Peer(tmp_path / "port")
+    leds.reconnect(limit_s=60.0)
+    assert leds.set(ON).levels == ON == returned.controller.levels
+    leds.close()
+    assert returned.controller.levels == protocol.DARK
+    returned.vanish()
+
+
+def usb_port(path, serial_number):
+    port = list_ports_common.ListPortInfo(str(path))
+    port.vid, port.pid, port.serial_number, port.description = 0x2341, 0x43, serial_number, "Arduino Uno"
+    return port
+
+
+def test_a_controller_is_found_under_another_name(tmp_path, monkeypatch):
+    other, mine = Peer(tmp_path / "other", serial_number="OTHER"), Peer(tmp_path / "mine", serial_number="MINE")
+    found = [usb_port(other.path, "77"), usb_port(mine.path, "55")]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: found)
+    leds = connect(mine.path)
+    mine.vanish()
+    back = Peer(tmp_path / "new", serial_number="MINE")
+    found[:] = [usb_port(other.path, None), usb_port(back.path, "99")]
+    leds.reconnect(limit_s=60.0)
+    assert leds.port == str(back.path)
+    assert leds.set(ON).levels == back.controller.levels
+    leds.close()
+    for peer in (other, back):
+        peer.vanish()
+
+
+def test_ports_are_listed_with_their_usb_serial_numbers(monkeypatch):
+    plain = list_ports_common.ListPortInfo("/dev/ttyS0")
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [plain, usb_port("/dev/ttyACM0", "55")])
+    first, second = hardware.find_controllers()
+    assert (first.device, first.serial_number, first.vendor) == ("/dev/ttyACM0", "55", 0x2341)
+    assert (second.device, second.serial_number) == ("/dev/ttyS0", None)
+    with pytest.raises(hardware.PortNotFoundError, match=r"no port /dev/missing.*ttyACM0 \(Arduino Uno\), /dev/ttyS0"):
+        connect("/dev/missing")
+    with pytest.raises(hardware.PortNotFoundError, match="URL of pyserial"):
+        connect("nonsense://port")
+
+
+def test_no_permission_names_the_group(monkeypatch, tmp_path):
+    def forbidden(*_, **__):
+        raise serial.SerialException(13, "could not open port: Permission denied")
+
+    monkeypatch.setattr(serial, "serial_for_url", forbidden)
+    with pytest.raises(hardware.PortPermissionError, match=r"usermod -aG .*dialout"):
+        connect(tmp_path / "port")
+
+
+def test_a_file_is_no_serial_port(tmp_path):
+    (tmp_path / "file").write_text("text")
+    with pytest.raises(hardware.NotALedControllerError, match="not a serial port"):
+        connect(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("talk", "message"),
+    [
+        (b"", "Nothing was received"),
+        (b"$GPGGA,092750.000,5321.6802,N*76\r\n", r"Received b'\$GPGGA.*another device"),
+        (b"\x80\xf8\x00\xfe\x87\x00\xf0" * 30, "not text.*typical of a wrong baud rate.*opened at 9600 baud.*115200"),
+        (protocol.encode("1 OK SET 0 0 0 0 0 0"), "no LED controller answered"),
+        (protocol.encode("0 ERR 1 checksum"), "no LED controller answered"),
+        (b"\x00" * 4000, "typical of a wrong baud rate"),
+    ],
+    ids=["silence", "text", "garbage", "answers to nobody", "refusals of nothing", "flood"],
+)
+def test_another_device_is_described(tmp_path, talk, message):
+    other = Peer(tmp_path / "port", talk=talk)
+    with pytest.raises(hardware.NotALedControllerError, match=message):
+        connect(other.path, timeout_s=0.4, baud=9600)
+    other.vanish()
+
+
+def test_another_version_of_the_protocol_is_named(tmp_path, monkeypatch):
+    class Newer(emulation.EmulatedController):
+        def _execute(self, request, now_s):
+            if isinstance(request, protocol.Hello):
+                return protocol.Controller(request.sequence, 2, "2.0", "board", "X", 0)
+            return super()._execute(request, now_s)
+
+    newer = Peer(tmp_path / "port")
+    newer.controller = Newer()
+    with pytest.raises(hardware.WrongVersionError, match=r"speaks version 2 .* needs 1\. Flash.*make flash PORT"):
+        connect(newer.path)
+    newer.controller = emulation.EmulatedController()
+    monkeypatch.setattr(protocol, "VERSION", 3)
+    monkeypatch.setattr(protocol.Hello.__init__, "__defaults__", (3,))
+    monkeypatch.setattr(newer.controller, "_execute", refuse_version)
+    with pytest.raises(hardware.WrongVersionError, match=r"speaks protocol 1 .* needs 3"):
+        connect(newer.path)
+    newer.vanish()
+
+
+def refuse_version(request, now_s):
+    return protocol.Refused(request.sequence, protocol.Code.VERSION, "protocol 1")
+
+
+HOLD = "import serial, sys; s = serial.Serial(sys.argv[1], exclusive=True); print('open', flush=True); sys.stdin.read()"
+
+
+def test_two_processes_cannot_share_a_port(peer):
+    arguments = [sys.executable, "-c", HOLD, str(peer.path)]
+    holder = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert holder.stdout.readline() == b"open\n"
+    with pytest.raises(hardware.PortInUseError, match=rf"in use by process {holder.pid} \(.*close the other program"):
+        connect(peer.path)
+    holder.communicate()
+    with connect(peer.path):
+        refused = subprocess.run(arguments, capture_output=True, input=b"", check=False)
+        assert b"exclusively lock" in refused.stderr
+        with pytest.raises(hardware.PortInUseError, match="another part of this process"):
+            connect(peer.path)
+
+
+def test_hardware_imports_no_jax():
+    folder = Path(hardware.__file__).parent
+    for path in (folder / name for name in ("ports.py", "protocol.py", "emulation.py", "_connection.py", "leds.py")):
+        assert not re.search(r"^\s*(import|from) (jax|sts_jax(?!\.hardware))", path.read_text(), re.MULTILINE), path
+
+
+# ---- Firmware
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The simulator's program, the firmware with a serial number, and the firmware without."""
+    for program in ("avr-gcc", "avr-objcopy", "make", "gcc"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is missing: apt-get install gcc-avr avr-libc make gcc libsimavr-dev")
+    folder = tmp_path_factory.mktemp("firmware")
+    program = folder / "avr_uart_pty"
+    source = Path(__file__).with_name("avr_uart_pty.c")
+    if subprocess.run(
+        ["gcc", "-include", "simavr/sim_avr.h", "-E", "-x", "c", os.devnull], capture_output=True
+    ).returncode:
+        pytest.skip("simavr's headers are missing: apt-get install libsimavr-dev")
+    subprocess.run(["gcc", "-O2", "-Wall", "-I/usr/include/simavr", "-o", program, source, "-lsimavr"], check=True)
+    for name in ("SIM-1", ""):
+        build = f"BUILD={folder / (name or 'random')}"
+        subprocess.run(["make", "--silent", "-C", FIRMWARE, build, f"SERIAL={name}"], check=True)
+    return program, folder / "SIM-1" / "leds.hex", folder / "random" / "leds.hex"
+
+
+@pytest.fixture
+def simulated(built):
+    chip = Simulated(*built[:2])
+    yield chip
+    chip.stop()
+
+
+@pytest.mark.slow
+def test_firmware_sets_the_duty_cycles(simulated):
+    with connect(simulated.path) as leds:
+        assert (leds.serial_number, leds.board, leds.firmware) == ("SIM-1", "atmega328p", "1.0.0")
+        for levels in (ON, (1, 2, 3, 4), (255,) * 4, protocol.DARK, (0, 0, 0, 255), (0, 7, 0, 0)):
+            lit = leds.set(levels)
+            simulated.wait_for(levels)
+            assert leds.ping().unchanged_since(lit)
+    simulated.wait_for(protocol.DARK)
+
+
+@pytest.mark.slow
+def test_firmware_keeps_the_lights_on_with_requests_and_turns_them_off_without(simulated):
+    with connect(simulated.path, watchdog_ms=2000) as leds:
+        lit = leds.set(ON)
+        time.sleep(4)
+        assert leds.ping().unchanged_since(lit)
+        leds._connection.stopped.set()  # no more requests
+        leds._thread.join()
+        simulated.wait_for(ON)
+        simulated.wait_for(protocol.DARK)
+        now = leds.ping()
+        assert (now.levels, now.counter, now.boot) == (protocol.DARK, lit.counter + 1, lit.boot)
+
+
+HOST = """
+import sys
+from sts_jax.hardware import Leds
+leds = Leds.connect(sys.argv[1], timeout_s=20.0, answer_s=20.0)
+print(leds.set((9, 9, 9, 9)).levels, flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.slow
+def test_firmware_turns_the_lights_off_when_the_host_is_killed(simulated):
+    host = subprocess.Popen([sys.executable, "-c", HOST, simulated.path], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert host.stdout.readline() == b"(9, 9, 9, 9)\n"
+    simulated.wait_for((9, 9, 9, 9))
+    host.send_signal(signal.SIGKILL)
+    host.communicate()
+    simulated.wait_for(protocol.DARK)
+
+
+@pytest.mark.slow
+def test_firmware_executes_repeated_requests_once(simulated, monkeypatch):
+    with connect(simulated.path) as leds:
+        connection = leds._connection
+        write, next_line, damage = connection._write, connection._next_line, {"request": 2, "answer": 2}
+
+        def damaged_write(line):
+            damage["request"] -= 1
+            write(line if damage["request"] < 0 else line.replace(b"SET", b"SAT"))
+
+        def damaged_line(until):
+            line = next_line(until)
+            if line is not None and b"SET" in line and damage["answer"] > 0:
+                damage["answer"] -= 1
+                return line.replace(b"SET", b"SAT")
+            return line
+
+        before = leds.ping()
+        monkeypatch.setattr(connection, "_write", damaged_write)
+        monkeypatch.setattr(connection, "_next_line", damaged_line)
+        lit = leds.set(ON)
+        assert damage == {"request": -3, "answer": 0}  # two damaged requests, and three for two damaged answers
+        assert (lit.levels, lit.counter) == (ON, before.counter + 1)
+        assert leds.ping().unchanged_since(lit)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("letter", ["r", "s"], ids=["reset", "clock stops"])
+def test_firmware_restarts_dark_with_another_boot_number(simulated, letter):
+    with connect(simulated.path) as leds:
+        lit = leds.set(ON)
+        simulated.wait_for(ON)
+        simulated.command(letter)
+        simulated.wait_for(protocol.DARK)
+        now = leds.ping()
+        assert (now.levels, now.boot) == (protocol.DARK, (lit.boot + 1) % 2**16)
+        assert not now.unchanged_since(lit)
+
+
+@pytest.mark.slow
+def test_firmware_draws_its_serial_number_once(built):
+    chip = Simulated(built[0], built[2])
+    with connect(chip.path) as leds:
+        number, boot = leds.serial_number, leds.ping().boot
+        assert re.fullmatch("[0-9A-F]{8}", number)
+    chip.command("r")
+    with connect(chip.path) as leds:
+        assert (leds.serial_number, leds.ping().boot) == (number, boot + 1)
+    chip.stop()
+
+
+def exchanged(port, line):
+    """The answer to a line. The newline of the boot is skipped."""
+    port.write(line)
+    while (answer := port.readline()) == b"\n":
+        pass
+    return answer
+
+
+def booted(path):
+    """The port of a simulated controller that has booted, with its watchdog at 10 s."""
+    port = serial.Serial(path, timeout=0.2, exclusive=True)
+    until(lambda: b" OK WATCH " in exchanged(port, protocol.encode("1 WATCH 10000")))
+    port.timeout = 0.5
+    while port.readline():  # answers to requests that were repeated during the boot
+        pass
+    port.timeout = 20.0
+    return port
+
+
+@pytest.mark.slow
+def test_firmware_answers_a_repeated_request_alike_and_does_not_execute_it_again(simulated):
+    with booted(simulated.path) as port:
+        ping, on = protocol.encode("2 PING"), protocol.encode("4 SET 9 9 9 9")
+        first = exchanged(port, ping)
+        time.sleep(0.05)
+        assert exchanged(port, ping) == first
+        assert exchanged(port, protocol.encode("3 PING")).split()[-1] != first.split()[-1]  # the time went on
+        exchanged(port, protocol.encode("3 WATCH 100"))
+        answer = exchanged(port, on)
+        simulated.wait_for((9, 9, 9, 9))
+        assert port.readline() == protocol.encode("0 OFF watchdog 2")
+        simulated.wait_for(protocol.DARK)
+        assert exchanged(port, on) == answer
+        state = protocol.decode_reply(exchanged(port, protocol.encode("5 PING")))
+        assert (state.levels, state.counter) == (protocol.DARK, 2)
+
+
+def random_lines(rng, number):
+    """Valid, damaged, malformed and repeated lines."""
+    words = [
+        "HELLO",
+        "SET",
+        "PING",
+        "WATCH",
+        "1",
+        "2",
+        "0",
+        "00",
+        "255",
+        "256",
+        "9999",
+        "10000",
+        "10001",
+        "x",
+        "",
+        "-1",
+    ]
+    lines = []
+    for _ in range(number):
+        sequence = rng.choice(["0", "65536", "x", *(str(rng.randint(1, 65535)) for _ in range(9))])
+        match rng.randrange(6):
+            case 0 | 1:
+                text = f"{sequence} SET " + " ".join(str(rng.choice([0, 1, 255, rng.randrange(256)])) for _ in range(4))
+            case 2:
+                text = f"{sequence} PING"
+            case _:
+                text = " ".join([sequence, *rng.choices(words, k=rng.randrange(8))])
+        line = protocol.encode(text[:58])
+        match rng.randrange(8):
+            case 0:
+                line = rng.choice(lines or [line])
+            case 1:
+                place = rng.randrange(len(line) - 1)
+                line = line[:place] + rng.choice([b"*", b"\0", b"\xff", b"q", b""]) + line[place + 1 :]
+            case 2:
+                line = b"y" * rng.randrange(50, 200) + line
+        lines += [line] * rng.choice([1, 1, 1, 2])
+    return lines
+
+
+@pytest.mark.slow
+def test_firmware_and_emulation_answer_alike(simulated):
+    """The texts of HELLO and the time since the boot differ, and everything else is the same."""
+    with booted(simulated.path) as port:
+        state = protocol.decode_reply(exchanged(port, protocol.encode("2 PING")))
+        device = emulation.EmulatedController(boot=state.boot)
+        device.receive(protocol.encode("1 WATCH 10000"), 0.0)
+        device.receive(protocol.encode("2 PING"), 0.0)
+        rng = random.Random(5)
+        lines = [line for line in random_lines(rng, 400) if line.strip(b"\n") and b"WATCH 9999" not in line]
+        for line in lines:
+            assert comparable(exchanged(port, line)) == comparable(device.receive(line, 0.0)), line
+        assert device.counter > 50
+
+
+def comparable(line):
+    reply = protocol.decode_reply(line)
+    if isinstance(reply, protocol.Controller):
+        return reply.sequence, reply.version, reply.channels
+    if isinstance(reply, protocol.State) and reply.uptime_ms is not None:
+        return reply.sequence, reply.levels, reply.counter, reply.boot
+    return line
