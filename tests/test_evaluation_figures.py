@@ -119,9 +119,9 @@ def test_ends_are_drawn_in_millimetres_as_the_images_are_oriented(tmp_path, draw
         np.testing.assert_allclose(np.transpose([ends.get_xdata(), ends.get_ydata()]), 1e3 * poses[:, :2])
 
 
-def test_a_scaling_figure_joins_models_of_one_training_time_or_one_number_of_trajectories(tmp_path, drawn):
+def test_a_scaling_figure_joins_models_of_one_number_of_steps_or_of_trajectories(tmp_path, drawn):
     points = [
-        figures.Trained("vision", number, minutes, number * minutes / 1e4, 0.0, 1.0)
+        figures.Trained("vision", number, 100 * minutes, minutes + number / 1e4, number * minutes / 1e4, 0.0, 1.0)
         for number in (800, 100)
         for minutes in (5, 2)
     ]
@@ -132,11 +132,26 @@ def test_a_scaling_figure_joins_models_of_one_training_time_or_one_number_of_tra
         handles, labels = axis.get_legend_handles_labels()
         return {label: handle.lines[0].get_xydata().tolist() for handle, label in zip(handles, labels, strict=True)}
 
-    assert lines(left) == {"vision, 5 min": [[100, 0.05], [800, 0.4]], "vision, 2 min": [[100, 0.02], [800, 0.16]]}
-    assert lines(right) == {
-        "vision, 800 trajectories": [[2, 0.16], [5, 0.4]],
-        "vision, 100 trajectories": [[2, 0.02], [5, 0.05]],
+    assert lines(left) == {
+        "vision, 500 steps": [[100, 0.05], [800, 0.4]],
+        "vision, 200 steps": [[100, 0.02], [800, 0.16]],
     }
+    assert lines(right) == {
+        "vision, 800 trajectories": [[2.08, 0.16], [5.08, 0.4]],
+        "vision, 100 trajectories": [[2.01, 0.02], [5.01, 0.05]],
+    }
+    assert left.get_xticks().tolist() == [100, 800]
+    assert right.get_xticks().tolist() == [2.01, 2.08, 5.01, 5.08]
+
+
+def test_a_scaling_figure_has_no_ticks_of_models_that_a_panel_leaves_out(tmp_path, drawn):
+    points = [
+        figures.Trained("vision", *where, 0.3, 0.2, 0.4) for where in ((100, 500, 5.1), (800, 500, 5.2), (800, 90, 1))
+    ]
+    figures.scaling(tmp_path / "a.png", points, title="t")
+    left, right = drawn[0].axes
+    assert left.get_xticks().tolist() == [100, 800]
+    assert right.get_xticks().tolist() == [1, 5.2]
 
 
 @pytest.mark.parametrize(("last", "scale"), [(0.5, "log"), (-3.0, "linear")])

@@ -16,6 +16,7 @@ class Trained(NamedTuple):
 
     name: str  # of the line, such as the inputs or the model
     trajectories: int  # number of training trajectories
+    steps: int  # gradient steps
     minutes: float  # training time
     skill: float
     low: float  # of the 95 % interval
@@ -25,8 +26,8 @@ class Trained(NamedTuple):
 def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
     """Draw visual skill on held-out objects against the number of training trajectories and against training time.
 
-    The left panel joins the models of one name and training time, the right panel those of one name and number of
-    trajectories.
+    The left panel joins the models of one name and number of gradient steps, the right panel those of one name and
+    number of trajectories.
 
     Args:
         path: The PNG to write.
@@ -36,11 +37,12 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
     """
     figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
     for axis, along, fixed, unit in (
-        (axes[0], "trajectories", "minutes", "{:g} min"),
+        (axes[0], "trajectories", "steps", "{:,} steps"),
         (axes[1], "minutes", "trajectories", "{:,} trajectories"),
     ):
         groups = collections.Counter((point.name, getattr(point, fixed)) for point in points)
         sizes = [(name, count) for (name, _), count in groups.items()]
+        ticks: set[float] = set()
         for group in groups:
             own = [point for point in points if (point.name, getattr(point, fixed)) == group]
             own = sorted(own, key=lambda point: getattr(point, along))
@@ -50,6 +52,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
             spread = [skill - [point.low for point in own], [point.high for point in own] - skill]
             label = f"{group[0]}, {unit.format(group[1])}"
             place = [getattr(point, along) for point in own]
+            ticks.update(place)
             axis.errorbar(place, skill, spread, fmt="o-", capsize=3, markersize=5, linewidth=1.2, label=label)
         if ceiling is not None:
             axis.axhline(ceiling, color="gray", linestyle="--", linewidth=1)
@@ -63,8 +66,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
                 color="0.4",
             )
         axis.set_xscale("log")
-        ticks = sorted({getattr(point, along) for point in points})
-        axis.set_xticks(ticks, [f"{tick:,g}" for tick in ticks])
+        axis.set_xticks(sorted(ticks), [f"{tick:,g}" for tick in sorted(ticks)])
         axis.set_xticks([], minor=True)
         axis.grid(alpha=0.3)
         axis.margins(y=0.12)
