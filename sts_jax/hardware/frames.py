@@ -1,0 +1,100 @@
+"""`Captured`: one frame of a camera with its time and number, and the statistics of all frames."""
+
+import collections
+import dataclasses
+import statistics
+
+import numpy as np
+from jaxtyping import UInt8
+
+_BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
+_INTERVALS = 61  # recent intervals between frames, of which the median is the period
+_FEWEST = 8  # intervals from which a period is measured
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Captured:
+    """One frame of a camera.
+
+    The clock is `time.monotonic`. Numbers that are missing between two frames belong to frames that were not fetched
+    or that were discarded as damaged.
+    """
+
+    image: UInt8[np.ndarray, "height width 3"]  # RGB, read-only, row 0 at the top
+    time_s: float  # arrival of the frame (s), before it was decoded
+    sequence: int  # number of the frame since `connect`, from 0
+    epoch: int  # number of the connection, from 0. It changes when a lost device is found again
+    dropped: int  # frames that the camera lost just before this one, estimated from the times
+    repeats: int  # frames just before this one that are identical with it
+    black: bool  # whether the image is black, see `is_black`
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraStatistics:
+    """Counts since `connect`."""
+
+    frames: int = 0  # complete frames
+    dropped: int = 0  # frames that the camera or the driver lost, estimated from the times
+    skipped: int = 0  # complete frames that were replaced before `async_read` fetched them
+    damaged: int = 0  # frames that could not be decoded
+    wrong_size: int = 0  # frames of another size
+    repeated: int = 0  # frames identical with the one before
+    black: int = 0  # black frames
+    losses: int = 0  # losses of the device or the stream
+    rate: float | None = None  # frames per second, from the median interval of recent frames, None: not yet measured
+
+
+def is_black(image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    """Whether no value of an image exceeds 8 of 255. The lights may be off, so this is no error."""
+    return bool(image.max(initial=0) <= _BLACK)
+
+
+class Pace:
+    """The period of the frames, and the frames that are missing between them.
+
+    A gap of n + 1 periods counts as n lost frames. If frames arrive in quick succession after a gap, they were only
+    late, and `dropped` is corrected. The number that `arrived` has returned for the first of them stays.
+    """
+
+    def __init__(self, nominal: float | None):
+        self._nominal = nominal
+        self._last: float | None = None
+        self._late = 0
+        self._intervals: collections.deque[float] = collections.deque(maxlen=_INTERVALS)
+        self.dropped = 0
+
+    @property
+    def period(self) -> float | None:
+        """Seconds between frames, or None if it is unknown."""
+        if len(self._intervals) < _FEWEST:
+            return self._nominal
+        return statistics.median(self._intervals)
+
+    @property
+    def rate(self) -> float | None:
+        """Measured frames per second, or None if too few frames have arrived."""
+        return 1 / statistics.median(self._intervals) if len(self._intervals) >= _FEWEST else None
+
+    def arrived(self, time_s: float) -> int:
+        """Record a frame and return the estimated number of frames lost before it."""
+        last, self._last = self._last, time_s
+        if last is None or time_s <= last:
+            return 0
+        interval, period = time_s - last, self.period
+        self._intervals.append(interval)
+        if period is None:
+            return 0
+        missing = max(round(interval / period) - 1, 0)
+        if missing:
+            self._late = missing
+            self.dropped += missing
+        elif interval < period / 2 and self._late:
+            self._late -= 1
+            self.dropped -= 1
+        else:
+            self._late = 0
+        return missing
+
+    def interrupted(self) -> None:
+        """Forget the last frame, because the connection was interrupted."""
+        self._last, self._late = None, 0
