@@ -146,7 +146,9 @@ def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
     """The error for frames of another size than the configuration's."""
     if config.kind == "device":
         path = devices.device_path(config.target)
-        remedy = f"choose one of the sizes that `v4l2-ctl -d {path} --list-formats-ext` prints (some need fourcc='MJPG')"
+        remedy = (
+            f"choose one of the sizes that `v4l2-ctl -d {path} --list-formats-ext` prints (some need fourcc='MJPG')"
+        )
     else:
         remedy = f"set width={width}, height={height} in CameraConfig, or let the source send the size asked for"
     return FrameSizeError(
@@ -176,6 +178,16 @@ def check_source(config: CameraConfig) -> None:
         )
     if not device and not path.stat().st_size:
         raise CameraOpenError(f"{path} is empty: give a video file.")
+
+
+def _group(path: Path) -> str:
+    """The group that owns a device, or video if it is unknown."""
+    with contextlib.suppress(OSError, KeyError, ImportError):
+        import grp  # not on Windows
+
+        group = grp.getgrgid(path.stat().st_gid).gr_name
+        return "video" if group == "root" else group
+    return "video"
 
 
 def opening_error(config: CameraConfig) -> CameraError:

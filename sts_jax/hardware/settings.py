@@ -27,9 +27,7 @@ class _Setting:
 
 _MANUAL = 1.0  # V4L2_EXPOSURE_MANUAL
 _SETTINGS = (
-    _Setting(
-        "exposure", "EXPOSURE", cv2.CAP_PROP_EXPOSURE, ("AUTO_EXPOSURE", cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
-    ),
+    _Setting("exposure", "EXPOSURE", cv2.CAP_PROP_EXPOSURE, ("AUTO_EXPOSURE", cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)),
     _Setting("gain", "GAIN", cv2.CAP_PROP_GAIN, None),
     _Setting("white_balance", "WB_TEMPERATURE", cv2.CAP_PROP_WB_TEMPERATURE, ("AUTO_WB", cv2.CAP_PROP_AUTO_WB, 0.0)),
     _Setting("focus", "FOCUS", cv2.CAP_PROP_FOCUS, ("AUTOFOCUS", cv2.CAP_PROP_AUTOFOCUS, 0.0)),
