@@ -83,7 +83,7 @@ class Camera:
             )
 
     def disconnect(self) -> None:
-        """Close the camera. It takes at most `timeout_s` and a second. A camera that is not connected stays as it is."""
+        """Close the camera, within `timeout_s` and a second. Without a connection, it does nothing."""
         grabber, self._grabber = self._grabber, None
         if grabber is not None and not grabber.stop():
             warnings.warn(

@@ -25,6 +25,7 @@ from sts_jax.hardware.camera_errors import (
 
 _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 _ANSI = int.from_bytes(b"ansi", "little")  # FFmpeg's name for a plain text, which it draws as a video
+_VIDEO = 81  # Linux's major number of video devices
 _TAIL = 1024  # bytes within which a complete JPEG image ends with its marker
 _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
 
@@ -117,8 +118,8 @@ class Capture:
             if self._jpeg:
                 if b"\xff\xd9" not in image.reshape(-1)[-_TAIL:].tobytes():
                     return None
-                image = cv2.imdecode(image.reshape(-1), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
-                return None if image is None else np.asarray(image)
+                decoded = cv2.imdecode(image.reshape(-1), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+                return None if decoded is None else np.asarray(decoded)
             return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
         except cv2.error:
             return None
@@ -133,7 +134,7 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
     if config.kind == "device":
         if sys.platform == "linux":
             return cv2.VideoCapture(devices.device_path(config.target), cv2.CAP_V4L2)
-        return cv2.VideoCapture(config.target, cv2.CAP_ANY)  # type: ignore[arg-type]
+        return cv2.VideoCapture(config.target, cv2.CAP_ANY)
     parameters = []
     if config.kind == "stream":
         # Several decoding threads hold back as many frames.
@@ -166,8 +167,6 @@ def check_source(config: CameraConfig) -> None:
     if not path.exists():
         remedy = devices.cameras_found() if device else f"Check the path (the working directory is {Path.cwd()})."
         raise CameraNotFoundError(f"there is no {'device' if device else 'file'} {path}. {remedy}")
-    if device and not path.is_char_device():
-        raise CameraOpenError(f"{path} is not a camera. {devices.cameras_found()}")
     if path.is_dir():
         raise CameraOpenError(f"{path} is a folder: give a video file.")
     if not os.access(path, os.R_OK | os.W_OK if device else os.R_OK):
@@ -176,6 +175,8 @@ def check_source(config: CameraConfig) -> None:
         raise CameraPermissionError(
             f"no permission to open {path}: {remedy if device else 'change its permissions with `chmod u+r`'}."
         )
+    if device and not (path.is_char_device() and os.major(path.stat().st_rdev) == _VIDEO):
+        raise CameraOpenError(f"{path} is not a camera. {devices.cameras_found()}")
     if not device and not path.stat().st_size:
         raise CameraOpenError(f"{path} is empty: give a video file.")
 

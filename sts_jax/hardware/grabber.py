@@ -363,7 +363,8 @@ class _Playback:
 
     def late(self) -> bool:
         """Whether the frame after the current one is due too. It then counts as taken."""
-        if not self.realtime or time.monotonic() < self._start + self._number * self._period:
+        last = self._frames is not None and self._number >= self._frames
+        if not self.realtime or last or time.monotonic() < self._start + self._number * self._period:
             return False
         self._number += 1
         return True

@@ -2,19 +2,20 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 
 from sts_jax.hardware.camera_config import CameraConfig
 
 
+@runtime_checkable
 class Properties(Protocol):
     """The part of `cv2.VideoCapture` that holds a device's properties."""
 
-    def get(self, propId: int, /) -> float: ...  # noqa: D102, N803
+    def get(self, propId: int, /) -> float: ...  # noqa: D102
 
-    def set(self, propId: int, value: float, /) -> bool: ...  # noqa: D102, N803
+    def set(self, propId: int, value: float, /) -> bool: ...  # noqa: D102
 
 
 @dataclasses.dataclass(frozen=True)
