@@ -39,7 +39,7 @@ class Camera:
     def connect(self, warmup_s: float = 1.0) -> "Camera":
         """Open the camera, let its automatic controls settle, and lock them.
 
-        It takes at most `warmup_s` and three times `timeout_s`. A video file starts at its first frame, without a
+        It takes at most `warmup_s` and four times `timeout_s`. A video file starts at its first frame, without a
         warm-up.
 
         Args:
@@ -56,7 +56,7 @@ class Camera:
         if self._grabber is not None:
             raise CameraError(f"{self.config.name} is connected already: call disconnect() first.")
         grabber = Grabber(_with_stable_path(self.config))
-        grabber.start(2 * self.config.timeout_s)
+        grabber.start(3 * self.config.timeout_s)
         self._grabber = grabber
         try:
             if self.config.kind != "file":
