@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import statistics
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -10,6 +11,7 @@ from jaxtyping import UInt8
 _BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
 _INTERVALS = 61  # recent intervals between frames, of which the median is the period
 _FEWEST = 8  # intervals from which a period is measured
+_MADE_UP = 16  # frames after a gap that may show that frames were only late
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,26 +51,32 @@ def is_black(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     return bool(image.max(initial=0) <= _BLACK)
 
 
+class _Gap(NamedTuple):
+    """Frames that are missing after a long interval."""
+
+    start_s: float  # the frame before the interval
+    frames: int  # frames since then
+    missing: int
+
+
 class Pace:
     """The period of the frames, and the frames that are missing between them.
 
-    A gap of n + 1 periods counts as n lost frames. If frames arrive in quick succession after a gap, they were only
-    late, and `dropped` is corrected. The number that `arrived` has returned for the first of them stays.
+    A gap of n + 1 periods counts as n lost frames. If the frames after the gap arrive early enough to make up for it,
+    they were only late, and `dropped` is corrected. The number that `arrived` has returned for the first of them stays.
     """
 
     def __init__(self, nominal: float | None):
-        self._nominal = nominal
+        """Start without frames.
+
+        Args:
+            nominal: frames per second until the period is measured, or None if they are unknown.
+        """
+        self._nominal = None if nominal is None else 1 / nominal
         self._last: float | None = None
-        self._late = 0
+        self._gap: _Gap | None = None
         self._intervals: collections.deque[float] = collections.deque(maxlen=_INTERVALS)
         self.dropped = 0
-
-    @property
-    def period(self) -> float | None:
-        """Seconds between frames, or None if it is unknown."""
-        if len(self._intervals) < _FEWEST:
-            return self._nominal
-        return statistics.median(self._intervals)
 
     @property
     def rate(self) -> float | None:
@@ -80,21 +88,25 @@ class Pace:
         last, self._last = self._last, time_s
         if last is None or time_s <= last:
             return 0
-        interval, period = time_s - last, self.period
-        self._intervals.append(interval)
+        period = 1 / self.rate if self.rate is not None else self._nominal
+        self._intervals.append(time_s - last)
         if period is None:
             return 0
-        missing = max(round(interval / period) - 1, 0)
+        missing = max(round((time_s - last) / period) - 1, 0)
         if missing:
-            self._late = missing
+            self._gap = _Gap(last, 1, missing)
             self.dropped += missing
-        elif interval < period / 2 and self._late:
-            self._late -= 1
-            self.dropped -= 1
-        else:
-            self._late = 0
+        elif self._gap is not None:
+            self._make_up(self._gap, time_s, period)
         return missing
+
+    def _make_up(self, gap: _Gap, time_s: float, period: float) -> None:
+        """Correct a gap by the frames that came after it."""
+        frames = gap.frames + 1
+        missing = min(max(round((time_s - gap.start_s) / period) - frames, 0), gap.missing)
+        self.dropped -= gap.missing - missing
+        self._gap = _Gap(gap.start_s, frames, missing) if missing and frames < _MADE_UP else None
 
     def interrupted(self) -> None:
         """Forget the last frame, because the connection was interrupted."""
-        self._last, self._late = None, 0
+        self._last, self._gap = None, None

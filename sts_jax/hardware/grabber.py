@@ -1,5 +1,6 @@
 """The thread that fetches a camera's frames, and finds the camera again when it is lost."""
 
+import atexit
 import collections
 import dataclasses
 import threading
@@ -64,10 +65,12 @@ class Grabber:
             CameraError: the source cannot be opened, or sends no frame in time. The thread is stopped.
         """
         self._thread.start()
+        atexit.register(self.stop)  # a thread inside OpenCV must not outlive the interpreter
         with self._changed:
             ready = self._changed.wait_for(lambda: self._newest is not None or self._problem is not None, timeout_s)
             problem = self._problem
         if problem is not None or not ready:
+            atexit.unregister(self.stop)
             self._stop.set()
             self._thread.join(0.1 if problem is None else self._config.timeout_s)
             if problem is not None:
@@ -79,6 +82,7 @@ class Grabber:
 
     def stop(self) -> bool:
         """Stop the thread. False if the driver has not returned in time. The thread then ends as soon as it does."""
+        atexit.unregister(self.stop)
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
@@ -86,10 +90,19 @@ class Grabber:
         return not self._thread.is_alive()
 
     def lock_settings(self, timeout_s: float) -> list[str]:
-        """Lock the settings at their current values, forget all earlier frames, and return what was refused."""
+        """Lock the settings at their current values and discard the frames until then.
+
+        Returns:
+            The settings that the driver refused.
+
+        Raises:
+            CameraError: no frame has arrived meanwhile.
+        """
         with self._changed:
             self._settle = True
             self._changed.wait_for(lambda: not self._settle or self._problem is not None, timeout_s)
+            if self._settle:
+                raise self._problem() if self._problem is not None else self._timeout(timeout_s)
             self._queue.clear()
             return list(self.refused)
 
