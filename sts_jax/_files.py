@@ -145,6 +145,9 @@ def digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
+OWNER = ".lock-owner"  # file in a locked folder that names the process
+
+
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
     """Lock a folder for this process until the block or the process ends.
@@ -153,7 +156,7 @@ def lock(folder: Path) -> Iterator[None]:
         LockedError: another process, or another part of this one, holds the lock.
         OSError: the folder cannot be created or written to.
     """
-    owner, held = folder / ".lock-owner", filelock.FileLock(folder / ".lock", timeout=0)
+    owner, held = folder / OWNER, filelock.FileLock(folder / ".lock", timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         held.acquire()

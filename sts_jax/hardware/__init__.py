@@ -1,5 +1,23 @@
 """The real sensor as a device. Imperative, NumPy only."""
 
+from sts_jax.hardware.camera import Camera
+from sts_jax.hardware.camera_config import CameraConfig
+from sts_jax.hardware.camera_errors import (
+    CameraBusyError,
+    CameraError,
+    CameraLostError,
+    CameraNotConnectedError,
+    CameraNotFoundError,
+    CameraOpenError,
+    CameraPermissionError,
+    CameraTimeoutError,
+    EndOfVideoError,
+    FrameSizeError,
+    FrozenCameraError,
+    StaleFrameError,
+)
+from sts_jax.hardware.devices import FoundCamera, find_cameras
+from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import (
     DisconnectedError,
@@ -15,7 +33,23 @@ from sts_jax.hardware.ports import (
 )
 
 __all__ = [
+    "Camera",
+    "CameraBusyError",
+    "CameraConfig",
+    "CameraError",
+    "CameraLostError",
+    "CameraNotConnectedError",
+    "CameraNotFoundError",
+    "CameraOpenError",
+    "CameraPermissionError",
+    "CameraStatistics",
+    "CameraTimeoutError",
+    "Captured",
     "DisconnectedError",
+    "EndOfVideoError",
+    "FoundCamera",
+    "FrameSizeError",
+    "FrozenCameraError",
     "LedError",
     "LedTimeoutError",
     "Leds",
@@ -25,6 +59,9 @@ __all__ = [
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "StaleFrameError",
     "WrongVersionError",
+    "find_cameras",
     "find_controllers",
+    "is_black",
 ]
