@@ -1,0 +1,89 @@
+"""The time after which a switch of the lights shows in whole frames, from frames around the switch."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+_SIZE = 32, 24  # pixels of a thumbnail, width and height. Its pixels are means of many, so noise hardly counts
+_LEAST_CONTRAST = 2.0  # of 255, mean difference of thumbnails of both lights below which no switch is recognised
+_TOLERANCE = 0.02  # share of the contrast within which a frame has the new light
+
+Thumbnail = Float[np.ndarray, "24 32 3"]
+
+
+class NoContrastError(RuntimeError):
+    """The image is the same with and without the lights."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settling:
+    """Times after the controller's acknowledgement of a switch. Frames that arrive earlier are discarded."""
+
+    visual_s: float  # after the lights went off (s)
+    tactile_s: float  # after the lights went on (s)
+    contrast: float  # mean difference of both lights' thumbnails, of 255
+
+    def __post_init__(self) -> None:
+        for name in ("visual_s", "tactile_s"):
+            value = getattr(self, name)
+            if not 0 < value < 60:
+                raise ValueError(f"{name} must be in (0, 60) s, got {value}")
+        if not self.contrast >= _LEAST_CONTRAST:
+            raise ValueError(f"contrast must be at least {_LEAST_CONTRAST} of 255, got {self.contrast}")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Switch:
+    """The frames that followed a switch of the lights, until long after it."""
+
+    delays_s: Float[np.ndarray, "n"]  # from the acknowledgement to the arrival of each frame (s)
+    thumbnails: Float[np.ndarray, "n 24 32 3"]
+
+
+def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
+    """The means of an image's blocks, 0 to 255."""
+    return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def difference(first: Thumbnail, second: Thumbnail) -> float:
+    """Mean absolute difference of two thumbnails, of 255."""
+    return float(np.abs(first - second).mean())
+
+
+def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
+    """The settling times that a number of switches show.
+
+    A frame has the new light if its thumbnail differs from the last one of its switch by at most 2 % of the contrast.
+    The time is that of the latest frame without the new light, and one period of the camera more, because the switches
+    sample the phase of the exposure.
+
+    Args:
+        on: Switches from dark to lit. The scene must be at rest.
+        off: Switches from lit to dark.
+        period_s: Time between two frames (s).
+
+    Raises:
+        NoContrastError: The lights do not change the image.
+    """
+    dark = np.mean([switch.thumbnails[-1] for switch in off], axis=0)
+    lit = np.mean([switch.thumbnails[-1] for switch in on], axis=0)
+    contrast = difference(dark, lit)
+    if contrast < _LEAST_CONTRAST:
+        raise NoContrastError(
+            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, and at least "
+            f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and whether the camera adapts its "
+            "exposure."
+        )
+    last_off, last_on = (max(_last_mixed(switch, contrast) for switch in switches) for switches in (off, on))
+    return Settling(last_off + period_s, last_on + period_s, contrast)
+
+
+def _last_mixed(switch: Switch, contrast: float) -> float:
+    """Delay (s) of the last frame that does not have the new light yet, at least 0."""
+    final = switch.thumbnails[-1]
+    apart = np.abs(switch.thumbnails - final).mean(axis=(1, 2, 3))
+    mixed = np.flatnonzero(apart > _TOLERANCE * contrast)
+    return max(float(switch.delays_s[mixed[-1]]), 0.0) if len(mixed) else 0.0
