@@ -611,6 +611,67 @@ class Driver:
         return True
 
 
+class Device(Driver):
+    """A V4L2 device of OpenCV, which this test machine lacks. Unplugged, it returns no frames and cannot be opened."""
+
+    plugged = True
+
+    def isOpened(self):
+        return self.plugged
+
+    def grab(self):
+        time.sleep(0.01)
+        self.values[cv2.CAP_PROP_POS_MSEC] += 10
+        return self.plugged
+
+    def retrieve(self):
+        return True, np.random.default_rng().integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
+
+    def release(self):
+        pass
+
+
+@pytest.fixture
+def device(monkeypatch):
+    automatic = {"AUTO_EXPOSURE": 3, "EXPOSURE": 157, "AUTO_WB": 1, "WB_TEMPERATURE": 4600}
+    size = {"FRAME_WIDTH": 0, "FRAME_HEIGHT": 0, "FPS": 100, "POS_MSEC": 5e6, "FOURCC": 0}
+    device = Device(**automatic, **size)
+    monkeypatch.setattr(capture, "check_source", lambda config: None)
+    monkeypatch.setattr(capture, "_open", lambda config: device)
+    return device
+
+
+def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
+    with Camera(config(0, lock=True, exposure=80, fourcc="MJPG")).connect(warmup_s=0.05) as camera:
+        assert camera.refused == ()
+        assert camera.read().dropped == 0
+        assert [device.get(getattr(cv2, f"CAP_PROP_{name}")) for name in ("AUTO_EXPOSURE", "EXPOSURE")] == [1, 80]
+        assert device.get(cv2.CAP_PROP_AUTO_WB) == 0
+        device.plugged = False
+        assert next_error(camera, CameraLostError)
+        device.set(cv2.CAP_PROP_EXPOSURE, 157)  # a device forgets its settings without power
+        device.set(cv2.CAP_PROP_AUTO_WB, 1)
+        device.plugged = True
+        assert next_frame(camera).epoch == 1
+        assert device.get(cv2.CAP_PROP_EXPOSURE) == 80
+        assert device.get(cv2.CAP_PROP_AUTO_WB) == 0
+
+
+def test_a_device_that_refuses_a_setting_is_warned_about(device):
+    device.stuck = {cv2.CAP_PROP_AUTO_WB}
+    with pytest.warns(UserWarning, match=r"camera 0 did not accept a setting. AUTO_WB: asked for 0, found 1"):
+        camera = Camera(config(0, lock=True)).connect(warmup_s=0)
+    assert camera.refused == ("AUTO_WB: asked for 0, found 1",)
+    camera.disconnect()
+
+
+def test_a_device_without_the_size_names_both(device):
+    device.stuck = {cv2.CAP_PROP_FRAME_WIDTH}
+    device.values[cv2.CAP_PROP_FRAME_WIDTH] = 640
+    with pytest.raises(FrameSizeError, match=r"640 x 120 pixels, but 160 x 120 .*v4l2-ctl -d /dev/video0"):
+        Camera(config(0)).connect()
+
+
 def test_settings_are_locked_at_their_current_values():
     driver = Driver(AUTO_EXPOSURE=3, EXPOSURE=157, AUTO_WB=1, WB_TEMPERATURE=4600, GAIN=5)
     held, refused = settings.lock(driver, {}, current=True)
