@@ -165,12 +165,6 @@ def test_frames_that_nobody_fetches_are_counted_as_skipped(server):
         assert camera.statistics.dropped == 0
 
 
-def test_a_process_that_forgets_to_disconnect_ends(server):
-    script = OTHER_PROCESS.replace("with ", "camera = ").replace(" as camera:", "").replace("    ", "")
-    process = subprocess.run([sys.executable, "-c", script, server.url], input=b"", env=environment(), timeout=60)
-    assert process.returncode == 0
-
-
 def test_images_are_rgb_and_read_only():
     server = MotionJpeg(colour=(0, 0, 255))  # red for OpenCV
     try:
@@ -188,20 +182,25 @@ def test_images_are_rgb_and_read_only():
 
 
 def test_lost_frames_are_counted_from_the_times(server):
-    server.fps = 20
-    with connected(server, buffer=100) as camera:
-        first = camera.async_read()
+    with connected(server, buffer=200) as camera:
         assert wait_until(lambda: camera.statistics.rate is not None)
-        start = server.number + 5
-        server.skipped = {start, start + 6, start + 7, start + 15, start + 16, start + 17}
+        start = server.number + 20
+        server.skipped = set(range(start, start + 40))
         server.mode = "skip"
-        read = [first]
-        while number_of(read[-1].image) < start + 20:
-            read.append(camera.async_read())
-        gaps = {number_of(b.image): b.dropped for b in read[1:] if b.dropped}
-        rate = camera.statistics.rate
-    assert {start + 1: 1, start + 8: 2, start + 18: 3}.items() <= gaps.items()
-    assert 10 < rate < 40
+        frame = camera.async_read()
+        while number_of(frame.image) < start + 40:
+            frame = camera.async_read()
+        assert 20 < frame.dropped < 80  # 40, if the machine is not busy
+        assert camera.statistics.dropped >= frame.dropped
+
+
+def test_gaps_in_the_times_are_lost_frames():
+    pace = frames.Pace(None)
+    numbers = [n for n in range(60) if n not in (20, 30, 31, 40, 41, 42)]
+    estimates = {n: pace.arrived(0.05 * n + 0.002 * (n % 3)) for n in numbers}
+    assert {n: lost for n, lost in estimates.items() if lost} == {21: 1, 32: 2, 43: 3}
+    assert pace.dropped == 6
+    assert pace.rate == pytest.approx(20, rel=0.1)
 
 
 def test_frames_that_are_only_late_are_not_counted_as_lost():
@@ -470,9 +469,9 @@ def environment():
 OTHER_PROCESS = """
 import sys
 from sts_jax.hardware import Camera, CameraConfig
-with Camera(CameraConfig(sys.argv[1], width=160, height=120, lock=False)).connect(0) as camera:
-    print("connected", flush=True)
-    sys.stdin.read()
+camera = Camera(CameraConfig(sys.argv[1], width=160, height=120, lock=False)).connect(0)
+print("connected", flush=True)
+sys.stdin.read()
 """
 
 
@@ -482,9 +481,9 @@ def test_a_camera_in_another_process_is_refused_with_its_id(server):
         assert process.stdout.readline() == b"connected\n"
         with pytest.raises(CameraBusyError, match=f"in use by process {process.pid} .*disconnect it"):
             connected(server)
-        process.kill()
-        process.wait()
-    connected(server).disconnect()  # a killed process leaves no lock
+        process.stdin.close()
+        assert process.wait(SOON_S) == 0  # without a disconnect
+    connected(server).disconnect()
 
 
 def test_a_camera_that_is_open_twice_in_one_process_is_refused(server):
@@ -610,6 +609,67 @@ class Driver:
             return False
         self.values[prop] = round(value)
         return True
+
+
+class Device(Driver):
+    """A V4L2 device of OpenCV, which this test machine lacks. Unplugged, it returns no frames and cannot be opened."""
+
+    plugged = True
+
+    def isOpened(self):
+        return self.plugged
+
+    def grab(self):
+        time.sleep(0.01)
+        self.values[cv2.CAP_PROP_POS_MSEC] += 10
+        return self.plugged
+
+    def retrieve(self):
+        return True, np.random.default_rng().integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
+
+    def release(self):
+        pass
+
+
+@pytest.fixture
+def device(monkeypatch):
+    automatic = {"AUTO_EXPOSURE": 3, "EXPOSURE": 157, "AUTO_WB": 1, "WB_TEMPERATURE": 4600}
+    size = {"FRAME_WIDTH": 0, "FRAME_HEIGHT": 0, "FPS": 100, "POS_MSEC": 5e6, "FOURCC": 0}
+    device = Device(**automatic, **size)
+    monkeypatch.setattr(capture, "check_source", lambda config: None)
+    monkeypatch.setattr(capture, "_open", lambda config: device)
+    return device
+
+
+def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
+    with Camera(config(0, lock=True, exposure=80, fourcc="MJPG")).connect(warmup_s=0.05) as camera:
+        assert camera.refused == ()
+        assert camera.read().dropped == 0
+        assert [device.get(getattr(cv2, f"CAP_PROP_{name}")) for name in ("AUTO_EXPOSURE", "EXPOSURE")] == [1, 80]
+        assert device.get(cv2.CAP_PROP_AUTO_WB) == 0
+        device.plugged = False
+        assert next_error(camera, CameraLostError)
+        device.set(cv2.CAP_PROP_EXPOSURE, 157)  # a device forgets its settings without power
+        device.set(cv2.CAP_PROP_AUTO_WB, 1)
+        device.plugged = True
+        assert next_frame(camera).epoch == 1
+        assert device.get(cv2.CAP_PROP_EXPOSURE) == 80
+        assert device.get(cv2.CAP_PROP_AUTO_WB) == 0
+
+
+def test_a_device_that_refuses_a_setting_is_warned_about(device):
+    device.stuck = {cv2.CAP_PROP_AUTO_WB}
+    with pytest.warns(UserWarning, match=r"camera 0 did not accept a setting. AUTO_WB: asked for 0, found 1"):
+        camera = Camera(config(0, lock=True)).connect(warmup_s=0)
+    assert camera.refused == ("AUTO_WB: asked for 0, found 1",)
+    camera.disconnect()
+
+
+def test_a_device_without_the_size_names_both(device):
+    device.stuck = {cv2.CAP_PROP_FRAME_WIDTH}
+    device.values[cv2.CAP_PROP_FRAME_WIDTH] = 640
+    with pytest.raises(FrameSizeError, match=r"640 x 120 pixels, but 160 x 120 .*v4l2-ctl -d /dev/video0"):
+        Camera(config(0)).connect()
 
 
 def test_settings_are_locked_at_their_current_values():

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import math
 import os
 import socket
 import sys
@@ -133,6 +134,8 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
     milliseconds = round(1000 * config.timeout_s)
     if config.kind == "device":
         if sys.platform == "linux":
+            # OpenCV reads this variable at its first frame. Without it, a stalled device blocks for 10 s.
+            os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(config.timeout_s)))
             return cv2.VideoCapture(devices.device_path(config.target), cv2.CAP_V4L2)
         return cv2.VideoCapture(config.target, cv2.CAP_ANY)
     parameters = []

@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 _BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
 _INTERVALS = 61  # recent intervals between frames, of which the median is the period
 _FEWEST = 8  # intervals from which a period is measured
-_MADE_UP = 16  # frames after a gap that may show that frames were only late
+_MADE_UP = 4  # frames after late ones that may still be early. More would add up the error of the period
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,6 +57,7 @@ class _Gap(NamedTuple):
     start_s: float  # the frame before the interval
     frames: int  # frames since then
     missing: int
+    limit: int  # frames after which it is final
 
 
 class Pace:
@@ -94,7 +95,7 @@ class Pace:
             return 0
         missing = max(round((time_s - last) / period) - 1, 0)
         if missing:
-            self._gap = _Gap(last, 1, missing)
+            self._gap = _Gap(last, 1, missing, missing + _MADE_UP)
             self.dropped += missing
         elif self._gap is not None:
             self._make_up(self._gap, time_s, period)
@@ -105,7 +106,7 @@ class Pace:
         frames = gap.frames + 1
         missing = min(max(round((time_s - gap.start_s) / period) - frames, 0), gap.missing)
         self.dropped -= gap.missing - missing
-        self._gap = _Gap(gap.start_s, frames, missing) if missing and frames < _MADE_UP else None
+        self._gap = gap._replace(frames=frames, missing=missing) if missing and frames < gap.limit else None
 
     def interrupted(self) -> None:
         """Forget the last frame, because the connection was interrupted."""
