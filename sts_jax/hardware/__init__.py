@@ -16,6 +16,7 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
+from sts_jax.hardware.device import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
 from sts_jax.hardware.leds import Leds, Lit
@@ -31,8 +32,10 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.settling import NoContrastError, Settling
 
 __all__ = [
+    "STS",
     "Camera",
     "CameraBusyError",
     "CameraConfig",
@@ -48,20 +51,28 @@ __all__ = [
     "DisconnectedError",
     "EndOfVideoError",
     "FoundCamera",
+    "FoundSensors",
     "FrameSizeError",
     "FrozenCameraError",
     "LedError",
     "LedTimeoutError",
     "Leds",
+    "LightError",
     "Lit",
+    "NoContrastError",
     "NotALedControllerError",
+    "NotStillError",
+    "Pair",
     "Port",
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "Settling",
+    "Shot",
     "StaleFrameError",
     "WrongVersionError",
     "find_cameras",
     "find_controllers",
+    "find_sensors",
     "is_black",
 ]

@@ -19,13 +19,14 @@ from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
-from sts_jax.hardware.settling import Settling, Switch, Thumbnail, difference, settling, thumbnail
+from sts_jax.hardware.settling import Settling, Switch, Thumbnail, light_share, settling, thumbnail
 
 Stream = Literal["visual", "tactile"]
 
-_DEPARTED = 0.5  # share of the contrast by which a frame must differ from the last one of the other light
+_DEPARTED = 0.5  # least share of a stream's light in its frames
 _SWITCHES = 8  # of each direction, to measure the settling
 _PHASE = 0.618  # of a period, by which the phase of the measured switches advances
+_GRACE_S = 0.2  # s, by which a wait for the camera may exceed a limit, so that the cause of a delay is the one reported
 _STILL = 3.0  # of 255, largest change of a thumbnail's pixel while nothing moves
 
 
@@ -83,9 +84,9 @@ class STS:
     ```
 
     A frame counts as of one light if it arrives later than the settling time after the controller's acknowledgement, if
-    it differs from the other light's last image, like the frame before it, and if the controller's next answer proves
-    that its lights have not changed in between. All other frames are discarded, also those of a stalled stream that
-    arrive late.
+    it and the frame before it look like the last image of this light rather than that of the other one, and if the
+    controller's next answer proves that its lights have not changed in between. All other frames are discarded, also
+    those of a stalled stream that arrive late.
 
     One thread may use a sensor at a time.
     """
@@ -131,8 +132,9 @@ class STS:
         self._stream: Stream = "visual"
         self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
         self._previous: Captured | None = None  # the last frame of the camera
-        self._departed = 0  # successive frames since the switch that differ from the other light's last image
+        self._departed = 0  # successive frames since the switch that show the new light
         self._background: _Background | None = None
+        self._stopping = False  # whether the thread in the background is to end
         self.discarded = 0  # frames that could not be proven to be of one light
 
     @property
@@ -200,7 +202,8 @@ class STS:
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take an image of each stream. Both arrive after the call.
 
-        A frame was exposed at most the settling time before its arrival. The stream whose light is on comes first, so successive pairs need one switch each.
+        A frame was exposed at most the settling time before its arrival. The stream whose light is on comes first, so
+        successive pairs need one switch each.
 
         Args:
             timeout_ms: Longest time (ms), None: two times `timeout_s`. A reconnection comes on top.
@@ -220,14 +223,14 @@ class STS:
         `disconnect` is called.
 
         Args:
-            timeout_ms: Longest wait (ms), None: two times `timeout_s`.
+            timeout_ms: Longest wait (ms), None: three times `timeout_s`.
 
         Raises:
             LightError: No pair came in time.
             LedError: As in `read`.
             CameraError: As in `read`.
         """
-        return self._started().next(self._limit_s(timeout_ms, 2))
+        return self._started().next(self._limit_s(timeout_ms, 3))
 
     def read_latest(self, max_age_ms: float = 500.0) -> Pair:
         """Return the newest pair of the thread of `async_read` without waiting.
@@ -305,33 +308,40 @@ class STS:
             f"{_STILL:g}): wait longer, or check the room's light."
         )
 
-    def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 0.5) -> Settling:
+    def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 1.0) -> Settling:
         """Measure how long after an acknowledgement frames with the former light arrive.
 
         Args:
             switches: Number of switches in each direction.
-            watch_s: Time for which frames are watched after a switch (s). The settling must be shorter.
+            watch_s: Time for which frames are watched after the first switch in each direction (s). The settling must
+                be shorter. Later switches are watched for three times the settling that the first ones show.
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image still changes at the end of `watch_s`.
+            LightError: The image still changes at the end of a watch.
         """
         self._lit = None
         period_s = self._period_s()
-        measured: dict[Stream, list[Switch]] = {"visual": [], "tactile": []}
         self._watched("visual", watch_s)
-        for number in range(switches):
-            for stream in ("tactile", "visual"):
-                time.sleep(period_s * (_PHASE * number % 1))
-                measured[stream].append(self._watched(stream, watch_s))
-        found = settling(measured["tactile"], measured["visual"], period_s)
-        slowest = max(found.visual_s, found.tactile_s)
-        if slowest > watch_s - 2 * period_s:
+        on, off = [self._watched("tactile", watch_s)], [self._watched("visual", watch_s)]
+        found = self._settled(on, off, period_s, watch_s)
+        shorter_s = min(3 * max(found.visual_s, found.tactile_s) + 3 * period_s, watch_s)
+        for number in range(1, switches):
+            time.sleep(period_s * (_PHASE * number % 1))
+            on.append(self._watched("tactile", shorter_s))
+            off.append(self._watched("visual", shorter_s))
+        found = self._settled(on, off, period_s, shorter_s)
+        self._looks = {"visual": off[-1].thumbnails[-1], "tactile": on[-1].thumbnails[-1]}
+        return found
+
+    def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
+        found = settling(on, off, period_s)
+        slowest_s = max(found.visual_s, found.tactile_s)
+        if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image still changes {slowest:.2f} s after a switch: keep the scene at rest, lock the camera's "
-                f"exposure, or watch for longer than watch_s={watch_s:g}."
+                f"the image still changes {slowest_s:.2f} s after a switch: keep the scene at rest, lock the camera's "
+                f"exposure, or watch for longer than {watch_s:.2f} s."
             )
-        self._looks = {name: done[-1].thumbnails[-1] for name, done in measured.items()}
         return found
 
     def __enter__(self) -> "STS":
@@ -385,8 +395,7 @@ class STS:
         """A frame that arrives when the light has settled, and the answer of the controller before it."""
         lit = self._switched(stream)
         settled_s = self.settling.visual_s if stream == "visual" else self.settling.tactile_s
-        look = self._looks.get("tactile" if stream == "visual" else "visual")
-        while True:
+        while not self._stopping:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
                 raise LightError(
@@ -395,15 +404,22 @@ class STS:
                     "rate."
                 )
             try:
-                frame = self._camera.async_read(1000 * left_s)
+                frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
             except CameraLostError:
                 continue
-            changed = look is None or difference(thumbnail(frame.image), look) > _DEPARTED * self.settling.contrast
-            self._departed = (self._departed * self._in_order(frame) + 1) * changed
+            self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
             self._previous = frame
             if self._departed >= 2 and frame.time_s >= max(lit.acknowledged_s + settled_s, after_s):
                 return lit, frame
             self.discarded += 1
+        raise LightError("the thread that takes pairs was stopped.")
+
+    def _shows(self, frame: Captured, stream: Stream) -> bool:
+        """Whether a frame looks more like the last image of its stream than like that of the other one."""
+        if len(self._looks) < 2:
+            return True
+        share = light_share(thumbnail(frame.image), self._looks["visual"], self._looks["tactile"])
+        return (share if stream == "tactile" else 1 - share) > _DEPARTED
 
     def _in_order(self, frame: Captured) -> bool:
         """Whether a frame is the next one after the last."""
@@ -469,7 +485,9 @@ class STS:
     def _stop_background(self) -> None:
         background, self._background = self._background, None
         if background is not None:
+            self._stopping = True
             background.stop()
+            self._stopping = False
 
 
 class _Background:
@@ -515,7 +533,7 @@ class _Background:
             return self._pair
 
     def stop(self) -> None:
-        """End the thread after its current pair."""
+        """End the thread."""
         self._stopped = True
         self._thread.join()
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 _SIZE = 32, 24  # pixels of a thumbnail, width and height. Its pixels are means of many, so noise hardly counts
 _LEAST_CONTRAST = 2.0  # of 255, mean difference of thumbnails of both lights below which no switch is recognised
-_TOLERANCE = 0.02  # share of the contrast within which a frame has the new light
+_TOLERANCE = 0.02  # of the share of the light, within which a frame has the new light
 
 Thumbnail = Float[np.ndarray, "24 32 3"]
 
@@ -53,12 +53,21 @@ def difference(first: Thumbnail, second: Thumbnail) -> float:
     return float(np.abs(first - second).mean())
 
 
+def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
+    """The share of the light in an image, by least squares between images without (0) and with the light (1).
+
+    Changes of parts that the light does not reach have no influence.
+    """
+    change = lit - dark
+    return float(((look - dark) * change).sum() / (change**2).sum())
+
+
 def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
     """The settling times that a number of switches show.
 
-    A frame has the new light if its thumbnail differs from the last one of its switch by at most 2 % of the contrast.
-    The time is that of the latest frame without the new light, and one period of the camera more, because the switches
-    sample the phase of the exposure.
+    A frame has the new light if the share of the light in it is within 2 % of the last one of its switch. The time is
+    that of the latest frame without the new light, and one period of the camera more, because the switches sample the
+    phase of the exposure.
 
     Args:
         on: Switches from dark to lit. The scene must be at rest.
@@ -77,13 +86,12 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
             f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and whether the camera adapts its "
             "exposure."
         )
-    last_off, last_on = (max(_last_mixed(switch, contrast) for switch in switches) for switches in (off, on))
+    last_off, last_on = (max(last_mixed(switch, dark, lit) for switch in switches) for switches in (off, on))
     return Settling(last_off + period_s, last_on + period_s, contrast)
 
 
-def _last_mixed(switch: Switch, contrast: float) -> float:
+def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
     """Delay (s) of the last frame that does not have the new light yet, at least 0."""
-    final = switch.thumbnails[-1]
-    apart = np.abs(switch.thumbnails - final).mean(axis=(1, 2, 3))
-    mixed = np.flatnonzero(apart > _TOLERANCE * contrast)
+    shares = np.array([light_share(look, dark, lit) for look in switch.thumbnails])
+    mixed = np.flatnonzero(np.abs(shares - shares[-1]) > _TOLERANCE)
     return max(float(switch.delays_s[mixed[-1]]), 0.0) if len(mixed) else 0.0

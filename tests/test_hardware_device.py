@@ -1,0 +1,241 @@
+"""`STS`: which light was on is judged by the peer's log of each frame, never by the host's label."""
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+from camera_server import SIZE, number_of
+from sensor_peer import CORNER, DARK, LIT, SensorPeer
+
+from sts_jax import hardware
+from sts_jax.hardware.settling import Settling, Switch, settling
+
+SETTLING = Settling(visual_s=0.1, tactile_s=0.1, contrast=30.0)
+
+
+def config(url, **changes):
+    return hardware.CameraConfig(url, *SIZE, **{"lock": False, "timeout_s": 5.0, **changes})
+
+
+@pytest.fixture
+def peer(tmp_path):
+    made = SensorPeer(tmp_path / "leds")
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def sensor(peer):
+    given = config(peer.url, frozen_after_s=None)
+    with hardware.STS(camera=given, leds=peer.path, settling=SETTLING).connect(0.2) as made:
+        yield made
+
+
+def judged(peer, shot):
+    """Whether the frame that an image shows had its stream's light during all of its exposure."""
+    shares = peer.camera.shown[number_of(shot.image[:CORNER, :CORNER])]
+    return shares == [1.0 if shot.stream == "tactile" else 0.0]
+
+
+def test_pairs_are_of_the_right_light(peer, sensor):
+    numbers = []
+    for _ in range(40):
+        pair = sensor.read()
+        assert pair.visual.stream == "visual"
+        assert pair.tactile.stream == "tactile"
+        assert judged(peer, pair.visual)
+        assert judged(peer, pair.tactile)
+        assert abs(int(pair.visual.image[60:, 60].mean()) - DARK) <= 3
+        assert abs(int(pair.tactile.image[60:, 60].mean()) - LIT) <= 3
+        numbers += [pair.visual.sequence, pair.tactile.sequence]
+    assert len(set(numbers)) == len(numbers)  # no frame is returned twice
+
+
+@pytest.mark.parametrize(("lag_s", "exposure_s"), [(0.015, 0.002), (0.12, 0.016)])
+def test_measured_settling_covers_lag_and_exposure(tmp_path, lag_s, exposure_s):
+    peer = SensorPeer(tmp_path / "leds", lag_s=lag_s, exposure_s=exposure_s)
+    try:
+        with hardware.STS(camera=config(peer.url), leds=peer.path).connect(0.2) as sensor:
+            assert sensor.settling.visual_s > lag_s + exposure_s
+            assert sensor.settling.tactile_s > lag_s + exposure_s
+            np.testing.assert_allclose(sensor.settling.contrast, LIT - DARK, rtol=0.1)
+            assert all(judged(peer, shot) for _ in range(10) for shot in _both(sensor.read()))
+    finally:
+        peer.stop()
+
+
+def _both(pair):
+    return pair.visual, pair.tactile
+
+
+def test_settling_time_of_known_switches_is_that_of_the_last_mixed_frame():
+    dark, lit = np.zeros((24, 32, 3), np.float32), np.full((24, 32, 3), 100, np.float32)
+    mixes = np.array([0, 0, 0.3, 0.97, 0.995, 1], np.float32)[:, None, None, None]
+    delays = np.array([-0.01, 0.01, 0.03, 0.05, 0.07, 0.09], np.float32)
+    on, off = Switch(delays, dark + mixes * lit), Switch(delays + 0.001, lit - mixes * lit)
+    found = settling([on, on], [off], period_s=0.02)
+    np.testing.assert_allclose((found.tactile_s, found.visual_s, found.contrast), (0.07, 0.071, 100), rtol=1e-5)
+    with pytest.raises(hardware.NoContrastError, match="wiring"):
+        settling([on], [on], period_s=0.02)
+
+
+@pytest.mark.parametrize("duty", [0.0, 0.25, 0.5, 1.0])
+def test_stream_has_the_share_of_tactile_images(peer, sensor, duty):
+    images = sensor.stream(duty)
+    shots = [next(images) for _ in range(12)]
+    assert sum(shot.stream == "tactile" for shot in shots) == round(12 * duty)
+    assert all(judged(peer, shot) for shot in shots)
+
+
+def test_stream_dwells(peer, sensor):
+    images = sensor.stream(0.5, dwell=3)
+    streams = [next(images).stream for _ in range(12)]
+    assert all(len(set(streams[i : i + 3])) == 1 for i in range(0, 12, 3))
+    assert streams.count("tactile") == 6
+
+
+def test_lights_that_go_off_in_between_are_noticed(peer, sensor):
+    """The controller restarts, or its watchdog fires, while frames are taken. No image has the wrong label."""
+    stopped = threading.Event()
+
+    def disturb():
+        while not stopped.wait(0.35):
+            peer.leds.controller._apply((0, 0, 0, 0))
+            peer.leds.controller.counter += 1
+
+    thread = threading.Thread(target=disturb)
+    thread.start()
+    try:
+        shots = [shot for _ in range(5) for shot in _both(sensor.read())]
+    finally:
+        stopped.set()
+        thread.join()
+    assert all(judged(peer, shot) for shot in shots)
+    assert sensor.discarded > 0
+
+
+def test_a_stalled_stream_does_not_pass_old_frames_as_new(peer, sensor):
+    sensor.read()
+    peer.camera.mode = "stall"
+    threading.Timer(0.4, lambda: setattr(peer.camera, "mode", "live")).start()
+    for _ in range(3):
+        assert all(judged(peer, shot) for shot in _both(sensor.read()))
+
+
+def test_leds_that_do_not_light_up_are_named(peer, sensor):
+    sensor.read()
+    peer.camera.blind = True
+    with pytest.raises(hardware.LightError, match="check that the LEDs light up"):
+        sensor.read(timeout_ms=800)
+    peer.camera.blind = False
+    sensor.read()
+
+
+def test_no_contrast_at_connection_is_named_and_devices_are_closed(peer):
+    peer.camera.blind = True
+    sensor = hardware.STS(camera=config(peer.url), leds=peer.path)
+    with pytest.raises(hardware.NoContrastError, match="wiring and levels"):
+        sensor.connect(0.1)
+    assert not sensor.camera.is_connected
+    with pytest.raises(hardware.CameraNotConnectedError, match=r"call connect\(\) first"):
+        sensor.read()
+
+
+def test_a_controller_that_returns_is_found_again(tmp_path):
+    peer = SensorPeer(tmp_path / "leds")
+    try:
+        with hardware.STS(camera=config(peer.url), leds=peer.path, settling=SETTLING).connect(0.1) as sensor:
+            sensor.read()
+            peer.leds.vanish()
+            again = []
+
+            def plug():
+                again.append(SensorPeer(tmp_path / "leds"))
+                peer.camera.lights = again[0].camera.lights
+
+            threading.Timer(0.5, plug).start()
+            shots = _both(sensor.read())
+            assert all(judged(peer, shot) for shot in shots)
+    finally:
+        peer.camera.stop()
+        for other in again:
+            other.stop()
+
+
+def test_async_read_and_read_latest(peer, sensor):
+    with pytest.raises(hardware.StaleFrameError, match=r"async_read\(\)"):
+        sensor.read_latest()
+    first = sensor.async_read()
+    second = sensor.async_read()
+    assert second.visual.time_s > first.visual.time_s
+    assert sensor.read_latest(5000).visual.sequence >= second.visual.sequence
+    with pytest.raises(hardware.StaleFrameError, match="raise max_age_ms"):
+        sensor.read_latest(1e-3)
+    assert all(judged(peer, shot) for shot in _both(sensor.async_read()))
+    sensor.read()  # ends the thread
+    assert not [thread for thread in threading.enumerate() if thread.name == "pairs of the sensor"]
+
+
+def test_an_error_in_the_thread_reaches_the_caller(peer):
+    given = config(peer.url, frozen_after_s=None)
+    with hardware.STS(camera=given, leds=peer.path, settling=SETTLING, timeout_s=0.5).connect(0.2) as sensor:
+        sensor.async_read(10_000)
+        peer.camera.blind = True
+        with pytest.raises(hardware.LightError, match="LEDs light up"):
+            any(sensor.async_read(10_000) is None for _ in range(50))
+
+
+def test_wait_until_still(peer, sensor):
+    peer.camera.numbered, peer.camera.moving = False, True
+    with pytest.raises(hardware.NotStillError, match="still changes after"):
+        sensor.wait_until_still(0.8, window_s=0.3)
+    threading.Timer(0.4, lambda: setattr(peer.camera, "moving", False)).start()
+    shot = sensor.wait_until_still(20, window_s=0.3)
+    assert shot.stream == "visual"
+
+
+def test_lights_are_off_after_disconnecting(peer, sensor):
+    sensor.read()
+    sensor.disconnect()
+    assert peer.leds.controller.levels == (0, 0, 0, 0)
+    sensor.disconnect()  # does nothing
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"levels": (0, 0, 0, 0)}, "at least one above 0"),
+        ({"levels": (256, 0, 0, 0)}, "from 0 to 255"),
+        ({"levels": (255,)}, "four numbers"),
+        ({"timeout_s": 0}, "timeout_s must be positive"),
+        ({"reconnect_s": float("nan")}, "reconnect_s must be positive"),
+    ],
+)
+def test_bad_arguments_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        hardware.STS(camera=0, leds="/dev/null", **changes)
+
+
+def test_bad_calls_are_refused(sensor):
+    with pytest.raises(ValueError, match=r"duty must be in \[0, 1\], got 1.5"):
+        sensor.stream(1.5)
+    with pytest.raises(ValueError, match="dwell must be >= 1, got 0"):
+        sensor.stream(dwell=0)
+    with pytest.raises(ValueError, match="timeout_ms must be > 0, got 0"):
+        sensor.read(timeout_ms=0)
+    with pytest.raises(ValueError, match="max_age_ms must be > 0, got -1"):
+        sensor.read_latest(-1)
+    with pytest.raises(ValueError, match="contrast must be at least 2"):
+        dataclasses.replace(sensor.settling, contrast=1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lag_s", [0.015, 0.05, 0.12])
+def test_many_pairs_have_no_wrong_or_mixed_light(tmp_path, lag_s):
+    peer = SensorPeer(tmp_path / "leds", lag_s=lag_s, exposure_s=0.016)
+    try:
+        with hardware.STS(camera=config(peer.url), leds=peer.path).connect(0.2) as sensor:
+            assert all(judged(peer, shot) for _ in range(120) for shot in _both(sensor.read()))
+    finally:
+        peer.stop()
