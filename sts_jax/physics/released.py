@@ -52,7 +52,7 @@ class Released(Scenario):
     beyond: tuple[float, float] = (math.radians(-9), math.radians(9))
     skew: float = math.radians(4)  # rad, largest angle in the pad's plane between the axis of the lean and the edge
     carried: tuple[float, float] = (0.3, 0.9)  # share of the weight that the pad carries until the release
-    spread: float = 0.02  # m, radius of the disc from which the middle of the object's extent is drawn
+    spread: float = 0.02  # m, radius of the disc about the pad's centre, where the object lies on average
     # candidate faces and edges, of which the first one that balances at less than 45 degrees is taken
     tries: int = 16
     rate: float = 31.25  # frames/s
@@ -90,30 +90,27 @@ class Released(Scenario):
         Toppling and returning differ by the angle that the object turns, see `outcome`. Starts therefore lean from the
         narrower one of the two faces at an edge, on which the object balances at less than 45 degrees.
         """
-        candidates, beyond, skew, turn, radius, angle, share = jax.random.split(key, 7)
+        candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
         edges = jax.lax.map(lambda own: _random_edge(own, shape), keys)  # one by one, to save memory
-        narrow = edges.balance < TURNED
-        chosen = jnp.where(jnp.any(narrow), jnp.argmax(narrow), jnp.argmin(edges.balance))
+        chosen = jnp.argmin(jnp.where(edges.balance < TURNED, edges.height, edges.height + 1.0))
         edge = jax.tree.map(lambda x: x[chosen], edges)
 
         past = jax.random.uniform(beyond, minval=self.beyond[0], maxval=self.beyond[1])
         lean = jnp.maximum(edge.balance + past, SMALLEST)
         heading = edge.outward + jax.random.uniform(skew, minval=-self.skew, maxval=self.skew)
         axis = jnp.stack([-jnp.sin(heading), jnp.cos(heading), 0.0])
-        leaning = geometry.quat_multiply(geometry.quat_from_rotvec(lean * axis), edge.quat)
-        quat = geometry.quat_canonical(geometry.quat_multiply(random_yaw(turn), leaning))
+        quat = geometry.quat_canonical(geometry.quat_multiply(geometry.quat_from_rotvec(lean * axis), edge.quat))
 
         points = shape.points @ geometry.quat_to_matrix(quat).T
         across = points[:, :2]
-        middle = (jnp.min(across, axis=0) + jnp.max(across, axis=0)) / 2
         touching = (points[:, 2] < jnp.min(points[:, 2]) + LEVEL)[:, None]
+        low = jnp.min(jnp.where(touching, across, jnp.inf), axis=0)
+        high = jnp.max(jnp.where(touching, across, -jnp.inf), axis=0)
         room = jnp.asarray(pad) / 2 - CLEARANCE
-        place = jnp.clip(
-            random_place(radius, angle, self.spread) - middle,
-            -room - jnp.min(jnp.where(touching, across, jnp.inf), axis=0),
-            room - jnp.max(jnp.where(touching, across, -jnp.inf), axis=0),
-        )
+        # Halfway between the places of the centre of mass on the two faces, so that it is over the pad on either.
+        middle = random_place(radius, angle, self.spread) - edge.middle
+        place = jnp.clip(middle - (low + high) / 2, -room - low, room - high)
         carried = jax.random.uniform(share, minval=self.carried[0], maxval=self.carried[1])
         return Start(shape.above(place, quat, -STANDING), jnp.asarray(self.steps), jnp.zeros(0), carried)
 
@@ -139,13 +136,15 @@ class _Edge(NamedTuple):
     quat: Float[Array, "4"]  # of the object on the face
     outward: Float[Array, ""]  # rad, direction in the pad's plane perpendicular to the edge, away from the face
     balance: Float[Array, ""]  # rad, lean over the edge at which an object with average contents balances
+    height: Float[Array, ""]  # m, of the centre of mass at this angle
+    middle: Float[Array, "2"]  # m, from the edge, halfway between the centres of mass before and after a quarter turn
 
 
 def _random_edge(key: PRNGKeyArray, shape: Shape) -> _Edge:
-    """Draw a stable face, all equally likely, and an edge of it that lies in a random direction."""
-    which, direction = jax.random.split(key)
-    face = jax.random.categorical(which, jnp.where(shape.shares > 0, 0.0, -jnp.inf))
-    quat = upright(shape.rests[face])
+    """Draw a stable face by its share and an edge of it that lies in a random direction."""
+    which, turn, direction = jax.random.split(key, 3)
+    face = jax.random.categorical(which, jnp.log(shape.shares))
+    quat = geometry.quat_multiply(random_yaw(turn), upright(shape.rests[face]))
     rotation = geometry.quat_to_matrix(quat)
     points, com = shape.points @ rotation.T, jnp.mean(shape.coms, axis=0) @ rotation.T
     low = jnp.min(points[:, 2])
@@ -157,8 +156,8 @@ def _random_edge(key: PRNGKeyArray, shape: Shape) -> _Edge:
     corner = points[jnp.argmax(jnp.where(support, points[:, :2] @ outward, -jnp.inf)), :2]
     ahead, aside = (points[:, :2] - corner) @ jnp.stack([-outward[1], outward[0]]), (points[:, :2] - corner) @ -outward
     other = support & (jnp.hypot(ahead, aside) > LEVEL)
-    turn = jnp.min(jnp.where(other, jnp.arctan2(jnp.maximum(aside, 0), ahead), jnp.inf))
-    turn = jnp.where(jnp.isfinite(turn), turn, 0.0)
-    heading = angle + turn
-    inside = (corner - com[:2]) @ jnp.stack([jnp.cos(heading), jnp.sin(heading)])
-    return _Edge(quat, heading, jnp.arctan2(inside, com[2] - low))
+    bend = jnp.min(jnp.where(other, jnp.arctan2(jnp.maximum(aside, 0), ahead), jnp.inf))
+    heading = angle + jnp.where(jnp.isfinite(bend), bend, 0.0)
+    normal = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+    inside, height = (corner - com[:2]) @ normal, com[2] - low
+    return _Edge(quat, heading, jnp.arctan2(inside, height), jnp.hypot(inside, height), (height - inside) / 2 * normal)
