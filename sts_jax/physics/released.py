@@ -52,8 +52,9 @@ class Released(Scenario):
     beyond: tuple[float, float] = (math.radians(-9), math.radians(9))
     skew: float = math.radians(4)  # rad, largest angle in the pad's plane between the axis of the lean and the edge
     carried: tuple[float, float] = (0.3, 0.9)  # share of the weight that the pad carries until the release
-    spread: float = 0.02  # m, radius of the disc about the pad's centre, where the object lies on average
-    # candidate faces and edges, of which the first one that balances at less than 45 degrees is taken
+    spread: float = 0.015  # m, radius of the disc about the pad's centre, where the object lies on average
+    # Candidate faces and edges. The one with the lowest centre of mass in balance is taken, so that few objects tumble
+    # off the pad.
     tries: int = 16
     rate: float = 31.25  # frames/s
     frames: int = 60
@@ -61,7 +62,8 @@ class Released(Scenario):
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.5, 0.6)
     tilt: float = math.pi  # rad, as in `Freefall`
-    contact: Contact = dataclasses.field(default_factory=Contact)
+    # A gel brakes rolling objects. More rolling friction would let an object stand on its edge.
+    contact: Contact = dataclasses.field(default_factory=lambda: Contact(rolling=0.0005))
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
