@@ -132,7 +132,7 @@ def outcomes(study: Study, starts: Starts) -> None:
 
 
 def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Log loss (n,) of each start's outcome, for a classifier without or with touch."""
+    """Log loss (n,) of the outcomes that a classifier predicts from the true states, and from `touch` if given."""
     label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     features = study.features(study.scenario, items, starts, touch)
     return metrics.log_loss(classifier.probabilities(features, label, starts.body), label)
@@ -195,7 +195,9 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
 
 
 def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, steps: int) -> None:
-    """Print the AUC of the fill from touch, from frames in the air, and from these frames with painted objects."""
+    """Print how well full objects are told from empty ones (AUC): from touch, from pictures of the objects in the air,
+    and from such pictures of objects whose colour shows the fill.
+    """
     detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, steps)
     flying, plain, tinted = aloft(jax.random.key(2), learned.items, EXAMPLES)
     new, new_plain, new_tinted = aloft(jax.random.key(3), items, num)

@@ -89,8 +89,10 @@ def checked_samples(num_samples: Any, key: Any) -> int:
             f"num_samples={num_samples!r}, but it must be a whole number. Inside jax.jit it must be a constant "
             "(static_argnames makes it one)."
         ) from None
-    if number < 0 or (number > 0 and key is None):
-        raise ValueError(f"num_samples={number}, but it must be >= 0, and needs a key if it is > 0.")
+    if number < 0:
+        raise ValueError(f"num_samples={number}, but it must be >= 0.")
+    if number > 0 and key is None:
+        raise ValueError(f"num_samples={number}, but key is missing: pass key=jax.random.key(0), or num_samples=0.")
     if key is not None and not (
         isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
     ):

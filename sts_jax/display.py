@@ -126,7 +126,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
             remedies = ["save it as .npz"] * isinstance(thing, tuple(_KINDS.values()))
             remedies += ["draw it with sts.show(...).savefig(path)"] * (not isinstance(thing, Trajectory))
             raise TypeError(
-                f"a .png file keeps the picture of a Frame or an image, got a {type(thing).__name__}: "
+                f"only a Frame or an image can be written to a .png file, got a {type(thing).__name__}: "
                 f"{', or '.join(remedies)}"
             )
         else:

@@ -1,4 +1,4 @@
-"""A trained model as a function from any subset of vision, touch and pose to a prediction of the last moment."""
+"""`Predictor`: a trained model as a function from any subset of vision, touch and pose to their values at rest."""
 
 import dataclasses
 import importlib.resources

@@ -82,7 +82,7 @@ def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason
         ("k", "must not be parallel"),
         ("l", "its up is"),
         ("m", "models-OBJ/models/m.obj does not exist"),
-        ("d", "twice"),
+        ("d", "several rows"),
         ("o", "_BAD"),
         ("metadata.csv", "2 of 15 models are of none"),
     ):

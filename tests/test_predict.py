@@ -161,7 +161,7 @@ def broken(name, change):
         (measurement(0), "there is no item"),
         ({**measurement(2), "condition": np.zeros((2, 3))}, "condition has shape"),
         ({**measurement(2), "present": {"pose": np.ones(3, bool)}}, "present"),
-        ({**measurement(2), "num_samples": 3}, "needs a key"),
+        ({**measurement(2), "num_samples": 3}, "key is missing"),
     ],
 )
 def test_each_invalid_input_is_named(predictor, given, message):

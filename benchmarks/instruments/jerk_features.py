@@ -47,14 +47,15 @@ def weighed(starts: Starts) -> np.ndarray:
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Map starts to equivalent ones whose push points 0 to 45 degrees from +x, by a symmetry of the pad.
+    """Turn or mirror first states by a symmetry of the square pad, so that the push points 0 to 45 degrees from +x.
 
     Args:
         pose: First poses, (n, 7).
         condition: (n, 3). The first two columns are the acceleration of the pad (m/s^2), the opposite of the push.
+            The third is not used.
 
     Returns:
-        Places (m) and pushes (m/s^2), (n, 2) each.
+        Positions on the pad (m) and pushes (m/s^2), (n, 2) each.
     """
     push = -np.asarray(jerk(condition).acceleration)
     sign = np.where(push < 0, -1, 1)

@@ -1,4 +1,4 @@
-"""Predictions of the last moment of held-out trajectories, from any subset of the inputs of a model."""
+"""Predictions of the images and poses at the end of held-out trajectories, from any subset of a model's inputs."""
 
 import itertools
 from collections.abc import Callable, Sequence

@@ -69,7 +69,7 @@ class Metric:
         ValueError: The metric has neither `errors` nor a `statistic`, its name is empty, or a field is out of range.
     """
 
-    name: str  # its key in summaries
+    name: str  # under which summaries list it
     errors: Errors | None = None  # of a prediction of n items, `(n,)`, or None if it does not predict the quantity
     unit: str = ""  # of the column, shown in brackets
     digits: int = 3  # decimals in the column
@@ -84,7 +84,9 @@ class Metric:
 
     def __post_init__(self) -> None:
         if not self.name:
-            raise ValueError("name of a metric is empty: give its key in summaries, such as 'height_error'")
+            raise ValueError(
+                "name of a metric is empty: give the name under which summaries list it, such as 'height_error'"
+            )
         if self.errors is None and self.statistic is None:
             raise ValueError(f"metric {self.name!r} has neither errors nor statistic: give a function as one of them")
         if type(self.digits) is not int or self.digits < 0:

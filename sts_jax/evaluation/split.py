@@ -8,10 +8,10 @@ from sts_jax.dataset import Dataset
 
 
 def train_share(shares: Sequence[float], split: str) -> float:
-    """The share of the objects, or of the trajectories, that trains.
+    """The share of the objects, or of the trajectories, that is used for training.
 
     Args:
-        shares: `shares` of the collection.
+        shares: The shares of training, validation and test objects that the collection states.
         split: `object` if whole objects are held out, `trajectory` if trajectories are. The latter split has no
             validation part, as in the paper.
     """

@@ -148,12 +148,14 @@ def stack(bodies: Sequence[Body]) -> Body:
     for index, shape in enumerate(shapes):
         if shape != shapes[0]:
             raise ValueError(
-                f"body {index} is of another class than body 0 ({len(bodies[index].faces)} faces, hulls "
-                f"{bodies[index].hulls.shape}, texture {len(bodies[index].texture)}, but body 0 has "
-                f"{len(bodies[0].faces)} faces, {bodies[0].hulls.shape}, {len(bodies[0].texture)}): stack each class "
-                "separately"
+                f"body {index} is of another size class than body 0: it has {_sizes(bodies[index])}, and body 0 has "
+                f"{_sizes(bodies[0])}. Stack the bodies of each size class separately"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
+
+
+def _sizes(body: Body) -> str:
+    return f"{len(body.faces)} faces, hulls of shape {body.hulls.shape} and a texture of side {len(body.texture)}"
 
 
 def mirror(body: Body) -> Body:

@@ -46,7 +46,7 @@ def convex_hull(
     try:
         candidates = points[ConvexHull(points).vertices]
     except (QhullError, ValueError) as error:
-        raise ValueError("the points lie in a plane: their convex hull has no volume") from error
+        raise ValueError("the points lie in a plane, so their convex hull has no volume: thicken the object") from error
     chosen = [int(np.argmax(candidates[:, 0]))]
     relative = candidates - candidates[chosen[0]]
     chosen.append(int(np.argmax(np.linalg.norm(relative, axis=1))))

@@ -74,7 +74,7 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             continue
         try:
             if name in seen:
-                raise ValueError("its id is in the table twice, and the first row is used")
+                raise ValueError("it has several rows in metadata.csv, of which the first is used: remove the others")
             seen.add(name)
             if "_BAD" in categories:
                 raise ValueError("marked _BAD in the table")

@@ -69,7 +69,7 @@ def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
     other = sorted(set(outcome.tolist()) - set(known))
     if other:
         raise ValueError(
-            f"scenario.outcome returns {other[0]}, but the numbers of scenario.outcomes are {known}: declare it there"
+            f"scenario.outcome returns {other[0]}, but the numbers of scenario.outcomes are {known}: add it to outcomes"
         )
 
 

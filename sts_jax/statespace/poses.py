@@ -54,7 +54,7 @@ def about_vertical(angle: Float[Array, "*n 2"]) -> Float[Array, "*n 3 3"]:
 
 
 def nearest(turn: Float[Array, "*n 9"]) -> Float[Array, "*n 3 3"]:
-    """The rotations nearest to nine numbers."""
+    """The rotation matrices nearest to matrices that are given as nine numbers each."""
     return geometry.quat_to_matrix(geometry.quat_from_matrix(turn.reshape(*turn.shape[:-1], 3, 3)))
 
 

@@ -162,7 +162,7 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
         for values in (arrays.inputs, arrays.targets):
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
                 raise ValueError(
-                    f"{modality.name}: arrays of {values[modality.name].shape[1:]}, but the model has "
-                    f"{modality.shape}: give arrays or a Modality of the other's shape"
+                    f"{modality.name}: arrays of shape {values[modality.name].shape[1:]}, but the model's Modality has "
+                    f"shape {modality.shape}: give arrays of that shape, or a model with the arrays' shape"
                 )
     _check_condition(model.condition, arrays)

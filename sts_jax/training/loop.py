@@ -195,9 +195,9 @@ def _run(
             _send([record], log)
             if not np.isfinite(record["loss"]):
                 raise FloatingPointError(
-                    f"{workdir}: the loss is {record['loss']} at step {done}: lower the learning rate, or clip the "
-                    f"gradient (TrainConfig has learning_rate={config.learning_rate} and clip={config.clip}, which a "
-                    "given optimiser does not use)"
+                    f"{workdir}: the loss is {record['loss']} at step {done}: lower TrainConfig.learning_rate (now "
+                    f"{config.learning_rate}) or TrainConfig.clip (now {config.clip}). An optimiser of your own uses "
+                    "neither: change it instead"
                 )
         if done % config.checkpoint_every == 0 or done == total:
             save(workdir, state)

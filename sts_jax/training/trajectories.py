@@ -169,7 +169,7 @@ def state_model(
     if height != width or preprocessing.crop:
         raise ValueError(
             f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}, but a state-space model "
-            "takes square images of the whole view"
+            "takes square images of the whole view: give a preprocessing with resolution=(n, n) and crop=False"
         )
     absent = () if _touched(pairs, preprocessing, empty["tactile"]).any() else ("tactile",)
     model = statespace.Config(

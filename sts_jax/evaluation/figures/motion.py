@@ -94,10 +94,10 @@ def animation(
     outcome: str = "",
     side: int = 240,
 ) -> None:
-    """Write an animation of one trajectory: a view from outside, both streams, force and moment so far.
+    """Write an animation of one trajectory: an outside view, the visual and the tactile stream, and the wrench so far.
 
-    An arrow on the visual stream is the component of gravity along the pad, which is due to the slope or to the jerk of
-    the pad. The animation is SLOWER times slower than the motion.
+    An arrow on the visual stream shows the component of the apparent gravity along the pad. It is not zero on a slope
+    and while the pad accelerates. The animation is SLOWER times slower than the motion.
 
     Args:
         path: The GIF to write.
