@@ -8,6 +8,7 @@ meet the gel's outer face (z = 0 in the sensor frame) in the same point.
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Protocol, SupportsFloat, runtime_checkable
 
 import cv2
@@ -172,7 +173,7 @@ def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float6
     """Project points of the camera frame, shape (..., 3), into the raw image, shape (..., 2). See `project`."""
     radius = np.hypot(points[..., 0], points[..., 1])
     angle = np.arctan2(radius, points[..., 2])
-    distorted_angle = np.where(angle <= lens.largest_angle, _distort_angle(lens.k, angle), np.nan)
+    distorted_angle = np.where(angle <= lens.largest_angle, distort_angle(lens.k, angle), np.nan)
     ratio = distorted_angle / np.where(radius > 0, radius, 1)
     return np.stack([lens.fx * ratio * points[..., 0] + lens.cx, lens.fy * ratio * points[..., 1] + lens.cy], axis=-1)
 
@@ -400,28 +401,29 @@ def _averaged(image: NDArray, resolution: tuple[int, int]) -> NDArray:
     return cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
 
 
-def _distort_angle(k: tuple[float, ...], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+def distort_angle(k: Sequence[float], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The polynomial d of the lens at angles from the optical axis (rad), see `Lens`."""
     square = angle * angle
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 
 
 def _undistort_angle(k: tuple[float, ...], distorted_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of `_distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
+    """The inverse of `distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
     largest = _largest_angle(k)
     known = np.linspace(0, largest, _TABLE)
-    table = _distort_angle(k, known)
+    table = distort_angle(k, known)
     angle = np.interp(distorted_angle, table, known)
     for _ in range(3):
         square = angle * angle
         slope = 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
-        step = (_distort_angle(k, angle) - distorted_angle) / np.maximum(slope, 1e-6)
+        step = (distort_angle(k, angle) - distorted_angle) / np.maximum(slope, 1e-6)
         angle = np.clip(angle - np.clip(step, -largest / _TABLE, largest / _TABLE), 0, largest)
     return np.where(distorted_angle <= table[-1], angle, np.nan)
 
 
 @functools.lru_cache(maxsize=32)
 def _largest_angle(k: tuple[float, ...]) -> float:
-    """The smallest positive root of the derivative of `_distort_angle`, at most pi."""
+    """The smallest positive root of the derivative of `distort_angle`, at most pi."""
     roots = np.roots([9 * k[3], 7 * k[2], 5 * k[1], 3 * k[0], 1.0])
     real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots))) & (roots.real > 0)].real
     return min([MOST_ANGLE, *np.sqrt(real).tolist()])
