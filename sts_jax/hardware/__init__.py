@@ -1,5 +1,15 @@
 """The real sensor as a device. Imperative, NumPy only."""
 
+from sts_jax.hardware.calibration import (
+    Board,
+    Calibration,
+    CalibrationError,
+    FoundCorners,
+    board_image,
+    calibrate,
+    find_board,
+    save_board,
+)
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
 from sts_jax.hardware.ports import (
@@ -16,7 +26,11 @@ from sts_jax.hardware.ports import (
 )
 
 __all__ = [
+    "Board",
+    "Calibration",
+    "CalibrationError",
     "DisconnectedError",
+    "FoundCorners",
     "LedError",
     "LedTimeoutError",
     "Leds",
@@ -29,10 +43,14 @@ __all__ = [
     "PortNotFoundError",
     "PortPermissionError",
     "WrongVersionError",
+    "board_image",
+    "calibrate",
     "distorted",
     "distortion",
+    "find_board",
     "find_controllers",
     "project",
     "rectification",
     "rectified",
+    "save_board",
 ]
