@@ -24,11 +24,14 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
 
 __all__ = [
+    "Background",
     "Board",
     "Calibration",
     "CalibrationError",
+    "Device",
     "DisconnectedError",
     "FoundCorners",
     "LedError",
@@ -42,6 +45,8 @@ __all__ = [
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "SensorFileError",
+    "WrongDeviceError",
     "WrongVersionError",
     "board_image",
     "calibrate",
