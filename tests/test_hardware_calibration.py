@@ -190,6 +190,79 @@ def test_colour_images_give_the_same_lens_and_images_without_the_board_are_left_
     assert calibration.lens == calibrate(images, BOARD).lens
 
 
+def corners_of(lens, poses, noise, rng, project=None):
+    """The corners of boards in given poses (board to camera) that lie in the image, with noise in pixels."""
+    found = []
+    for rotation, translation in poses:
+        points = BOARD.corners @ Rotation.from_rotvec(rotation).as_matrix().T + translation
+        pixels = (project or hardware.lens.project_camera)(lens, points)
+        pixels = pixels + noise * rng.standard_normal(pixels.shape)
+        inside = ((pixels > 2) & (pixels < [lens.width - 3, lens.height - 3])).all(axis=-1)
+        found.append(hardware.FoundCorners(np.flatnonzero(inside), pixels[inside]))
+    return found
+
+
+def pad_points():
+    """Points all over the pad (m), shape (64, 3)."""
+    x, y = np.meshgrid(np.linspace(-0.075, 0.075, 8), np.linspace(-0.075, 0.075, 8))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(64)], axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lenses_of_all_fields_of_view_are_recovered(seed):
+    rng = np.random.default_rng(seed)
+    width, height = [(640, 480), (1640, 1232)][seed % 2]
+    ideal = Lens.ideal(width, height, field_of_view=math.radians(rng.uniform(115, 200)))
+    lens = dataclasses.replace(
+        ideal,
+        cx=ideal.cx + 0.02 * width * rng.uniform(-1, 1),
+        cy=ideal.cy + 0.02 * width * rng.uniform(-1, 1),
+        fy=ideal.fy * rng.uniform(0.98, 1.02),
+        k=tuple(np.array([0.08, 0.03, 0.01, 0.002]) * rng.uniform(-1, 1, 4)),
+        rotation=tuple(rng.uniform(-0.15, 0.15, 3)),
+        translation=(*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.09, 0.12)),
+    )
+    poses = [(lens.rotation, lens.translation)]
+    for x, y in [(x, y) for x in (-0.05, 0, 0.05) for y in (-0.04, 0, 0.04)]:
+        poses.append((rng.uniform(-0.5, 0.5, 3), (x, y, rng.uniform(0.12, 0.16))))
+    calibration = hardware.fit_lens(corners_of(lens, poses, 0.1, rng), (width, height), BOARD)
+    np.testing.assert_allclose(max(calibration.errors), 0.14, atol=0.04)  # 0.1 pixels in both directions
+    points = np.stack(
+        [*np.meshgrid(np.linspace(-0.075, 0.075, 9), np.linspace(-0.075, 0.075, 9)), np.zeros((9, 9))], -1
+    )
+    errors = hardware.project(calibration.lens, points) - hardware.project(lens, points)
+    assert np.linalg.norm(errors, axis=-1).max() < 0.3
+    np.testing.assert_allclose(calibration.lens.center, lens.center, atol=4e-4)
+
+
+def refracted(lens, points, thickness=0.005, index=1.41):
+    """Project points of the camera frame through a gel in front of an untilted camera: a slab with parallel faces."""
+    radius = np.hypot(points[:, 0], points[:, 1])
+    low, high = np.zeros_like(radius), np.full_like(radius, 1.55)
+    for _ in range(60):
+        middle = (low + high) / 2
+        within = np.tan(np.arcsin(np.sin(middle) / index))
+        near = (points[:, 2] - thickness) * np.tan(middle) + thickness * within < radius
+        low, high = np.where(near, middle, low), np.where(near, high, middle)
+    rays = np.stack([np.sin(low) * points[:, 0] / radius, np.sin(low) * points[:, 1] / radius, np.cos(low)], axis=-1)
+    return hardware.lens.project_camera(lens, rays)
+
+
+def test_the_refraction_of_the_gel_becomes_a_part_of_the_lens():
+    rng, lens = np.random.default_rng(0), Lens.ideal(640, 480)
+    poses = [(lens.rotation, lens.translation)] + [
+        (rng.uniform(-0.4, 0.4, 3), (x, y, rng.uniform(0.14, 0.17))) for x in (-0.05, 0, 0.05) for y in (-0.04, 0, 0.04)
+    ]
+    found = corners_of(lens, poses, 0.05, rng, refracted)
+    calibration = hardware.fit_lens(found, (640, 480), BOARD)
+    points = pad_points()
+    seen = refracted(lens, points + lens.translation)
+    ignored = np.linalg.norm(hardware.project(lens, points) - seen, axis=-1)
+    remaining = np.linalg.norm(hardware.project(calibration.lens, points) - seen, axis=-1)
+    assert ignored.max() > 2
+    assert remaining.max() < 0.3
+
+
 # ---- Errors
 
 

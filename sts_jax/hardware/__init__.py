@@ -8,6 +8,7 @@ from sts_jax.hardware.calibration import (
     board_image,
     calibrate,
     find_board,
+    fit_lens,
     save_board,
 )
 from sts_jax.hardware.leds import Leds, Lit
@@ -54,6 +55,7 @@ __all__ = [
     "distortion",
     "find_board",
     "find_controllers",
+    "fit_lens",
     "project",
     "rectification",
     "rectified",
