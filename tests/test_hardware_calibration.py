@@ -261,6 +261,7 @@ def test_the_refraction_of_the_gel_becomes_a_part_of_the_lens():
     remaining = np.linalg.norm(hardware.project(calibration.lens, points) - seen, axis=-1)
     assert ignored.max() > 2
     assert remaining.max() < 0.3
+    assert 0.001 < lens.translation[2] - calibration.lens.translation[2] < 0.0025  # the pad appears nearer
 
 
 # ---- Errors

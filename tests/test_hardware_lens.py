@@ -283,7 +283,7 @@ def test_invalid_arguments_raise_errors():
 
 def test_the_lens_and_its_file_import_no_jax():
     folder = Path(hardware.__file__).parent
-    for name in ("lens.py",):
+    for name in ("lens.py", "calibration.py", "sensor_file.py"):
         text = (folder / name).read_text()
         allowed = r"^\s*(import|from) (jax|sts_jax(?!\.hardware|\._files| import _files$))"
         assert not re.search(allowed, text, re.MULTILINE), name

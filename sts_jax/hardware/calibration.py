@@ -24,8 +24,8 @@ MOST_TILT_ON_PAD = math.radians(30)  # of the pad against the image
 _STARTS = np.radians(np.arange(60, 221, 10))  # rad, fields of view across the diagonal from which the fit may start
 _WIDEST = math.radians(80)  # rad, corners beyond it do not take part in the first estimate of a pose
 # Pixels per unit of k. Without it, k is arbitrary beyond the corners' largest angle. With an error of 0.1 pixels of the
-# corners, the standard deviations are 0.2, 0.1, 0.05 and 0.02. The equidistant, stereographic, equisolid and orthographic
-# projections have absolute values of at most 0.17, 0.01, 0.001 and 0.0001.
+# corners, the standard deviations are 0.2, 0.1, 0.05 and 0.02. The equidistant, stereographic, equisolid and
+# orthographic projections have absolute values of at most 0.17, 0.01, 0.001 and 0.0001.
 _PRIOR = np.array([0.5, 1.0, 2.0, 5.0])
 _PAGE = (210, 297)  # mm, A4
 _PIXELS_PER_MM = 10
