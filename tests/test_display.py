@@ -132,7 +132,7 @@ def test_a_body_is_drawn_from_outside():
             "a.png",
             BODY,
             TypeError,
-            r"Frame or an image can be written to a \.png file, got a Body: save it as \.npz, or draw it with sts\.show",
+            r"can be written to a \.png file, got a Body: save it as \.npz, or draw it with sts\.show",
         ),
         ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
         ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),

@@ -1,5 +1,16 @@
 """The real sensor as a device. Imperative, NumPy only."""
 
+from sts_jax.hardware.calibration import (
+    Board,
+    Calibration,
+    CalibrationError,
+    FoundCorners,
+    board_image,
+    calibrate,
+    find_board,
+    fit_lens,
+    save_board,
+)
 from sts_jax.hardware.camera import Camera
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.camera_errors import (
@@ -16,10 +27,10 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
-from sts_jax.hardware.device import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
 from sts_jax.hardware.leds import Leds, Lit
+from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
 from sts_jax.hardware.ports import (
     DisconnectedError,
     LedError,
@@ -32,10 +43,16 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
 from sts_jax.hardware.settling import NoContrastError, Settling
+from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
 
 __all__ = [
     "STS",
+    "Background",
+    "Board",
+    "Calibration",
+    "CalibrationError",
     "Camera",
     "CameraBusyError",
     "CameraConfig",
@@ -48,31 +65,47 @@ __all__ = [
     "CameraStatistics",
     "CameraTimeoutError",
     "Captured",
+    "Device",
     "DisconnectedError",
     "EndOfVideoError",
     "FoundCamera",
+    "FoundCorners",
     "FoundSensors",
     "FrameSizeError",
     "FrozenCameraError",
     "LedError",
     "LedTimeoutError",
     "Leds",
+    "Lens",
     "LightError",
     "Lit",
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
     "Pair",
+    "Pinhole",
     "Port",
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "SensorFileError",
     "Settling",
     "Shot",
     "StaleFrameError",
+    "WrongDeviceError",
     "WrongVersionError",
+    "board_image",
+    "calibrate",
+    "distorted",
+    "distortion",
+    "find_board",
     "find_cameras",
     "find_controllers",
     "find_sensors",
+    "fit_lens",
     "is_black",
+    "project",
+    "rectification",
+    "rectified",
+    "save_board",
 ]
