@@ -73,9 +73,9 @@ def make(name: str) -> objects.Body:
 
 
 def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
-    """Draw a pose of one of the kinds POSES, and its wrench.
+    """Draw a pose of a kind of `POSES`, and its wrench.
 
-    The wrench is 1 N under the object's lowest point if the object touches the pad, and zero otherwise.
+    The wrench is that of a force of 1 N upwards at the object's lowest point if it touches the pad, and zero otherwise.
     """
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)

@@ -8,10 +8,12 @@ Prints, for each outcome, its shares on two sides and the interval of their diff
 bottle are released 20 mm above the pad in any orientation, and their runs are labelled by the face that is down at the
 end. Bottles on the jerked pad are labelled by outcome. A side is one way to compute the same runs:
 
-- `simulate` in MJX ("ours"), with half the time step, and as mirror image (of start, jerk and object)
-- `simulate` in C MuJoCo, with half the time step, and as mirror image
+- `simulate` in MJX ("ours")
+- the same with half the time step
+- the same with start, jerk and object mirrored
+- `simulate` in C MuJoCo, with the same two variants
 - C MuJoCo alone, which finds the contacts of the mesh
-- C MuJoCo with every vertex of the hull as a contact, and the mesh for the rims
+- C MuJoCo with every vertex of the hull as a contact point. It uses its own contacts of the mesh at the pad's rims only
 - for jerked bottles, the same with a pad that is driven on slides, under constant gravity
 
 C MuJoCo keeps four contacts of a mesh that stands on a face. A round base then becomes a square, up to 30 % narrower,

@@ -3,9 +3,9 @@
     python -m benchmarks.touch          # about a minute, for the dataset of runs/freefall
     python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
-Prints the accuracy of ridge regression of the log mass on simple image features (sums, sizes, depths), which is fitted
-on training objects, and the share of imprint pixels at 0 or 255. Both use the last frames of settled objects on the
-pad. Writes no files.
+Prints the accuracy of a ridge regression of the log mass on simple image features (sums, sizes, depths), which is
+fitted to training objects. Also prints the share of imprint pixels at 0 or 255. Both use the last frames of settled
+objects on the pad. Writes no files.
 """
 
 import dataclasses

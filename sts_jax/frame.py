@@ -259,12 +259,12 @@ def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any
         )
     if pose.shape != (7,):
         raise ValueError(
-            f"pose has the shape {pose.shape}, but it must be (7,), position (m), quaternion. For several poses use "
-            "jax.vmap"
+            f"pose has the shape {pose.shape}, but it must be (7,): the position (m) and the quaternion [w, x, y, z]. "
+            "For several poses use jax.vmap"
         )
     if wrench is not None and wrench.shape != (6,):
         raise ValueError(
-            f"wrench has the shape {wrench.shape}, but it must be (6,), force (N) and moment (N m). For several "
+            f"wrench has the shape {wrench.shape}, but it must be (6,): force (N) and moment (N m). For several "
             "wrenches use jax.vmap"
         )
     if len(body.faces) > FACE_CLASSES[-1]:

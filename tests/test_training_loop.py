@@ -326,8 +326,8 @@ def test_a_state_space_model_memorises_four_samples(tmp_path):
         ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "targets have samples of"),
         ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "inputs have samples of"),
         ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"empty needs .* of shape \(16, 16, 3\)"),
-        ({"present": {"tactile": np.ones(4, bool)}}, r"^present masks \['tactile'\]"),
-        ({"target_present": {"tactile": np.ones(4, bool)}}, r"target_present masks \['tactile'\]"),
+        ({"present": {"tactile": np.ones(4, bool)}}, r"^present has masks for \['tactile'\]"),
+        ({"target_present": {"tactile": np.ones(4, bool)}}, r"target_present has masks for \['tactile'\]"),
         ({"condition": np.ones((4, 3), np.float32)}, "condition has width 3"),
     ],
 )

@@ -101,9 +101,9 @@ def pressed(starts: Starts) -> np.ndarray:
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
     """Features (n, k) of starts on the slope, for objects of any shape.
 
-    They include the results of `balance` for DRAWS of the hidden contents. From vision, all of these draws are equally
-    likely. Touch weighs them by their likelihood. The pose has noise of SEEN, because an exact pose would reveal by
-    micrometres which objects have begun to slip.
+    They include the results of `balance` for `DRAWS` random draws of the hidden contents. From vision, all of these
+    draws are equally likely. Touch weighs them by their likelihood. Noise with the standard deviations `SEEN` is added
+    to the pose, because an exact pose would reveal by micrometres which objects have begun to slip.
 
     Args:
         scenario: The scenario.

@@ -40,18 +40,18 @@ def ceilings(
 ) -> Ceilings:
     """The ceilings of the first `num` held-out items: read, or computed and written to `ceiling{suffix}.npz`.
 
-    `ceiling{suffix}.json` records the checksums of their inputs.
+    `ceiling{suffix}.json` records the checksums of the inputs from which they were computed.
 
     Args:
         workdir: The work directory.
         suffix: Suffix of the names of the files, for a second split.
         collection: The collection of the experiment.
-        sensor: The sensor that renders the ends.
+        sensor: The sensor that renders the ends of the re-rolls.
         data: The dataset of the items.
         test: The held-out items.
         times: Number of re-rolls per item.
         num: Number of items.
-        judge: Scores the prediction of some items, see `evaluation.scorer`.
+        judge: Scores a prediction of all these items, see `evaluation.scorer`.
     """
     few = dataset.Pairs(*(leaf[:num] for leaf in test))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"

@@ -79,7 +79,7 @@ class Board:
         return np.asarray(self.opencv().getChessboardCorners(), np.float64) - middle
 
     def opencv(self) -> "cv2.aruco.CharucoBoard":
-        """The board of OpenCV, whose origin is the top left corner."""
+        """This board as an object of OpenCV, whose origin is the top left corner."""
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._markers())
 
     def _markers(self) -> "cv2.aruco.Dictionary":
@@ -122,9 +122,13 @@ def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15,
     pixels = [round(1000 * side * _PIXELS_PER_MM) for side in board.size]
     limits = [(_PAGE[0] - 10) * _PIXELS_PER_MM, (_PAGE[1] - 60) * _PIXELS_PER_MM]
     if any(p > f for p, f in zip(pixels, frame, strict=True)):
-        raise ValueError(f"the board of {_mm(board.size)} does not fit into the outline of {_mm(outline)}")
+        raise ValueError(
+            f"the board of {_mm(board.size)} does not fit into outline={_mm(outline)}: use smaller squares"
+        )
     if any(f > limit for f, limit in zip(frame, limits, strict=True)):
-        raise ValueError(f"the outline of {_mm(outline)} must be at most {_PAGE[0] - 10} mm x {_PAGE[1] - 60} mm")
+        raise ValueError(
+            f"outline is {_mm(outline)}, but at most {_PAGE[0] - 10} mm x {_PAGE[1] - 60} mm fit on the page"
+        )
     page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
     left, top = (page.shape[1] - frame[0]) // 2, 10 * _PIXELS_PER_MM
     cv2.rectangle(page, (left - 1, top - 1), (left + frame[0], top + frame[1]), 160, 1)

@@ -160,7 +160,9 @@ def decode(line: bytes) -> str:
             checksum differs.
     """
     if len(line) > LONGEST_LINE:
-        raise ProtocolError(f"line of {len(line)} bytes, allowed are {LONGEST_LINE}: {line!r}", Code.LENGTH)
+        raise ProtocolError(
+            f"line has {len(line)} bytes, but at most {LONGEST_LINE} are allowed: {line!r}", Code.LENGTH
+        )
     found = re.fullmatch(rb"([ -)+-~]+)\*([0-9A-F]{4})\n", line)
     if found is None:
         raise ProtocolError(f"not a line of the protocol: {line!r}")
@@ -211,7 +213,9 @@ def decode_request(line: bytes) -> Request:
         case ["WATCH", period] if (number := _number(period, SHORTEST_WATCH_MS, LONGEST_WATCH_MS)) is not None:
             return Watch(sequence, number)
         case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
-            raise ProtocolError(f"bad arguments: {line!r}", Code.ARGUMENTS, sequence)
+            raise ProtocolError(
+                f"the arguments are missing, superfluous or out of range: {line!r}", Code.ARGUMENTS, sequence
+            )
     raise ProtocolError(f"unknown command: {line!r}", Code.COMMAND, sequence)
 
 

@@ -239,7 +239,7 @@ class Device:
 
 
 def sensor_file(path: str | os.PathLike) -> Path:
-    """The path of a sensor file, given itself or its folder."""
+    """The path of a sensor file. `path` is the file or the folder that holds it."""
     path = Path(path)
     return path if path.suffix.lower() == ".json" else path / NAME
 

@@ -277,8 +277,8 @@ def _body(
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: has {len(faces):,} faces and {len(vertices):,} vertices, but at most {FACE_CLASSES[-1]:,} fit: "
-            "give faces= to decimate it"
+            f"{path}: has {len(faces):,} faces and {len(vertices):,} vertices, but at most {FACE_CLASSES[-1]:,} of "
+            "each are allowed: give faces= to decimate it"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     closed = is_closed(faces)

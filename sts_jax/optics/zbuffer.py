@@ -1,7 +1,8 @@
 """A z-buffer in plain JAX: the nearest face at each pixel, for triangles of any size on the screen.
 
-Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop takes the list of runs in chunks,
-and each chunk column by column, so the work grows with the covered pixels and not with the product of faces and pixels.
+Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop takes the list of runs in chunks
+and draws one pixel of each run of a chunk at a time, so the work grows with the covered pixels and not with the product
+of faces and pixels.
 Each step is one scatter-min of a 32-bit key, with the depth in the high bits and the index of the face in the low ones.
 The choice of the face has no gradient. Values interpolated from the chosen face have one.
 

@@ -1,6 +1,6 @@
 """Contacts of convex hulls with a box's top and sides: exact candidates, and the contact points chosen from them.
 
-MJX's own test of a mesh against a box is unsuitable. Beside a face it counts every pair of edges, so a small object on
+MJX's own test of a mesh against a box is unsuitable. Besides faces, it tests every pair of edges, so a small object on
 a large pad is pushed by contacts between its edges and the distant rims of the pad. It never comes to rest, or is even
 thrown off. Every mesh also compiles anew. The pad and the stop wall of the slope are boxes whose sides are parallel to
 the axes, so their contacts with a convex hull are of three kinds:

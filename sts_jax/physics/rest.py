@@ -183,7 +183,7 @@ def _index(faces: StableFaces, face: int | str) -> int:
     if not count:
         raise ValueError(
             "the body rests on no face, because its centre of mass lies outside its hull or less than 0.5 mm inside "
-            "the edge of every face: pass sense a pose of your own"
+            "the edge of every face: give `sense` a pose of your own"
         )
     numbered = f"it rests on {count} faces, 0 (the most likely) to {count - 1}" if count > 1 else "it rests on face 0"
     if isinstance(face, str):

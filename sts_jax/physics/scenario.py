@@ -169,7 +169,7 @@ class Scenario(abc.ABC):
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) with which its condition begins."""
+        """Number of vectors (x, y) at the front of the condition. The numbers after them are scalars."""
         return sum(quantity.vector for quantity in self.quantities)
 
     @property

@@ -162,7 +162,7 @@ def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Arra
         there = ocp.metadata(str(path.absolute()), stored).metadata
         _compare(there, wanted)
         if stored == OPTIMISER and there.keys() != wanted.keys():
-            raise ValueError(f"{min(there.keys() - wanted.keys())} belongs to another optimiser")
+            raise ValueError(f"{min(there.keys() - wanted.keys())} belongs to another optimiser than the given one")
         with context:
             return ocp.load(str(path.absolute()), abstract, checkpointable_name=stored)
 

@@ -157,7 +157,9 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
             )
     for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
         if not set(masks) <= set(model.names):
-            raise ValueError(f"{kind} masks {sorted(masks)}, but the model has {sorted(model.names)}: remove others")
+            raise ValueError(
+                f"{kind} has masks for {sorted(masks)}, but the model has {sorted(model.names)}: remove the others"
+            )
     for modality in model.modalities:
         for values in (arrays.inputs, arrays.targets):
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
