@@ -92,7 +92,8 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     """Raise a ValueError if the arrays do not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
-            f"present masks {sorted(arrays.present)} and target_present masks {sorted(arrays.target_present)}, but the "
+            f"present has masks for {sorted(arrays.present)}, target_present has masks for "
+            f"{sorted(arrays.target_present)}, but the "
             f"model takes masks only of its inputs {list(model.inputs)}: remove the others"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
