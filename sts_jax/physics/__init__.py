@@ -7,6 +7,7 @@ from sts_jax.physics.freefall import Freefall
 from sts_jax.physics.inclined import Inclined
 from sts_jax.physics.mass_properties import Rigid, rigids
 from sts_jax.physics.perturbed import Perturbed
+from sts_jax.physics.released import Released
 from sts_jax.physics.rest import Placement, StableFaces, place, stable_faces, weight
 from sts_jax.physics.scenario import (
     Hidden,
@@ -34,6 +35,7 @@ __all__ = [
     "Perturbed",
     "Placement",
     "Quantity",
+    "Released",
     "Rigid",
     "Scenario",
     "Shape",

@@ -41,8 +41,8 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
         raise TypeError(f"sensor is {sensor!r}, but it must be a Sensor, for instance sts.Sensor()")
     if not isinstance(scenario, Scenario) or not _is_frozen(scenario):
         raise TypeError(
-            f"scenario is {scenario!r}, but it must be Freefall(), Inclined(), Perturbed() or a frozen dataclass of "
-            "your own that derives from physics.Scenario"
+            f"scenario is {scenario!r}, but it must be Freefall(), Inclined(), Perturbed(), Released() or a frozen "
+            "dataclass of your own that derives from physics.Scenario"
         )
     scenario.check()
     check_bodies(bodies)

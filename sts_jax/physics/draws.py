@@ -69,7 +69,7 @@ def starts(
         key: for the whole set. The key of `simulate` may be used again.
         bodies: one body, or a sequence of different ones.
         sensor: `sensor.gel.size` is the pad's size.
-        scenario: `Freefall()`, `Inclined()`, `Perturbed()` or another `Scenario`.
+        scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: starts of each body.
 
     Returns:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from sts_jax import geometry
 from sts_jax.physics.limits import check_length, check_range
 from sts_jax.physics.scenario import (
+    LEVEL,
     MOVED,
     STANDING,
     TURNED,
@@ -21,10 +22,10 @@ from sts_jax.physics.scenario import (
     Start,
     fell_off,
     random_yaw,
+    upright,
 )
 from sts_jax.physics.scene import Contact
 
-LEVEL = 0.001  # m, points up to this far above the lowest one support an object, since it may rock by a facet
 DIRECTIONS = 120  # directions in which an object's support is measured
 LET_GO = 0.008  # s from release to frame 0, when a tipping object leans by 0.1 degree and touch has felt it
 CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop wall
@@ -89,7 +90,7 @@ class Inclined(Scenario):
         rests = jax.random.uniform(kind) < self.resting
         faces = shape.rests[jax.random.categorical(face, jnp.log(shape.shares), shape=(self.tries,))]
         turns = jax.vmap(random_yaw)(jax.random.split(turn, self.tries))
-        laid = jax.vmap(geometry.quat_multiply)(turns, jax.vmap(_upright)(faces))
+        laid = jax.vmap(geometry.quat_multiply)(turns, jax.vmap(upright)(faces))
         margin = jax.lax.map(lambda quat: _margins(quat, shape, self.slope), laid)  # one by one, to save memory
         undecided = jnp.minimum(jnp.maximum(margin, 0).mean(axis=1), jnp.maximum(-margin, 0).mean(axis=1))
         quat = jnp.where(rests, laid[jnp.argmax(undecided)], geometry.random_quat(free))
@@ -134,10 +135,3 @@ def _margins(quat: Float[Array, "4"], shape: Shape, slope: float) -> Float[Array
     outward = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     reach = jnp.max(jnp.where((points[:, 2] < low + LEVEL)[:, None], points[:, :2] @ outward, -jnp.inf), axis=0)
     return jnp.min(reach - meets @ outward, axis=1)
-
-
-def _upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The shortest turn that takes a unit vector to +z."""
-    upside_down = up[2] < -0.9999
-    turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
-    return geometry.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))

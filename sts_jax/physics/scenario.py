@@ -19,6 +19,7 @@ G = 9.81  # m/s^2
 FELL_OFF_HEIGHT = -0.005  # m, height below which an object's origin, inside its hull, has left the pad
 MOVED = 0.01  # m, an object that moved less has stayed in place
 TURNED = math.pi / 4  # rad, an object that leans more topples, and one that turned more rolls
+LEVEL = 0.001  # m, points up to this far above the lowest one support an object, since it may rock by a facet
 STANDING = 1.04e-5  # m, depth in the pad of a standing object and of a start at rest
 
 
@@ -32,6 +33,7 @@ class Outcome(enum.IntEnum):
     TOPPLES = 4
     STICKS = 5
     ROLLS = 6
+    RETURNS = 7
 
     def __str__(self) -> str:
         return in_words(self)
@@ -82,6 +84,8 @@ class Start(NamedTuple):
     pose: Float[Array, "7"]  # m and quaternion, mesh frame in the sensor frame
     held: Int[Array, ""]  # steps until its release in the interval that ends with frame 0
     condition: Float[Array, "c"]  # SI units
+    # Share of its weight that the pad carries in frame 0 if the object is held until then. The hand carries the rest.
+    carried: Float[Array, ""] | float = 0.0
 
 
 class Quantity(NamedTuple):
@@ -317,6 +321,13 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
 def fell_off(pose: Float[Array, "*n 7"]) -> Bool[Array, "*n"]:
     """Whether an object has left the pad, from its true or predicted pose."""
     return pose[..., 2] < FELL_OFF_HEIGHT
+
+
+def upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
+    """The shortest turn that takes a unit vector to +z."""
+    upside_down = up[2] < -0.9999
+    turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
+    return geometry.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
 
 
 def random_yaw(key: PRNGKeyArray) -> Float[Array, "4"]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 from tqdm import tqdm
 
 from sts_jax._keys import check_key
@@ -18,7 +18,9 @@ from sts_jax.physics.arguments import check_arguments, check_condition, check_hi
 from sts_jax.physics.bodies import BodyError, hulls, shapes
 from sts_jax.physics.draws import draw
 from sts_jax.physics.engines import Engine, Rolled, Setup, gravity_at, in_c, in_mjx
-from sts_jax.physics.roll import SLOW_TIME
+from sts_jax.physics.held import held_wrench
+from sts_jax.physics.mass_properties import rigids
+from sts_jax.physics.roll import SLOW_TIME, Record
 from sts_jax.physics.scenario import Hidden, Scenario, Start
 from sts_jax.physics.trajectory import Trajectory
 from sts_jax.sensor import Sensor
@@ -60,7 +62,7 @@ def simulate(
         key: for the whole set.
         body: one body, or a sequence of different ones.
         sensor: `sensor.gel.size` is the pad's size.
-        scenario: `Freefall()`, `Inclined()`, `Perturbed()` or another `Scenario`.
+        scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: trajectories of each body.
         hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major. Replaces the drawn values. The starts remain
             those of `key`, except where `resampled` is not 0.
@@ -100,7 +102,7 @@ def simulate(
         engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     with _reported(progress, len(setup.which), engine) as report:
         accepted = _accepted(key, setup, given, chunk, engine, report)
-    return _trajectory(setup, accepted)
+    return _trajectory(setup, sensor, accepted)
 
 
 @contextlib.contextmanager
@@ -182,9 +184,33 @@ def _chunks(setup: Setup, pending: np.ndarray, chunk: int, engine: Engine, worke
     return [group for part in parts for group in np.split(part, range(size, len(part), size))]
 
 
-def _trajectory(setup: Setup, accepted: _Accepted) -> Trajectory:
+def _with_held(setup: Setup, sensor: Sensor, accepted: _Accepted, down: Float[np.ndarray, "n"]) -> Record:
+    """The records, with the wrench of the pad on objects that a hand holds against it in frame 0.
+
+    Args:
+        setup: the properties of the trajectories.
+        sensor: the sensor, whose gel determines the centre of pressure.
+        accepted: the accepted draws and their results.
+        down: m/s^2, gravity towards the pad in frame 0.
+    """
+    record, starts = accepted.rolled.record, jax.tree.map(np.asarray, accepted.starts)
+    held = np.flatnonzero((starts.carried > 0) & (starts.held >= setup.scenario.steps))
+    if not len(held):
+        return record
+    wrench, contact = np.array(record.wrench), np.array(record.contact)
+    mass = rigids(setup.bodies, setup.which, accepted.hidden).mass
+    for i in held.tolist():
+        force = float(starts.carried[i] * mass[i] * down[i])
+        wrench[i, 0] = held_wrench(sensor.gel, setup.hulls[setup.which[i]], starts.pose[i], force)
+        contact[i, 0] = True
+    return record._replace(wrench=jnp.asarray(wrench), contact=jnp.asarray(contact))
+
+
+def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory:
     """The results under the names of `Trajectory`."""
-    scenario, (ends, record) = setup.scenario, jax.tree.map(jnp.asarray, accepted.rolled)
+    scenario, ends = setup.scenario, jax.tree.map(jnp.asarray, accepted.rolled.ends)
+    gravity = gravity_at(accepted.starts.condition, setup.time[:, -1:], scenario=scenario)[:, :, 0]
+    record = jax.tree.map(jnp.asarray, _with_held(setup, sensor, accepted, -np.asarray(gravity[:, 0, 2])))
     outcome = jax.vmap(scenario.outcome)(record.pose[:, 0], record.pose[:, -1])
     check_outcomes(scenario, np.asarray(outcome))
     starts = accepted.starts
@@ -195,7 +221,7 @@ def _trajectory(setup: Setup, accepted: _Accepted) -> Trajectory:
         wrench=record.wrench,
         contact=record.contact,
         wall=record.wall,
-        gravity=gravity_at(starts.condition, setup.time[:, -1:], scenario=scenario)[:, :, 0],
+        gravity=gravity,
         settled=ends.gone | (ends.slow * scenario.contact.timestep >= SLOW_TIME),
         outcome=outcome,
         touches=ends.touches,
