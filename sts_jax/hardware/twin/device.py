@@ -60,6 +60,19 @@ class Twin:
     ```
     """
 
+    # Set at the boot
+    _epoch_s: float  # the camera's first exposure begins
+    _controller: EmulatedController
+    _lights: LightHistory
+    _sequence: int  # number of the last request of `set` and `ping`
+    _index: int  # the last frame of `capture`
+    _made: int  # number of frames
+    _last: Made | None
+    _due_s: float  # delivery of the last frame
+    _stalled_until_s: float
+    _phase: str | None  # seen by `operate`
+    _next_s: float  # next action of `operate`
+
     def __init__(
         self,
         scene: Scene,
@@ -125,7 +138,15 @@ class Twin:
             now = self.now_s
             seen, leds = self.scene.at(now), self._controller
             return State(
-                now, seen.phase, seen.trajectory, seen.frame, seen.pose, leds.levels, leds.counter, leds.boot, self._made
+                now,
+                seen.phase,
+                seen.trajectory,
+                seen.frame,
+                seen.pose,
+                leds.levels,
+                leds.counter,
+                leds.boot,
+                self._made,
             )
 
     def run_on(self, clock: Callable[[], float]) -> None:
@@ -226,12 +247,25 @@ class Twin:
             fault = self._waiting.take(*_FRAME_KINDS)
             self._made += 1
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
-        kind = None if fault is None else fault.kind
+        kind = None if fault is None or (fault.kind == "repeat" and self._last is None) else fault.kind
         if kind == "repeat" and self._last is not None:
             exposure = dataclasses.replace(self._last.exposure, index=index, due_s=self._due_s, fault=kind)
             made = Made(exposure, self._last.jpeg)
         else:
-            exposure = Exposure(index, start, end, self._due_s, *light, *seen, kind)
+            exposure = Exposure(
+                index,
+                start,
+                end,
+                self._due_s,
+                light.mean,
+                light.lowest,
+                light.highest,
+                seen.phase,
+                seen.trajectory,
+                seen.frame,
+                seen.pose,
+                kind,
+            )
             image = self.blender.frame(self.scene.ends(seen, self.blender), light.mean)
             if kind == "black":
                 image = np.zeros_like(image)
@@ -304,9 +338,9 @@ class Twin:
         self._sequence = 0
         self._index = -1
         self._made = 0
-        self._last: Made | None = None
+        self._last = None
         self._due_s = self._stalled_until_s = -math.inf
-        self._phase: str | None = None
+        self._phase = None
         self._next_s = math.inf
 
     def _next_sequence(self) -> int:

@@ -1,11 +1,12 @@
 """The twin's own log: the truth about each frame."""
 
+import contextlib
 import dataclasses
 import json
 import os
 import threading
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO, TextIO
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +41,14 @@ class Log:
             OSError: A file cannot be written.
         """
         self._lock = threading.Lock()
-        self._lines: TextIO | None = None if path is None else Path(path).open("w", buffering=1)
-        self._jpegs = None if record is None else Path(record).open("wb", buffering=0)
+        self._lines: TextIO | None = None
+        self._jpegs: BinaryIO | None = None
+        with contextlib.ExitStack() as files:
+            if path is not None:
+                self._lines = files.enter_context(Path(path).open("w", buffering=1))
+            if record is not None:
+                self._jpegs = files.enter_context(Path(record).open("wb", buffering=0))
+            self._files = files.pop_all()  # all are open
 
     def write(self, exposure: Exposure, jpeg: bytes) -> None:
         """Write one frame. Both files are complete up to this frame afterwards."""
@@ -54,9 +61,7 @@ class Log:
     def close(self) -> None:
         """Close the files."""
         with self._lock:
-            for file in (self._lines, self._jpegs):
-                if file is not None:
-                    file.close()
+            self._files.close()
             self._lines = self._jpegs = None
 
 

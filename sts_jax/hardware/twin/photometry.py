@@ -55,14 +55,13 @@ class Ends(NamedTuple):
 
 
 class Blender:
-    """Makes frames of the two ends of a scene. It is not thread-safe.
+    """Makes frames of the two ends of a scene.
 
-    `ends` takes the time of a few frames and is called once for each pose. `frame` is called for each frame.
+    `ends` takes the time of a few frames and is called once for each pose. `frame` is called for each frame, by one
+    thread at a time.
     """
 
-    def __init__(
-        self, imperfections: Imperfections, *, exposure: float = 1.0, maps: Maps | None = None, seed: int = 0
-    ):
+    def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, maps: Maps | None = None, seed: int = 0):
         """Prepare the tables.
 
         Args:

@@ -7,6 +7,7 @@ import threading
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sts_jax import physics
@@ -43,7 +44,9 @@ class Seen(NamedTuple):
 
 
 class Scene(abc.ABC):
-    """The contents of the twin's view. `Twin` calls all methods with one lock held, except `prepare`."""
+    """The contents of the twin's view. `Twin` calls `at` and `command` one at a time."""
+
+    exposure: float = 1.0  # of the visual stream over that of the tactile one, `Room.exposure`
 
     @abc.abstractmethod
     def at(self, time_s: float) -> Seen:
@@ -53,7 +56,7 @@ class Scene(abc.ABC):
     def ends(self, seen: Seen, blender: Blender) -> Ends:
         """The two ends of the light of a moment. Takes the time of a rendering unless `prepare` was called."""
 
-    def prepare(self, command: str, blender: Blender) -> None:
+    def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
         """Do the work that a command needs, so that no later call of `ends` takes long. Threads may call it."""
 
     def command(self, command: str, time_s: float) -> None:
@@ -64,10 +67,10 @@ class Scene(abc.ABC):
         """
         raise ValueError(f"command {command!r} is not possible: this scene does not change")
 
-    def start(self, blender: Blender) -> None:
+    def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
         """Begin to work ahead in a thread. The virtual clock does not need it."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027, few scenes need it
         """End the thread."""
 
 
@@ -101,16 +104,16 @@ class _Motion(NamedTuple):
     rest: int  # first frame from which on the object is still
     outcome: str
 
-    def index(self, elapsed_s: float, motion_rate: float) -> int:
+    def drawn(self, elapsed_s: float, motion_rate: float) -> int:
         """The pose that is drawn at a time since the release (s): the last one of the motion's rate."""
-        drawn = round(int(elapsed_s * motion_rate) * self.rate / motion_rate)
-        return drawn if elapsed_s * self.rate < self.rest and drawn < self.rest else len(self.pose) - 1
+        frame = round(int(elapsed_s * motion_rate) * self.rate / motion_rate)
+        return frame if elapsed_s * self.rate < self.rest and frame < self.rest else len(self.pose) - 1
 
     def indices(self, motion_rate: float) -> list[int]:
         """All poses that are drawn, the first one and the one at rest before the others."""
         steps = int(self.rest / self.rate * motion_rate) + 1
-        drawn = [self.index(step / motion_rate, motion_rate) for step in range(steps)]
-        return list(dict.fromkeys([0, len(self.pose) - 1, *drawn]))
+        moving = [self.drawn(step / motion_rate, motion_rate) for step in range(steps)]
+        return list(dict.fromkeys([0, len(self.pose) - 1, *moving]))
 
 
 class ObjectScene(Scene):
@@ -146,6 +149,7 @@ class ObjectScene(Scene):
         if not 0 < motion_rate < float("inf"):
             raise ValueError(f"motion_rate must be positive and finite, got {motion_rate}")
         self.sensor = Sensor() if sensor is None else sensor
+        self.exposure = float(self.sensor.room.exposure)
         self._body = body
         self._scenario = physics.Released() if scenario is None else scenario
         self._scenario.check()
@@ -177,7 +181,7 @@ class ObjectScene(Scene):
             return Seen(phase, number, 0, None)
         motion, frame = self._motion(number), 0
         if phase is Phase.MOVING:
-            frame = motion.index(time_s - since_s, self._motion_rate)
+            frame = motion.drawn(time_s - since_s, self._motion_rate)
             phase = Phase.STILL if frame == len(motion.pose) - 1 else Phase.MOVING
         return Seen(phase, number, frame, tuple(float(value) for value in motion.pose[frame]))
 
@@ -251,6 +255,8 @@ class ObjectScene(Scene):
                     self._render(trajectory, frame, blender)
 
     def _motion(self, number: int) -> _Motion:
+        if number < len(self._motions):  # without waiting for a rendering
+            return self._motions[number]
         with self._working:
             attempts = 0
             while len(self._motions) <= number:
@@ -287,7 +293,7 @@ class ObjectScene(Scene):
         with self._working:
             if (ends := self._rendered.get((trajectory, frame))) is not None:
                 return ends
-            images = sense(self.sensor, self._body, pose, wrench, resolution=self._resolution)
+            images = sense(self.sensor, self._body, jnp.asarray(pose), jnp.asarray(wrench), resolution=self._resolution)
             ends = blender.ends(np.asarray(images.visual), np.asarray(images.tactile))
             self._rendered[trajectory, frame] = ends
             return ends

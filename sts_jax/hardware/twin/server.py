@@ -110,7 +110,7 @@ class Served:
         if fault.kind in _FRAME_FAULTS:
             self._twin.inject(fault)
         elif fault.kind == "drop":
-            self._camera.drops += 1
+            self._web.drop()
         else:
             self._leds.inject(fault)
 

@@ -1,8 +1,10 @@
 """The twin's camera as motion JPEG over HTTP, and its commands."""
 
+import contextlib
 import dataclasses
 import http.server
 import json
+import socket
 import threading
 import time
 import urllib.parse
@@ -16,7 +18,7 @@ CAMERA = "/camera"
 COMMANDS = ("hold", "release", "clear")
 _BOUNDARY = "frame"
 _WAIT_S = 0.1  # s, period in which threads see that they must end
-_SEND_S = 2.0  # s, longest wait for a client that takes no bytes
+_SEND_S = 10.0  # s, longest wait for a client that takes no bytes
 _BUFFER = 1 << 16  # bytes of the connection's send buffer. A larger one makes frames of a slow client older
 _KEPT = 32  # frames between exposure and delivery
 
@@ -31,7 +33,6 @@ class CameraThread:
         self._changed = threading.Condition()
         self._clients = 0
         self._stop = threading.Event()
-        self.drops = 0  # number of times that all connections were dropped
         self._thread = threading.Thread(target=self._run, name="twin's camera", daemon=True)
         self._thread.start()
 
@@ -102,7 +103,19 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.twin = twin
         self.camera = camera
         self.inject = inject
+        self.streams: set[socket.socket] = set()  # connections that receive frames
         super().__init__(address, _Handler)
+
+    def drop(self) -> None:
+        """Close the connections that receive frames."""
+        for connection in list(self.streams):
+            with contextlib.suppress(OSError):  # it is closed already
+                connection.shutdown(socket.SHUT_RDWR)
+
+    def server_close(self) -> None:
+        """Close the server and all connections, and wait for their threads."""
+        self.drop()
+        super().server_close()
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -153,14 +166,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _stream(self) -> None:
         """Send frames when they are due. A client that takes them too slowly misses some."""
         camera, twin = self.server.camera, self.server.twin
-        drops, index = camera.drops, -1
+        index = -1
         self.send_response(200)
         self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
         camera.join()
+        self.server.streams.add(self.connection)
         try:
-            while not camera.stopped and camera.drops == drops:
+            while not camera.stopped:
                 made = camera.following(index)
                 if made is None:
                     continue
@@ -171,13 +185,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         except OSError:
             pass  # the client has gone
         finally:
+            self.server.streams.discard(self.connection)
             camera.leave()
             self.close_connection = True
 
     def setup(self) -> None:
         """Limit the send buffer."""
-        import socket
-
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         super().setup()
 
