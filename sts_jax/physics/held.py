@@ -1,74 +1,52 @@
 """The wrench of the pad on an object that a hand holds against it."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation
+from jaxtyping import Array, Float
 
-from sts_jax import tactile
-from sts_jax.physics.contact import Hull
+from sts_jax import geometry, tactile
+from sts_jax.objects.body import Body
+from sts_jax.rendering.equilibrium import underside
 
-NEAR = 1e-6  # m, a vertex nearer to the plane of a face belongs to the face
-STEEPEST = 1e-9  # smallest slope of a face, so that upright faces have a height over each cell
+DEEPEST = 0.98  # share of the gel's largest depth to which a hand presses an object at most
 HALVINGS = 50  # of the interval in which the depth lies
 
 
-def held_wrench(gel: tactile.Gel, hull: Hull, pose: Float[np.ndarray, "7"], force: float) -> Float[np.ndarray, "6"]:
-    """The wrench of the pad on an object that is held in its attitude and pressed into the gel with a force.
+def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], force: float) -> Float[np.ndarray, "6"]:
+    """The wrench of the pad on an object that is held in its attitude and pressed into the gel.
 
     The hand balances all moments, so the object sinks without tilting until the gel's springs carry the force. Their
-    pressure `p = k max(0, d - h)` on the gel's grid gives the centre of pressure. The wrench depends on the pose and
-    the force only, not on the motion after the release.
+    pressure `p = k max(0, d - h)` on the gel's grid determines the centre of pressure, and `sense` finds the same
+    balance. A sharp corner would sink deeper than the gel allows. The hand then carries more, so that the depth stays
+    below the limit. The wrench depends on the body, the pose and the force only, not on the motion after the release.
 
     Args:
         gel: its springs and its grid.
-        hull: convex parts of the object.
+        body: the object.
         pose: mesh frame in the sensor frame. Its height has no effect.
-        force: N, normal force of the pad.
+        force: N, normal force that the pad is to exert.
 
     Returns:
-        Force (N) and moment about the sensor's origin (N m), without friction. The moment is that of a force at the
-        lowest point of the object if this point touches no cell of the grid.
+        Force (N) and moment about the sensor's origin (N m), without friction. 0 for an object beside the pad.
     """
-    x, y, heights, lowest = _underside(gel, hull, np.asarray(pose, np.float64))
-    limit = float(gel.max_depth)
-    load = force / (float(gel.stiffness) * float(tactile.cell_area(gel)))
-    heights = np.where(heights < limit, heights, np.inf)
-    low, high = 0.0, limit
+    x, y = (np.asarray(part, np.float64) for part in tactile.cell_centres(gel))
+    heights = np.asarray(_heights(gel, body.vertices, body.faces, body.two_sided, jnp.asarray(pose)), np.float64)
+    if not np.isfinite(heights).any():
+        return np.zeros(6)
+    heights = heights - heights.min()
+    stiffness = float(gel.stiffness) * float(tactile.cell_area(gel))  # N/m of one cell
+    low, high = 0.0, DEEPEST * float(gel.max_depth)
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if np.sum(np.maximum(middle - heights, 0)) < load else (low, middle)
-    pressed = np.maximum(high - heights, 0)
-    total = np.sum(pressed)
-    centre = np.array([np.sum(pressed * x), np.sum(pressed * y)]) / total if total > 0 else lowest
-    return np.array([0.0, 0.0, force, centre[1] * force, -centre[0] * force, 0.0])
+        low, high = (middle, high) if stiffness * np.sum(np.maximum(middle - heights, 0)) < force else (low, middle)
+    push = stiffness * np.maximum(high - heights, 0)
+    return np.array([0.0, 0.0, np.sum(push), np.sum(push * y), -np.sum(push * x), 0.0])
 
 
-def _underside(
-    gel: tactile.Gel, hull: Hull, pose: Float[np.ndarray, "7"]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Cells of the gel's grid (m), heights of the hull over its lowest point there, and the place of this point.
-
-    Heights beyond the gel's largest depth may be too large, because only faces with a lower vertex are considered.
-    """
-    turn = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix()
-    points = np.einsum("ij,jph->iph", turn, np.asarray(hull.vertices, np.float64)) + pose[:3, None, None]
-    normals = np.einsum("ij,jpf->ipf", turn, np.asarray(hull.planes[:3], np.float64))
-    offsets = np.asarray(hull.planes[3], np.float64) + np.einsum("i,ipf->pf", pose[:3], normals)
-    bottom = points[2].min()
-    lowest = points.reshape(3, -1)[:2, points[2].argmin()]
-    x, y = (np.asarray(part, np.float64) for part in tactile.cell_centres(gel))
-    heights = np.full(x.shape, np.inf)
-    for part in range(points.shape[1]):
-        own, normal, offset = points[:, part], normals[:, part], offsets[part]
-        deep = own[:, own[2] < bottom + float(gel.max_depth)]
-        if not deep.size:
-            continue
-        faces = np.any(np.abs(normal.T @ deep - offset[:, None]) < NEAR, axis=1)
-        (nx, ny, nz), offset = normal[:, faces, None, None], offset[faces, None, None]
-        downward = nz < STEEPEST
-        slope = np.where(downward, np.minimum(nz, -STEEPEST), np.maximum(nz, STEEPEST))
-        height = (offset - nx * x - ny * y) / slope
-        under = np.max(height, axis=0, initial=-np.inf, where=downward)
-        over = np.min(height, axis=0, initial=np.inf, where=~downward)
-        heights = np.minimum(heights, np.where((under <= over) & np.isfinite(under), under, np.inf))
-    return x, y, heights - bottom, lowest
+@jax.jit
+def _heights(
+    gel: tactile.Gel, vertices: Array, faces: Array, two_sided: Array, pose: Float[Array, "7"]
+) -> Float[Array, "r c"]:
+    """Heights of the object's underside over the gel's grid (m), `inf` where there is none within the gel's reach."""
+    return underside(gel, faces, two_sided, geometry.transform(pose, vertices), jnp.bool_(True))[0]

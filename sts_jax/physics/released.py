@@ -26,7 +26,8 @@ from sts_jax.physics.scenario import (
 )
 from sts_jax.physics.scene import Contact
 
-SMALLEST = math.radians(3)  # rad, smallest lean from the face, so that a held object never lies flat
+SMALLEST = math.radians(6)  # rad, smallest lean from the face, so that a held object never seems to lie on it
+FLAT = math.radians(15)  # rad, an object that balances at a smaller lean lies on one of several facets
 CLEARANCE = 0.002  # m, smallest distance of the points that touch from the edge of the pad
 
 
@@ -52,8 +53,9 @@ class Released(Scenario):
     beyond: tuple[float, float] = (math.radians(-9), math.radians(9))
     skew: float = math.radians(4)  # rad, largest angle in the pad's plane between the axis of the lean and the edge
     carried: tuple[float, float] = (0.3, 0.9)  # share of the weight that the pad carries until the release
-    spread: float = 0.02  # m, radius of the disc about the pad's centre, where the object lies on average
-    # candidate faces and edges, of which the first one that balances at less than 45 degrees is taken
+    spread: float = 0.015  # m, radius of the disc about the pad's centre, where the object lies on average
+    # Candidate faces and edges. The suitable one with the lowest centre of mass in balance is taken, so that few
+    # objects tumble off the pad.
     tries: int = 16
     rate: float = 31.25  # frames/s
     frames: int = 60
@@ -61,7 +63,8 @@ class Released(Scenario):
     shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
     friction: tuple[float, float] = (0.5, 0.6)
     tilt: float = math.pi  # rad, as in `Freefall`
-    contact: Contact = dataclasses.field(default_factory=Contact)
+    # A gel brakes rolling objects. More rolling friction would let an object stand on its edge.
+    contact: Contact = dataclasses.field(default_factory=lambda: Contact(rolling=0.0005))
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -88,12 +91,14 @@ class Released(Scenario):
         """Draw one held pose over the pad and the share of the weight on the pad, as `Scenario.start` describes.
 
         Toppling and returning differ by the angle that the object turns, see `outcome`. Starts therefore lean from the
-        narrower one of the two faces at an edge, on which the object balances at less than 45 degrees.
+        narrower one of the two faces at an edge, on which the object balances at 15 to 45 degrees. An object without
+        such a face, such as a cylinder on its side, leans from another one.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
         edges = jax.lax.map(lambda own: _random_edge(own, shape), keys)  # one by one, to save memory
-        chosen = jnp.argmin(jnp.where(edges.balance < TURNED, edges.height, edges.height + 1.0))
+        suitable = (edges.balance > FLAT) & (edges.balance < TURNED)
+        chosen = jnp.argmin(jnp.where(suitable, edges.height, edges.height + 1.0))  # no object is 1 m high
         edge = jax.tree.map(lambda x: x[chosen], edges)
 
         past = jax.random.uniform(beyond, minval=self.beyond[0], maxval=self.beyond[1])

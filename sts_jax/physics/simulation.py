@@ -201,7 +201,7 @@ def _with_held(setup: Setup, sensor: Sensor, accepted: _Accepted, down: Float[np
     mass = rigids(setup.bodies, setup.which, accepted.hidden).mass
     for i in held.tolist():
         force = float(starts.carried[i] * mass[i] * down[i])
-        wrench[i, 0] = held_wrench(sensor.gel, setup.hulls[setup.which[i]], starts.pose[i], force)
+        wrench[i, 0] = held_wrench(sensor.gel, setup.bodies[setup.which[i]], starts.pose[i], force)
         contact[i, 0] = True
     return record._replace(wrench=jnp.asarray(wrench), contact=jnp.asarray(contact))
 

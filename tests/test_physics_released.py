@@ -1,0 +1,297 @@
+"""`Released`: held poses touch the pad, the balance decides on which side objects fall, and no future in the wrench."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+import sts_jax as sts
+from sts_jax import objects, physics
+from sts_jax.physics import held, scene
+from sts_jax.physics.scenario import STANDING, G
+
+PAD = (0.15, 0.15)
+NUM = 20
+SCENARIO = physics.Released()
+HALF = np.array([0.02, 0.012, 0.03])  # m, half the size of the block
+
+
+def block() -> objects.Body:
+    """A solid block, 40 x 24 x 60 mm, without contents. The visible mesh is the block too."""
+    body = objects.make(jax.random.key(0), "fork")
+    corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * HALF
+    faces = ConvexHull(corners)
+    outward = [
+        f if np.cross(*(corners[f[1:]] - corners[f[0]])) @ e[:3] > 0 else f[::-1]
+        for f, e in zip(faces.simplices, faces.equations, strict=True)
+    ]
+    x, y, z = (2 * HALF) ** 2
+    mass = 0.12
+    return dataclasses.replace(
+        body,
+        vertices=jnp.asarray(np.resize(corners, body.vertices.shape), jnp.float32),
+        faces=jnp.asarray(np.resize(np.array(outward), body.faces.shape), body.faces.dtype),
+        hulls=jnp.asarray(np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None], jnp.float32),
+        shell_mass=jnp.float32(mass),
+        shell_com=jnp.zeros(3),
+        shell_inertia=jnp.asarray(mass / 12 * np.diag([y + z, x + z, x + y]), jnp.float32),
+    )
+
+
+@pytest.fixture(scope="module")
+def bodies() -> list[objects.Body]:
+    return [*(objects.make(jax.random.key(i), "camera") for i in (0, 3)), block()]
+
+
+@pytest.fixture(scope="module")
+def let_go(bodies: list[objects.Body]) -> physics.Trajectory:
+    found = physics.simulate(jax.random.key(1), bodies, sts.Sensor(), SCENARIO, NUM, engine="mujoco")
+    return jax.tree.map(np.asarray, found)
+
+
+def rigid(bodies: list[objects.Body], traj: physics.Trajectory, row: int) -> tuple[float, np.ndarray, np.ndarray]:
+    hidden = jax.tree.map(lambda x: jnp.asarray(x[row]), traj.hidden)
+    mass, com, inertia = objects.rigid(bodies[traj.body[row]], hidden.fill, hidden.shell_scale, hidden.up)
+    return float(mass), np.asarray(com, np.float64), np.asarray(inertia, np.float64)
+
+
+def placed(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return Rotation.from_quat(pose[3:], scalar_first=True).apply(points) + pose[:3]
+
+
+def corners(bodies: list[objects.Body], traj: physics.Trajectory, row: int, frame: int = 0) -> np.ndarray:
+    points = np.asarray(bodies[traj.body[row]].hulls, np.float64).reshape(-1, 3)
+    return placed(np.asarray(traj.pose[row, frame], np.float64), points)
+
+
+def test_a_held_object_is_at_rest_and_touches_the_pad_with_an_edge_or_a_corner(
+    bodies: list[objects.Body], let_go: physics.Trajectory
+) -> None:
+    np.testing.assert_array_equal(let_go.velocity[:, 0], 0)
+    assert let_go.contact[:, 0].all()
+    assert not let_go.wall.any()
+    for row in range(len(let_go.pose)):
+        points = corners(bodies, let_go, row)
+        assert points[:, 2].min() == pytest.approx(-STANDING, abs=1e-7)
+        touching = points[points[:, 2] < points[:, 2].min() + 1e-4, :2]
+        assert np.abs(touching).max() < PAD[0] / 2
+        assert np.linalg.matrix_rank(touching - touching[0], tol=1e-3) <= 1  # no face lies on the pad
+
+
+def test_the_held_wrench_carries_a_share_of_the_weight_within_the_contact(
+    bodies: list[objects.Body], let_go: physics.Trajectory
+) -> None:
+    deepest = float(sts.Sensor().gel.max_depth)
+    for row in range(len(let_go.pose)):
+        force, moment = let_go.wrench[row, 0, :3], let_go.wrench[row, 0, 3:]
+        assert 0 < force[2] <= 1.001 * SCENARIO.carried[1] * G * rigid(bodies, let_go, row)[0]
+        np.testing.assert_array_equal([*force[:2], moment[2]], 0)
+        centre = np.array([-moment[1], moment[0]]) / force[2]
+        points = corners(bodies, let_go, row)
+        low = points[points[:, 2] < 2 * deepest]
+        reach = 2 * deepest / np.tan(np.radians(3))  # of the part that is pressed into the gel beside the contact
+        assert np.linalg.norm(low[:, :2] - centre, axis=1).min() < max(reach, np.ptp(low[:, :2], axis=0).max())
+        lowest, highest = low[:, :2].min(0) - 0.02, low[:, :2].max(0) + 0.02
+        assert np.all((centre > lowest) & (centre < highest))
+
+
+def test_sense_draws_the_held_pose_without_tilting_it(bodies: list[objects.Body], let_go: physics.Trajectory) -> None:
+    sensor = sts.Sensor()
+    for row in range(0, len(let_go.pose), 7):
+        frame = sts.sense(sensor, bodies[let_go.body[row]], let_go.pose[row, 0], let_go.wrench[row, 0])
+        assert frame.balanced
+        turned = 2 * np.arccos(min(1, abs(np.dot(np.asarray(frame.pose[3:], np.float64), let_go.pose[row, 0, 3:]))))
+        assert turned < np.radians(0.3)
+        assert float(jnp.max(frame.pressure)) <= float(sensor.gel.stiffness * sensor.gel.max_depth)
+
+
+@pytest.mark.parametrize("force", [0.05, 0.4])
+def test_an_edge_pressed_into_the_gel_sinks_as_a_wedge(force: float) -> None:
+    lean = np.radians(20)
+    body, gel = block(), dataclasses.replace(sts.Sensor().gel, cells=(600, 600))
+    turn = Rotation.from_rotvec([0, lean, 0])
+    pose = np.array([0.004, -0.003, 0, *turn.as_quat(scalar_first=True)])
+    wrench = held.held_wrench(gel, body, pose, force)
+    # A wedge of width w sinks by d: F = k w d^2 (cot a + tan a) / 2, with the centre of pressure (cot a - tan a) d / 3
+    # from the edge, on the side of the flatter face.
+    width, flat, steep = 2 * HALF[1], 1 / np.tan(lean), np.tan(lean)
+    depth = np.sqrt(2 * force / (float(gel.stiffness) * width * (flat + steep)))
+    points = placed(pose, np.asarray(body.hulls, np.float64).reshape(-1, 3))
+    edge = points[points[:, 2] < points[:, 2].min() + 1e-6]
+    np.testing.assert_allclose(wrench[2], force, rtol=1e-6)
+    np.testing.assert_allclose(-wrench[4] / force, edge[0, 0] - (flat - steep) * depth / 3, atol=5e-5)
+    np.testing.assert_allclose(wrench[3] / force, -0.003, atol=5e-5)
+
+
+def test_a_corner_is_pressed_no_deeper_than_the_gel_allows() -> None:
+    body, gel = block(), sts.Sensor().gel
+    pose = np.array([0, 0, 0, *Rotation.from_euler("xy", [0.6, 0.6]).as_quat(scalar_first=True)])
+    light, heavy = held.held_wrench(gel, body, pose, 0.01), held.held_wrench(gel, body, pose, 50.0)
+    assert light[2] == pytest.approx(0.01, rel=1e-6)
+    assert 0.01 < heavy[2] < 5
+    assert sts.sense(sts.Sensor(), body, jnp.asarray(pose), jnp.asarray(heavy)).balanced
+    beside = np.array([0.5, 0, 0, *pose[3:]])
+    np.testing.assert_array_equal(held.held_wrench(gel, body, beside, 1.0), 0)
+
+
+def test_the_balance_of_the_centre_of_mass_decides_on_which_side_an_object_falls(
+    bodies: list[objects.Body], let_go: physics.Trajectory
+) -> None:
+    agree, judged = [], 0
+    for row in range(len(let_go.pose)):
+        first = np.asarray(let_go.pose[row, 0], np.float64)
+        points, centre = corners(bodies, let_go, row), placed(first, rigid(bodies, let_go, row)[1])
+        edge = points[points[:, 2] < points[:, 2].min() + 5e-3, :2].mean(0)  # both ends of a skewed edge
+        ahead = centre[:2] - edge
+        if np.linalg.norm(ahead) < 4e-3:  # nearly balanced
+            continue
+        judged += 1
+        early = placed(np.asarray(let_go.pose[row, 4], np.float64), rigid(bodies, let_go, row)[1])  # after 0.13 s
+        agree.append((early[:2] - centre[:2]) @ ahead > 0)
+    assert judged >= len(let_go.pose) / 4
+    assert np.mean(agree) > 0.85
+
+
+def test_a_block_beyond_its_balance_topples_and_one_short_of_it_returns() -> None:
+    shares = []
+    for beyond in (-np.radians(6), np.radians(6)):
+        scenario = dataclasses.replace(SCENARIO, beyond=(beyond, beyond), skew=0.0)
+        traj = physics.simulate(jax.random.key(2), block(), sts.Sensor(), scenario, 16, engine="mujoco")
+        turned = np.abs(np.asarray(jax.vmap(upward)(traj.pose[:, 0]) * jax.vmap(upward)(traj.pose[:, -1])).sum(1))
+        on_pad = np.asarray(traj.outcome != physics.Outcome.FELL_OFF)
+        assert on_pad.mean() > 0.6
+        shares.append(np.mean(np.asarray(traj.outcome)[on_pad] == physics.Outcome.TOPPLES))
+        # On a face it has turned by the lean or by the rest of a quarter turn, which the sizes of the block determine.
+        assert turned[on_pad].max() < 0.99
+    assert shares[0] == 0
+    assert shares[1] > 0.8
+
+
+def upward(pose: jax.Array) -> jax.Array:
+    """The upward direction in the mesh frame."""
+    return sts.geometry.quat_to_matrix(pose[3:])[2]
+
+
+def test_no_outcome_is_rare_and_most_objects_stay_on_the_pad(let_go: physics.Trajectory) -> None:
+    share = {outcome: np.mean(let_go.outcome == outcome) for outcome in SCENARIO.outcomes}
+    assert share[physics.Outcome.TOPPLES] > 0.1
+    assert share[physics.Outcome.RETURNS] > 0.2
+    assert share[physics.Outcome.FELL_OFF] < 0.35
+    assert let_go.settled.mean() > 0.9
+
+
+def test_the_first_frame_is_independent_of_everything_after_the_release(
+    bodies: list[objects.Body], let_go: physics.Trajectory
+) -> None:
+    # Neither friction nor the contact's constants nor the number of frames change the first frame.
+    slippery = let_go.hidden._replace(friction=np.full_like(let_go.hidden.friction, 0.1))
+    other = dataclasses.replace(SCENARIO, frames=4, contact=physics.Contact(rolling=0.002))
+    found = physics.simulate(
+        jax.random.key(1),
+        bodies,
+        sts.Sensor(),
+        other,
+        NUM,
+        hidden=jax.tree.map(jnp.asarray, slippery),
+        engine="mujoco",
+    )
+    for name in ("pose", "velocity", "wrench", "contact"):
+        np.testing.assert_array_equal(getattr(found, name)[:, 0], getattr(let_go, name)[:, 0])
+    assert np.abs(np.asarray(found.pose)[:, 3] - let_go.pose[:, 3]).max() > 1e-3
+
+
+def test_the_energy_never_rises(bodies: list[objects.Body], let_go: physics.Trajectory) -> None:
+    for row in range(len(let_go.pose)):
+        mass, com, inertia = rigid(bodies, let_go, row)
+        energy = []
+        for pose, velocity in zip(let_go.pose[row].astype(float), let_go.velocity[row].astype(float), strict=True):
+            turn = Rotation.from_quat(pose[3:], scalar_first=True)
+            centre = turn.apply(com)
+            speed = velocity[:3] + np.cross(velocity[3:], centre)
+            spin = turn.apply(velocity[3:], inverse=True)
+            energy.append(mass * (speed @ speed / 2 + G * (pose[2] + centre[2])) + spin @ inertia @ spin / 2)
+        assert max(energy) < energy[0] + 0.02 * mass * G * 0.03  # 2 % of a fall of 30 mm
+
+
+def test_objects_fall_as_in_c_mujoco(bodies: list[objects.Body], let_go: physics.Trajectory) -> None:
+    # A plain loop of MuJoCo, which finds the contacts of the mesh itself, until rounding decides.
+    for row in range(0, len(let_go.pose), 6):
+        model = scene.compile_scene(np.asarray(bodies[let_go.body[row]].hulls), PAD, SCENARIO.contact)
+        data = mujoco.MjData(model)
+        scene.set_rigid(model, data, *rigid(bodies, let_go, row), float(let_go.hidden.friction[row]))
+        data.qpos[:] = let_go.pose[row, 0]
+        mujoco.mj_step(model, data, nstep=3 * SCENARIO.steps)
+        np.testing.assert_allclose(let_go.pose[row, 3, :3], data.qpos[:3], atol=1e-3)
+
+
+@pytest.mark.slow
+def test_both_engines_agree(bodies: list[objects.Body], let_go: physics.Trajectory) -> None:
+    found = physics.simulate(jax.random.key(1), bodies, sts.Sensor(), SCENARIO, NUM, chunk=20, engine="mjx")
+    for name in ("pose", "wrench", "velocity", "contact"):
+        np.testing.assert_array_equal(getattr(found, name)[:, 0], getattr(let_go, name)[:, 0])
+    early = np.linalg.norm(np.asarray(found.pose)[:, 3, :3] - let_go.pose[:, 3, :3], axis=1)
+    assert np.quantile(early, 0.8) < 3e-4
+    for outcome in SCENARIO.outcomes:
+        assert np.mean(np.asarray(found.outcome) == outcome) == pytest.approx(
+            np.mean(let_go.outcome == outcome), abs=0.12
+        )
+
+
+def test_starts_are_those_of_the_key_under_jit_and_vmap(bodies: list[objects.Body]) -> None:
+    points = np.asarray(bodies[2].hulls, np.float64).reshape(-1, 3)
+    shape = physics.Shape(*map(jnp.asarray, (points, *objects.rest_poses(points, np.zeros(3)), np.zeros((16, 3)))))
+    keys = jax.random.split(jax.random.key(4), 3)
+    together = jax.jit(jax.vmap(lambda key: SCENARIO.start(key, shape, PAD)))(keys)
+    for i, key in enumerate(keys):
+        alone = SCENARIO.start(key, shape, PAD)
+        np.testing.assert_allclose(alone.pose, together.pose[i], atol=1e-5)
+        np.testing.assert_allclose(alone.carried, together.carried[i], rtol=1e-6)
+        up = np.abs(np.asarray(upward(alone.pose)))
+        assert up.max() < np.cos(np.radians(5))  # it leans
+
+
+def test_outcomes_follow_from_the_poses() -> None:
+    first = jnp.array([0.01, 0, 0.05, *Rotation.from_euler("x", 0.4).as_quat(scalar_first=True)])
+    cases = {
+        physics.Outcome.RETURNS: Rotation.identity(),
+        physics.Outcome.TOPPLES: Rotation.from_euler("x", np.pi / 2),
+    }
+    for outcome, turn in cases.items():
+        for yaw in (0.0, 2.0):
+            quat = jnp.asarray((Rotation.from_euler("z", yaw) * turn).as_quat(scalar_first=True))
+            last = jnp.concatenate([jnp.array([0.03, 0.01, 0.02]), quat])
+            assert int(SCENARIO.outcome(first, last)) == outcome
+            assert int(SCENARIO.outcome(first, last.at[2].set(-0.05))) == physics.Outcome.FELL_OFF
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"beyond": (0.1, -0.1)},
+        {"beyond": (-10.0, 10.0)},
+        {"beyond": (float("nan"), 0.1)},
+        {"skew": -0.1},
+        {"skew": 5.0},
+        {"carried": (0.0, 0.5)},
+        {"carried": (0.5, 1.5)},
+        {"spread": -0.01},
+        {"tries": 0},
+        {"tries": 2.5},
+        {"friction": (0.0, 0.5)},
+    ],
+)
+def test_errors_name_bad_fields(change: dict) -> None:
+    with pytest.raises(ValueError, match=f"scenario.{next(iter(change))}"):
+        dataclasses.replace(SCENARIO, **change).check()
+
+
+def test_variants_of_the_hidden_values_exist() -> None:
+    off = physics.variant(SCENARIO, "off")
+    assert off.tilt == 0
+    assert off.fill == (0.4, 0.4)
+    assert physics.variant(SCENARIO, "wide-friction").friction == (0.3, 0.9)
