@@ -1,0 +1,445 @@
+"""The fisheye lens of a real sensor, and its image as the pinhole view of the simulated one.
+
+Pixel coordinates are (column, row), whole numbers at pixel centres. An image from the camera is called raw, and one
+that shows the view of the sensor's pinhole is called rectified. A raw and a rectified pixel correspond if their rays
+meet the gel's outer face (z = 0 in the sensor frame) in the same point.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from typing import Protocol, SupportsFloat, runtime_checkable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_ANGLE = math.pi  # rad, a ray at this angle points backwards along the optical axis
+_MARGIN = 16  # pixels beyond the image's border at which coordinates are clipped
+_BAND = 256  # rows of a map that are computed at once
+_GRAZING = 1e-6  # smallest cosine of the angle between a ray and the pad's normal at which they meet
+_TABLE = 2048  # angles of the table from which the inversion starts
+
+
+@runtime_checkable
+class Pinhole(Protocol):
+    """The view of a sensor. `sts_jax.Sensor().camera` is one."""
+
+    @property
+    def distance(self) -> SupportsFloat:
+        """Distance from the pinhole to the gel's outer face (m)."""
+
+    @property
+    def fov(self) -> SupportsFloat:
+        """Vertical field of view (rad)."""
+
+    @property
+    def aspect(self) -> SupportsFloat:
+        """Width / height of the view."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    r"""A fisheye camera of the Kannala-Brandt model (OpenCV's `cv2.fisheye`) and its place in the sensor.
+
+    A point p of the sensor frame is at q = R p + t in the camera frame, where R is the matrix of `rotation` and t is
+    `translation`. With the angle a between q and the optical axis, the point is seen at
+
+        (fx d q_x / r + cx, fy d q_y / r + cy),   r = sqrt(q_x^2 + q_y^2),
+        d = a + k_1 a^3 + k_2 a^5 + k_3 a^7 + k_4 a^9.
+
+    Raises:
+        ValueError: a value is out of range, or the camera does not look at the pad from inside the sensor.
+    """
+
+    width: int  # pixels
+    height: int  # pixels
+    fx: float  # pixels per radian at the centre
+    fy: float  # pixels per radian at the centre
+    cx: float  # pixels, column of the optical axis
+    cy: float  # pixels, row of the optical axis
+    k: tuple[float, float, float, float]
+    rotation: tuple[float, float, float]  # rad, rotation vector from the sensor frame to the camera frame
+    translation: tuple[float, float, float]  # m, centre of the gel's outer face in the camera frame
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"{name} must be a whole number >= 1, got {value!r}")
+        for name in ("fx", "fy", "cx", "cy"):
+            value = getattr(self, name)
+            if not _is_number(value):
+                raise ValueError(f"{name} must be a finite number, got {value!r}")
+        for name, length in (("k", 4), ("rotation", 3), ("translation", 3)):
+            value = getattr(self, name)
+            if not isinstance(value, tuple) or len(value) != length or not all(map(_is_number, value)):
+                raise ValueError(f"{name} must be a tuple of {length} finite numbers, got {value!r}")
+        for name in ("fx", "fy"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
+        if self.translation[2] <= 0:
+            raise ValueError(
+                f"translation must have a third number > 0, so that the pad is in front of the camera, got "
+                f"{self.translation}"
+            )
+        if self.center[2] >= 0:
+            raise ValueError(
+                f"rotation {self.rotation} and translation {self.translation} place the camera at "
+                f"{tuple(round(float(c), 4) for c in self.center)} in the sensor frame, but it must lie inside the "
+                "sensor, at z < 0"
+            )
+
+    @classmethod
+    def ideal(
+        cls,
+        width: int,
+        height: int,
+        *,
+        field_of_view: float = math.radians(160),
+        distance: float = 0.1,
+    ) -> "Lens":
+        """A lens without error under the pad's centre: the distance to the image's centre is proportional to the angle.
+
+        Args:
+            width: width of the raw image (pixels).
+            height: height of the raw image (pixels).
+            field_of_view: angle across the image's diagonal (rad). The paper's device: 160 degrees.
+            distance: distance to the gel's outer face (m). Paper's code: 0.1.
+        """
+        if not 0 < field_of_view <= 2 * MOST_ANGLE:
+            raise ValueError(f"field_of_view must be in (0, 2 pi] rad, got {field_of_view}")
+        focal = math.hypot(width, height) / field_of_view
+        return cls(
+            width=width,
+            height=height,
+            fx=focal,
+            fy=focal,
+            cx=(width - 1) / 2,
+            cy=(height - 1) / 2,
+            k=(0.0, 0.0, 0.0, 0.0),
+            rotation=(0.0, 0.0, 0.0),
+            translation=(0.0, 0.0, distance),
+        )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The rotation R from the sensor frame to the camera frame, shape (3, 3)."""
+        return rotation_matrix(self.rotation)
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """The camera's position in the sensor frame (m), shape (3,)."""
+        return -self.matrix.T @ np.asarray(self.translation)
+
+    @property
+    def largest_angle(self) -> float:
+        """The angle from the optical axis up to which the image is unique (rad).
+
+        Beyond it, d decreases with the angle, which no real lens does. The polynomial is not valid there.
+        """
+        return _largest_angle(self.k)
+
+
+def rotation_matrix(vector: tuple[float, float, float]) -> NDArray[np.float64]:
+    """The matrix of a rotation vector (rad), shape (3, 3)."""
+    angle = math.hypot(*vector)
+    if angle == 0:
+        return np.eye(3)
+    x, y, z = (component / angle for component in vector)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def project(lens: Lens, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Project points of the sensor frame into the raw image.
+
+    Args:
+        lens: the camera.
+        points: shape (..., 3), sensor frame (m).
+
+    Returns:
+        Pixel coordinates, shape (..., 2). They may lie outside of the image. Points beyond `Lens.largest_angle` give
+        NaN.
+    """
+    points = np.asarray(points, np.float64)
+    if points.shape[-1:] != (3,):
+        raise ValueError(f"points must have shape (..., 3), got {points.shape}")
+    return project_camera(lens, points @ lens.matrix.T + np.asarray(lens.translation))
+
+
+def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Project points of the camera frame, shape (..., 3), into the raw image, shape (..., 2). See `project`."""
+    radius = np.hypot(points[..., 0], points[..., 1])
+    angle = np.arctan2(radius, points[..., 2])
+    distorted_angle = np.where(angle <= lens.largest_angle, distort_angle(lens.k, angle), np.nan)
+    ratio = distorted_angle / np.where(radius > 0, radius, 1)
+    return np.stack([lens.fx * ratio * points[..., 0] + lens.cx, lens.fy * ratio * points[..., 1] + lens.cy], axis=-1)
+
+
+def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The rays of raw pixels in the camera frame.
+
+    Args:
+        lens: the camera.
+        pixels: pixel coordinates, shape (..., 2).
+
+    Returns:
+        Unit vectors, shape (..., 3). Pixels that no angle up to `Lens.largest_angle` reaches give NaN.
+    """
+    pixels = np.asarray(pixels, np.float64)
+    x, y = (pixels[..., 0] - lens.cx) / lens.fx, (pixels[..., 1] - lens.cy) / lens.fy
+    radius = np.hypot(x, y)
+    angle = _undistort_angle(lens.k, radius)
+    ratio = np.sin(angle) / np.where(radius > 0, radius, 1)
+    return np.stack([ratio * x, ratio * y, np.cos(angle)], axis=-1)
+
+
+def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDArray[np.float32]:
+    """The raw pixel that belongs to each pixel of the pinhole's view.
+
+    Args:
+        lens: the camera.
+        pinhole: the sensor's view.
+        resolution: (height, width) of the rectified image, pixels. It shows the largest centred part of the view with
+            this aspect ratio, like `sts_jax.optics.full_window`.
+
+    Returns:
+        Raw pixel coordinates, shape (height, width, 2). Some lie outside of the raw image if the camera does not see
+        the whole view.
+
+    Raises:
+        ValueError: the view contains rays beyond `Lens.largest_angle`.
+    """
+    left, top, width, height = window(pinhole, resolution)
+    rows, columns = resolution
+    x = left + (np.arange(columns) + 0.5) / columns * width
+    y = top + (np.arange(rows) + 0.5) / rows * height
+    pixels = np.empty((rows, columns, 2), np.float32)
+    for band in _bands(rows):
+        grid_x, grid_y = np.meshgrid(x, y[band])
+        pixels[band] = project(lens, np.stack([grid_x, grid_y, np.zeros_like(grid_x)], axis=-1))
+    if np.isnan(pixels).any():
+        raise ValueError(
+            f"the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from its optical axis, but the "
+            "view needs larger angles. Calibrate it again with boards that reach the view's corners."
+        )
+    return pixels
+
+
+def rectified(lens: Lens, pinhole: Pinhole, image: NDArray[np.uint8], resolution: tuple[int, int]) -> NDArray[np.uint8]:
+    """The pinhole's view from a raw image.
+
+    The raw image is sampled at least as densely as its pixels lie, and the samples of each pixel are averaged, so that
+    small images show no aliasing. The maps of the last eight combinations of arguments are kept.
+
+    Args:
+        lens: the camera.
+        pinhole: the sensor's view.
+        image: raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
+        resolution: (height, width) of the result, pixels.
+
+    Returns:
+        Rectified image of the given resolution, uint8. Parts of the view that the camera does not see are black.
+
+    Raises:
+        ValueError: the image is not uint8 or has another size, or see `rectification`.
+    """
+    _check_image(image)
+    if image.shape[:2] != (lens.height, lens.width):
+        raise ValueError(
+            f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated at "
+            f"{lens.width}x{lens.height}. Set the camera to this size, or calibrate again."
+        )
+    maps = _rectifying_maps(lens, _Values.of(pinhole), _checked(resolution))
+    sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return _averaged(sampled, resolution)
+
+
+def distortion(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDArray[np.float32]:
+    """The pixel of the pinhole's view that belongs to each raw pixel.
+
+    Args:
+        lens: the camera.
+        pinhole: the sensor's view.
+        resolution: (height, width) of the rectified image, pixels.
+
+    Returns:
+        Coordinates in the rectified image, shape (lens.height, lens.width, 2). Raw pixels that show more than the view
+        have coordinates outside of the rectified image. If a ray does not meet the plane of the gel's outer face, they
+        are NaN.
+    """
+    return _view_pixels(lens, _Values.of(pinhole), _checked(resolution), 1)
+
+
+def distorted(
+    lens: Lens,
+    pinhole: Pinhole,
+    image: NDArray[np.uint8],
+    *,
+    outside: float | tuple[float, float, float],
+    samples: int | None = None,
+) -> NDArray[np.uint8]:
+    """The raw image of a camera that sees the pinhole's view, the inverse of `rectified`.
+
+    The maps of the last four combinations of arguments are kept.
+
+    Args:
+        lens: the camera.
+        pinhole: the sensor's view.
+        image: rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show the
+            largest centred part of the view with its aspect ratio, as `sts_jax.sense` renders it.
+        outside: value or colour of the raw pixels that show more than the view, 0 to 255.
+        samples: samples of each raw pixel in each direction, which are averaged. None: as many as the image needs to
+            show no aliasing. Fewer samples are faster.
+
+    Returns:
+        Raw image of shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
+
+    Raises:
+        ValueError: the image is not uint8, or `samples` is below 1.
+    """
+    _check_image(image)
+    if samples is not None and samples < 1:
+        raise ValueError(f"samples must be >= 1 or None, got {samples}")
+    rows, columns = image.shape[:2]
+    maps = _distorting_maps(lens, _Values.of(pinhole), (rows, columns), samples)
+    colour = (outside,) * 4 if isinstance(outside, int | float) else tuple(outside)
+    sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=colour)
+    return _averaged(sampled, (lens.height, lens.width))
+
+
+def window(pinhole: Pinhole, resolution: tuple[int, int]) -> tuple[float, float, float, float]:
+    """The part of the gel's outer face that an image shows: left, top, width and height (m).
+
+    It equals `sts_jax.optics.full_window`.
+    """
+    rows, columns = _checked(resolution)
+    values = _Values.of(pinhole)
+    height = 2 * values.distance * math.tan(values.fov / 2)
+    width = min(height * values.aspect, height * columns / rows)
+    height = width * rows / columns
+    return -width / 2, -height / 2, width, height
+
+
+@dataclasses.dataclass(frozen=True)
+class _Values:
+    """The numbers of a pinhole, by which maps are kept."""
+
+    distance: float
+    fov: float
+    aspect: float
+
+    @classmethod
+    def of(cls, pinhole: Pinhole) -> "_Values":
+        values = cls(float(pinhole.distance), float(pinhole.fov), float(pinhole.aspect))
+        if not values.distance > 0 or not 0 < values.fov < math.pi or not values.aspect > 0:
+            raise ValueError(f"pinhole must have distance > 0, fov in (0, pi) and aspect > 0, got {values}")
+        return values
+
+
+@functools.lru_cache(maxsize=8)
+def _rectifying_maps(lens: Lens, pinhole: _Values, resolution: tuple[int, int]) -> tuple[NDArray, NDArray]:
+    """OpenCV's maps of `rectified`, at the resolution times the number of samples in each direction."""
+    samples = _samples(rectification(lens, pinhole, resolution), (lens.height, lens.width))
+    fine = resolution[0] * samples, resolution[1] * samples
+    return _converted(rectification(lens, pinhole, fine), (lens.height, lens.width))
+
+
+@functools.lru_cache(maxsize=4)
+def _distorting_maps(
+    lens: Lens, pinhole: _Values, resolution: tuple[int, int], samples: int | None
+) -> tuple[NDArray, NDArray]:
+    """OpenCV's maps of `distorted`, at the raw size times the number of samples in each direction."""
+    if samples is None:
+        samples = _samples(_view_pixels(lens, pinhole, resolution, 1), resolution)
+    return _converted(_view_pixels(lens, pinhole, resolution, samples), resolution)
+
+
+def _view_pixels(lens: Lens, pinhole: _Values, resolution: tuple[int, int], samples: int) -> NDArray[np.float32]:
+    """`distortion` at `samples` points of every raw pixel in each direction."""
+    left, top, width, height = window(pinhole, resolution)
+    scale = np.array([resolution[1] / width, resolution[0] / height])
+    x = (np.arange(lens.width * samples) + 0.5) / samples - 0.5
+    y = (np.arange(lens.height * samples) + 0.5) / samples - 0.5
+    pixels = np.empty((len(y), len(x), 2), np.float32)
+    for band in _bands(len(y)):
+        rays = directions(lens, np.stack(np.meshgrid(x, y[band]), axis=-1)) @ lens.matrix  # in the sensor frame
+        outwards = np.where(rays[..., 2] > _GRAZING, rays[..., 2], np.nan)
+        on_face = lens.center[:2] - lens.center[2] / outwards[..., None] * rays[..., :2]
+        pixels[band] = (on_face - np.array([left, top])) * scale - 0.5
+    return pixels
+
+
+def _bands(rows: int) -> list[slice]:
+    """Groups of rows, which limit the memory that large maps need while they are computed."""
+    return [slice(first, first + _BAND) for first in range(0, rows, _BAND)]
+
+
+def _samples(coordinates: NDArray[np.float32], size: tuple[int, int]) -> int:
+    """Samples per pixel and direction with which a map skips no pixel of an image of the given size."""
+    inside = (coordinates > -0.5) & (coordinates < np.array(size[::-1]) - 0.5)
+    coordinates = np.where(inside.all(axis=-1, keepdims=True), coordinates, np.nan)
+    steps = [np.hypot(*np.moveaxis(np.diff(coordinates, axis=axis), -1, 0)) for axis in (0, 1)]
+    largest = max((float(np.nanmax(step)) for step in steps if np.isfinite(step).any()), default=1.0)
+    return max(1, math.ceil(largest))
+
+
+def _converted(coordinates: NDArray[np.float32], size: tuple[int, int]) -> tuple[NDArray, NDArray]:
+    """A map in OpenCV's fast format, whose coordinates are multiples of 1/32 pixel. NaN becomes a pixel outside."""
+    limits = np.array(size[::-1], np.float32) + _MARGIN
+    clipped = np.clip(np.nan_to_num(coordinates, nan=-_MARGIN), -_MARGIN, limits).astype(np.float32)
+    whole, fraction = cv2.convertMaps(clipped, None, cv2.CV_16SC2)
+    return whole, fraction
+
+
+def _averaged(image: NDArray, resolution: tuple[int, int]) -> NDArray:
+    """The mean of the samples of each pixel."""
+    if image.shape[:2] == resolution:
+        return image
+    return cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
+
+
+def distort_angle(k: Sequence[float], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The polynomial d of the lens at angles from the optical axis (rad), see `Lens`."""
+    square = angle * angle
+    return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
+
+
+def _undistort_angle(k: tuple[float, ...], distorted_angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The inverse of `distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
+    largest = _largest_angle(k)
+    known = np.linspace(0, largest, _TABLE)
+    table = distort_angle(k, known)
+    angle = np.interp(distorted_angle, table, known)
+    for _ in range(3):
+        square = angle * angle
+        slope = 1 + square * (3 * k[0] + square * (5 * k[1] + square * (7 * k[2] + square * 9 * k[3])))
+        step = (distort_angle(k, angle) - distorted_angle) / np.maximum(slope, 1e-6)
+        angle = np.clip(angle - np.clip(step, -largest / _TABLE, largest / _TABLE), 0, largest)
+    return np.where(distorted_angle <= table[-1], angle, np.nan)
+
+
+@functools.lru_cache(maxsize=32)
+def _largest_angle(k: tuple[float, ...]) -> float:
+    """The smallest positive root of the derivative of `distort_angle`, at most pi."""
+    roots = np.roots([9 * k[3], 7 * k[2], 5 * k[1], 3 * k[0], 1.0])
+    real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots))) & (roots.real > 0)].real
+    return min([MOST_ANGLE, *np.sqrt(real).tolist()])
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _checked(resolution: tuple[int, int]) -> tuple[int, int]:
+    if len(resolution) != 2 or not all(isinstance(n, int | np.integer) and n >= 1 for n in resolution):
+        raise ValueError(f"resolution must be (height, width) in pixels, both >= 1, got {resolution!r}")
+    return int(resolution[0]), int(resolution[1])
+
+
+def _check_image(image: NDArray) -> None:
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim not in (2, 3):
+        found = f"{image.dtype} of shape {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"image must be uint8 of shape (height, width) or (height, width, channels), got {found}")

@@ -1,0 +1,287 @@
+"""The lens: its model against closed forms and OpenCV, and images from raw to rectified and back."""
+
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+from scipy import ndimage
+
+import sts_jax as sts
+from sts_jax import hardware
+from sts_jax.hardware import Lens
+from sts_jax.hardware import lens as lens_module
+
+PINHOLE = sts.Sensor().camera
+IDEAL = Lens.ideal(640, 480)
+REAL = Lens(
+    width=640,
+    height=480,
+    fx=291.0,
+    fy=287.5,
+    cx=331.2,
+    cy=228.7,
+    k=(-0.04, 0.012, -0.007, 0.0012),
+    rotation=(0.05, -0.08, 0.03),
+    translation=(0.003, -0.004, 0.103),
+)
+LENSES = pytest.mark.parametrize("lens", [IDEAL, REAL], ids=["ideal", "tilted and shifted"])
+
+
+def pixel_of_point(lens, point):
+    """The Kannala-Brandt model for one point, with the rotation by Rodrigues' formula applied to the vector."""
+    v, p = np.array(lens.rotation), np.array(point)
+    angle = math.sqrt(v @ v)
+    axis = v / angle if angle else np.array([0.0, 0.0, 1.0])
+    turned = p * math.cos(angle) + np.cross(axis, p) * math.sin(angle) + axis * (axis @ p) * (1 - math.cos(angle))
+    x, y, z = turned + np.array(lens.translation)
+    theta = math.acos(z / math.sqrt(x * x + y * y + z * z))
+    phi = math.atan2(y, x)
+    d = theta + sum(k * theta ** (3 + 2 * i) for i, k in enumerate(lens.k))
+    return lens.fx * d * math.cos(phi) + lens.cx, lens.fy * d * math.sin(phi) + lens.cy
+
+
+def random_points(number=200):
+    return np.random.default_rng(0).uniform([-0.1, -0.1, -0.02], [0.1, 0.1, 0.1], (number, 3))
+
+
+# ---- Model
+
+
+@LENSES
+def test_projection_equals_the_closed_form(lens):
+    points = random_points()
+    expected = np.array([pixel_of_point(lens, point) for point in points])
+    np.testing.assert_allclose(hardware.project(lens, points), expected, atol=1e-9)
+
+
+@LENSES
+def test_projection_equals_opencv(lens):
+    points = random_points()
+    matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+    vectors = np.array(lens.rotation), np.array(lens.translation)
+    expected, _ = cv2.fisheye.projectPoints(points[None], *vectors, matrix, np.array(lens.k))
+    np.testing.assert_allclose(hardware.project(lens, points), expected[0], atol=1e-8)
+
+
+def test_projection_of_a_point_beside_and_behind_the_camera():
+    lens = Lens.ideal(100, 100, field_of_view=2 * math.pi)
+    pixels = hardware.project(lens, np.array([[0.2, 0.0, -0.1], [0.2, 0.0, -0.3], [0.0, 0.0, -0.05]]))
+    focal = math.hypot(100, 100) / (2 * math.pi)
+    expected = [[49.5 + focal * math.pi / 2, 49.5], [49.5 + focal * 0.75 * math.pi, 49.5], [49.5, 49.5]]
+    np.testing.assert_allclose(pixels, expected, atol=1e-9)
+
+
+@LENSES
+def test_directions_invert_the_projection_over_the_whole_image(lens):
+    rows, columns = np.meshgrid(np.arange(0, 480, 7.0), np.arange(0, 640, 7.0), indexing="ij")
+    pixels = np.stack([columns, rows], axis=-1)
+    rays = lens_module.directions(lens, pixels)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=-1), 1, atol=1e-12)
+    np.testing.assert_allclose(lens_module.project_camera(lens, rays), pixels, atol=1e-6)
+
+
+def test_the_ideal_lens_sees_its_field_of_view_across_the_diagonal():
+    rays = lens_module.directions(IDEAL, np.array([[-0.5, -0.5], [639.5, 479.5]]))
+    assert math.acos(rays[0] @ rays[1]) == pytest.approx(math.radians(160))
+
+
+def test_a_polynomial_that_bends_back_is_used_up_to_its_largest_value():
+    lens = dataclasses.replace(IDEAL, k=(-0.25, 0.0, 0.0, 0.0))
+    largest = math.sqrt(1 / 0.75)
+    assert lens.largest_angle == pytest.approx(largest)
+    beyond = [0.1 * math.tan(largest + 0.01), 0, 0]
+    within = [0.1 * math.tan(largest - 0.01), 0, 0]
+    pixels = hardware.project(lens, np.array([beyond, within]))
+    assert np.isnan(pixels[0]).all()
+    assert np.isfinite(pixels[1]).all()
+    assert np.isnan(hardware.distortion(lens, PINHOLE, (48, 64))[0, 0]).all()
+    bent = dataclasses.replace(lens, k=(-0.6, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"valid up to 42\.7 degrees .* Calibrate it again"):
+        hardware.rectification(bent, PINHOLE, (48, 64))
+
+
+# ---- Maps
+
+
+@pytest.mark.parametrize("resolution", [(64, 64), (48, 64), (1232, 1640), (30, 90), (90, 30), (1, 1)])
+def test_the_view_equals_that_of_the_simulated_sensor(resolution):
+    for camera in (PINHOLE, dataclasses.replace(PINHOLE, aspect=0.8, fov=1.1, distance=0.07)):
+        expected = np.asarray(sts.optics.full_window(camera, resolution))
+        np.testing.assert_allclose(lens_module.window(camera, resolution), expected, rtol=1e-6)
+
+
+@LENSES
+@pytest.mark.parametrize("resolution", [(60, 80), (64, 64)])
+def test_rectification_passes_through_the_points_that_the_simulated_camera_sees(lens, resolution):
+    window = sts.optics.full_window(PINHOLE, resolution)
+    slopes = sts.optics.rays(PINHOLE, window, resolution)
+    x, y = (PINHOLE.distance * np.asarray(slope, np.float64) for slope in slopes)
+    points = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    pixels = hardware.rectification(lens, PINHOLE, resolution)
+    assert pixels.dtype == np.float32
+    assert pixels.shape == (*resolution, 2)
+    for row, column in [(0, 0), (10, 50), (resolution[0] - 1, resolution[1] - 1)]:
+        np.testing.assert_allclose(pixels[row, column], pixel_of_point(lens, points[row, column]), atol=2e-4)
+
+
+@LENSES
+def test_distortion_inverts_the_rectification(lens):
+    resolution = (480, 640)
+    raw = hardware.rectification(lens, PINHOLE, resolution)
+    back = hardware.distortion(lens, PINHOLE, resolution)
+    assert back.shape == (480, 640, 2)
+    assert back.dtype == np.float32
+    planes = [ndimage.map_coordinates(np.nan_to_num(back[..., i]), raw[..., ::-1].T, order=1).T for i in (0, 1)]
+    mapped = np.stack(planes, axis=-1)[3:-3, 3:-3]
+    inside = (np.abs(raw[3:-3, 3:-3] - [319.5, 239.5]) < [316, 236]).all(axis=-1)
+    rows, columns = np.mgrid[3:477, 3:637]
+    errors = np.abs(mapped - np.stack([columns, rows], axis=-1))[inside]
+    assert inside.mean() > 0.95
+    assert errors.max() < 0.01  # pixels: linear interpolation of the map
+
+
+def test_rays_that_do_not_meet_the_pad_are_nan_in_the_distortion():
+    lens = dataclasses.replace(IDEAL, rotation=(0.6, 0.0, 0.0))
+    pixels = hardware.distortion(lens, PINHOLE, (480, 640))
+    upwards = lens_module.directions(lens, np.array([[319.5, 0.0], [319.5, 479.0]])) @ lens.matrix
+    assert np.isnan(pixels[0, 319]).all() == (upwards[0, 2] <= 0)
+    assert np.isnan(pixels[479, 319]).all() == (upwards[1, 2] <= 0)
+    assert np.isnan(pixels).any()
+
+
+# ---- Images
+
+
+def smooth_image(resolution):
+    y, x = np.mgrid[: resolution[0], : resolution[1]] / resolution[0]
+    waves = [np.sin(9 * x + 2 * y), np.cos(7 * y - 3 * x), np.sin(5 * x) * np.cos(6 * y)]
+    return (127.5 + 100 * np.stack(waves, axis=-1)).round().astype(np.uint8)
+
+
+@LENSES
+@pytest.mark.parametrize("resolution", [(480, 640), (256, 256)])
+def test_a_smooth_image_survives_the_round_trip(lens, resolution):
+    image = smooth_image(resolution)
+    raw = hardware.distorted(lens, PINHOLE, image, outside=0)
+    assert raw.shape == (480, 640, 3)
+    assert raw.dtype == np.uint8
+    back = hardware.rectified(lens, PINHOLE, raw, resolution)
+    assert back.shape == image.shape
+    difference = np.abs(back.astype(int) - image)[3:-3, 3:-3]  # without pixels that blend with the outside
+    assert difference.max() <= 4
+    assert difference.mean() < 0.7
+
+
+@LENSES
+def test_the_squares_of_a_checkerboard_keep_their_places_and_values_in_the_round_trip(lens):
+    rows, columns = np.mgrid[:480, :640]
+    image = np.where((rows // 40 + columns // 40) % 2 == 0, 230, 20).astype(np.uint8)
+    raw = hardware.distorted(lens, PINHOLE, image, outside=128)
+    back = hardware.rectified(lens, PINHOLE, raw, (480, 640))
+    within = (np.abs((rows % 40) - 19.5) < 15) & (np.abs((columns % 40) - 19.5) < 15)
+    assert np.abs(back.astype(int) - image)[within].max() <= 2
+    crossings = np.array([[[40 * c - 0.5, 40 * r - 0.5]] for r in range(2, 11) for c in range(2, 15)], np.float32)
+    found = cv2.cornerSubPix(back, crossings + 0.6, (8, 8), (-1, -1), (cv2.TERM_CRITERIA_EPS, 50, 1e-3))
+    errors = np.linalg.norm(found - crossings, axis=-1)
+    assert errors.mean() < 0.06
+    assert errors.max() < 0.25  # pixels. At the view's edge, a raw pixel is as long as three rectified ones
+
+
+@LENSES
+@pytest.mark.parametrize("point", [(0.0, 0.0), (0.05, -0.03), (-0.06, 0.055), (0.074, 0.01)])
+def test_a_marker_on_the_pad_is_rectified_to_its_pixel(lens, point):
+    y, x = np.mgrid[:480, :640].astype(float)
+    column, row = pixel_of_point(lens, (*point, 0.0))
+    raw = (255 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * 1.2**2))).round().astype(np.uint8)
+    window = sts.optics.full_window(PINHOLE, (480, 640))
+    points = jnp.array([[*point, 0.0]])
+    expected, _ = sts.optics.to_pixels(PINHOLE, window, (480, 640), points)
+    image = hardware.rectified(lens, PINHOLE, raw, (480, 640)).astype(float)
+    found = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
+    np.testing.assert_allclose(found, np.asarray(expected)[0], atol=0.1)
+
+
+def test_small_images_are_means_and_show_no_aliasing():
+    rows, columns = np.mgrid[:480, :640]
+    stripes = np.where((rows + columns) % 2 == 0, 255, 0).astype(np.uint8)
+    image = hardware.rectified(IDEAL, PINHOLE, stripes, (16, 16))
+    assert np.abs(image.astype(int) - 127).max() < 12
+    full = hardware.rectified(IDEAL, PINHOLE, smooth_image((480, 640)), (480, 480))
+    small = hardware.rectified(IDEAL, PINHOLE, smooth_image((480, 640)), (48, 48))
+    means = full.reshape(48, 10, 48, 10, 3).mean(axis=(1, 3))
+    assert np.abs(means - small).max() < 1.5
+
+
+def test_raw_pixels_beyond_the_view_have_the_colour_of_the_outside():
+    image = np.full((480, 640, 3), 200, np.uint8)
+    raw = hardware.distorted(IDEAL, PINHOLE, image, outside=(10, 20, 30))
+    assert raw[0, 0].tolist() == [10, 20, 30]
+    assert raw[240, 320].tolist() == [200, 200, 200]
+    share = np.mean(raw[..., 0] == 200)
+    coordinates = hardware.distortion(IDEAL, PINHOLE, (480, 640))
+    inside = ((coordinates > -0.5) & (coordinates < [639.5, 479.5])).all(axis=-1)
+    assert share == pytest.approx(inside.mean(), abs=0.01)
+    fast = hardware.distorted(IDEAL, PINHOLE, image, outside=(10, 20, 30), samples=1)
+    assert np.mean(fast != raw) < 0.01
+
+
+def test_parts_of_the_view_that_the_camera_does_not_see_are_black():
+    lens = Lens.ideal(640, 480, field_of_view=math.radians(60))
+    image = hardware.rectified(lens, PINHOLE, np.full((480, 640), 200, np.uint8), (48, 64))
+    assert image[0, 0] == 0
+    assert image[24, 32] == 200
+
+
+# ---- Errors
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": 0}, "width must be a whole number >= 1, got 0"),
+        ({"height": 480.0}, "height must be a whole number"),
+        ({"fx": -1.0}, r"fx must be > 0, got -1\.0"),
+        ({"cy": math.nan}, "cy must be a finite number, got nan"),
+        ({"k": (0.0, 0.0)}, "k must be a tuple of 4 finite numbers"),
+        ({"k": (0.0, math.inf, 0.0, 0.0)}, "k must be a tuple of 4 finite numbers"),
+        ({"rotation": (0.0, 0.0)}, "rotation must be a tuple of 3 finite numbers"),
+        ({"translation": (0.0, 0.0, -0.1)}, "translation must have a third number > 0"),
+        ({"rotation": (math.pi, 0.0, 0.0)}, r"place the camera at .* must lie inside the sensor, at z < 0"),
+    ],
+)
+def test_an_invalid_lens_raises_an_error_that_names_the_field(changes, message):
+    # The tests' type checker comes before the library's own check.
+    with pytest.raises((ValueError, TypeCheckError), match=f"{message}|Lens.__init__"):
+        dataclasses.replace(IDEAL, **changes)
+
+
+def test_invalid_arguments_raise_errors():
+    image = np.zeros((480, 640, 3), np.uint8)
+    with pytest.raises(ValueError, match="the image has 100x50 pixels, but the lens was calibrated at 640x480"):
+        hardware.rectified(IDEAL, PINHOLE, np.zeros((50, 100, 3), np.uint8), (48, 64))
+    with pytest.raises(ValueError, match="image must be uint8 of shape"):
+        hardware.distorted(IDEAL, PINHOLE, np.zeros((2, 48, 64, 3), np.uint8), outside=0)
+    with pytest.raises(ValueError, match="resolution must be"):
+        hardware.rectified(IDEAL, PINHOLE, image, (0, 64))
+    with pytest.raises(ValueError, match="samples must be >= 1"):
+        hardware.distorted(IDEAL, PINHOLE, image, outside=0, samples=0)
+    with pytest.raises(ValueError, match="field_of_view must be"):
+        Lens.ideal(640, 480, field_of_view=0.0)
+    with pytest.raises(ValueError, match="points must have shape"):
+        hardware.project(IDEAL, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="pinhole must have distance > 0"):
+        hardware.rectification(IDEAL, dataclasses.replace(PINHOLE, fov=4.0), (48, 64))
+
+
+def test_the_lens_and_its_file_import_no_jax():
+    folder = Path(hardware.__file__).parent
+    for name in ("lens.py",):
+        text = (folder / name).read_text()
+        allowed = r"^\s*(import|from) (jax|sts_jax(?!\.hardware|\._files| import _files$))"
+        assert not re.search(allowed, text, re.MULTILINE), name
