@@ -114,19 +114,19 @@ def judge(frames, changes, log, numbers):
     check(order == sorted(set(order)), f"frames are repeated or out of order: {order}")
     counts = {"frames": len(frames), "on": 0, "off": 0, "mixed": 0}
     bright, dark = (
-        [f[1:4] for f, row in zip(frames, rows) if low <= row["lowest"] <= row["highest"] <= high]
+        [f[1:4] for f, row in zip(frames, rows, strict=True) if low <= row["lowest"] <= row["highest"] <= high]
         for low, high in ((0.9999, 1), (0, 1e-4))
     )
     check(bright and dark, "no frames with the light on, or none with the light off")
-    bright, dark = ([sum(values) / len(values) for values in zip(*means)] for means in (bright, dark))
-    for frame, row in zip(frames, rows):
+    bright, dark = ([sum(values) / len(values) for values in zip(*means, strict=True)] for means in (bright, dark))
+    for frame, row in zip(frames, rows, strict=True):
         check(frame[4] >= row["due_s"], f"frame {row['index']} arrived before its time")
         levels = commanded(changes, row["start_s"], row["end_s"])
         if levels is not None:
             check(abs(row["light"] - levels[0] / 255) < 1e-3, f"frame {row['index']}: {levels} against {row}")
         kind = "mixed" if row["highest"] - row["lowest"] > 0.1 else "on" if row["light"] > 0.5 else "off"
         counts[kind] += 1
-        for mean, ends in zip(frame[1:4], zip(dark, bright)):
+        for mean, ends in zip(frame[1:4], zip(dark, bright, strict=True), strict=True):
             check(min(ends) - 1 <= mean <= max(ends) + 1, f"frame {row['index']} is {mean}, beyond {ends}")
             if kind != "mixed":
                 check(abs(mean - ends[kind == "on"]) < 1, f"frame {row['index']} is {mean} instead of {ends}")

@@ -4,9 +4,10 @@ from sts_jax.hardware.twin.device import Made, State, Twin
 from sts_jax.hardware.twin.faults import Fault
 from sts_jax.hardware.twin.lights import Light, LightHistory
 from sts_jax.hardware.twin.log import Exposure, read_log
-from sts_jax.hardware.twin.photometry import Blender, Ends, Imperfections
+from sts_jax.hardware.twin.photometry import Blender, Ends, Imperfections, Warp
 from sts_jax.hardware.twin.scene import ObjectScene, Phase, Picture, Scene, Seen
 from sts_jax.hardware.twin.server import Served
+from sts_jax.hardware.twin.view import lens_warp
 
 __all__ = [
     "Blender",
@@ -25,5 +26,7 @@ __all__ = [
     "Served",
     "State",
     "Twin",
+    "Warp",
+    "lens_warp",
     "read_log",
 ]

@@ -79,7 +79,7 @@ class Twin:
         *,
         rate: float = 30.0,
         imperfections: photometry.Imperfections | None = None,
-        maps: photometry.Maps | None = None,
+        warp: photometry.Warp | None = None,
         seed: int = 0,
         release_every: float | None = None,
         log: str | os.PathLike | None = None,
@@ -91,7 +91,7 @@ class Twin:
             scene: The contents of the view.
             rate: Frames per second of the camera.
             imperfections: Of camera and lights.
-            maps: Maps of `cv2.remap` from the rendered view to the raw view of the lens. Default: no distortion.
+            warp: From the rendered view to the raw view of a lens, `lens_warp`. Default: no distortion.
             seed: Of noise, jitter and the times of `release_every`.
             release_every: Mean duration (s) of one cycle of holding and resting, with which objects are held and
                 released at random. Their motion comes in addition. Default: on command only.
@@ -114,7 +114,7 @@ class Twin:
             raise ValueError(f"release_every must be positive and finite, got {release_every}")
         self.scene = scene
         self.rate = rate
-        self.blender = photometry.Blender(self.imperfections, exposure=scene.exposure, maps=maps, seed=seed)
+        self.blender = photometry.Blender(self.imperfections, exposure=scene.exposure, warp=warp, seed=seed)
         self._release_every = release_every
         self._random = random.Random(seed)
         self._serial_number = f"TWIN{seed}"

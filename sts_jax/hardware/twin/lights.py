@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from sts_jax.hardware import protocol
 
+_RISEN = 30.0  # rise times after which the target is reached, to 1e-13
+
 
 class Light(NamedTuple):
     """The share of the LEDs' full power during an interval, 0 to 1."""
@@ -76,7 +78,7 @@ class LightHistory:
             low, high = self._share(change, begin), self._share(change, end)
             # The integral of the exponential is the rise time times its difference.
             integral += change.target * (end - begin) + self._rise_s * (low - high)
-            shares += [low, high if self._rise_s else low]
+            shares += [low, high]
         lowest, highest = min(shares), max(shares)
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
 
@@ -86,6 +88,6 @@ class LightHistory:
         del self._changes[:keep]
 
     def _share(self, change: _Change, time_s: float) -> float:
-        if change.share == change.target or self._rise_s == 0 or math.isinf(change.time_s):
+        if change.share == change.target or time_s - change.time_s > _RISEN * self._rise_s:
             return change.target
         return change.target + (change.share - change.target) * math.exp((change.time_s - time_s) / self._rise_s)

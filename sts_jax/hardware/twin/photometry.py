@@ -7,8 +7,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-Maps = tuple[np.ndarray, np.ndarray]  # of `cv2.remap`: columns and rows of the pinhole image, float32 (height, width)
-
 _FULL = 65535  # uint16 value of the linear light 1
 _SPARE = 1 << 18  # random numbers of the noise beyond those of one frame, among which each frame's noise begins
 _STRIP = 1 << 18  # values that are processed at once, so that they stay in the processor's cache
@@ -54,6 +52,18 @@ class Ends(NamedTuple):
     tactile: np.ndarray  # LEDs at full power
 
 
+class Warp(NamedTuple):
+    """The way from the rendered view to the camera's raw view. `lens_warp` makes it of a lens."""
+
+    maps: tuple[np.ndarray, np.ndarray]  # of `cv2.remap`, of the raw size times a whole number of samples
+    size: tuple[int, int]  # (height, width) of the raw view, pixels
+
+    def apply(self, image: np.ndarray) -> np.ndarray:
+        """The raw view of an image in linear light. It is dark where it shows more than the image."""
+        sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)
+
+
 class Blender:
     """Makes frames of the two ends of a scene.
 
@@ -61,20 +71,20 @@ class Blender:
     thread at a time.
     """
 
-    def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, maps: Maps | None = None, seed: int = 0):
+    def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, warp: Warp | None = None, seed: int = 0):
         """Prepare the tables.
 
         Args:
             imperfections: Of these, `Blender` applies leakage, vignetting and noise.
             exposure: Exposure of the visual stream over that of the tactile one, `Room.exposure` of the sensor.
-            maps: Maps of `cv2.remap` from the pinhole view to the camera's raw view. Default: the pinhole view is raw.
+            warp: From the rendered view to the camera's raw view. Default: they are the same.
             seed: Of the noise.
         """
         if not 0 < exposure < math.inf:
             raise ValueError(f"exposure must be positive and finite, got {exposure}")
         self._imperfections = imperfections
         self._exposure = exposure
-        self._maps = maps
+        self._warp = warp
         self._rng = np.random.default_rng(seed)
         self._noise = np.zeros(0, np.float32)
         values = np.arange(_FULL + 1) / _FULL
@@ -93,7 +103,7 @@ class Blender:
         return Ends(self._end(visual), self._end(tactile))
 
     def blend(self, ends: Ends, light: float) -> np.ndarray:
-        """The frame without noise, uint8 RGB. It equals `sts_jax.expose` without leakage, vignetting and maps.
+        """The frame without noise, uint8 RGB. It equals `sts_jax.expose` without leakage, vignetting and warp.
 
         Args:
             ends: Of the scene.
@@ -131,8 +141,8 @@ class Blender:
         if image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"image must have the shape (height, width, 3), got {image.shape}")
         linear = self._to_linear[np.round(np.clip(image, 0, 1) * _FULL).astype(np.uint16)]
-        if self._maps is not None:
-            linear = cv2.remap(linear, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        if self._warp is not None:
+            linear = self._warp.apply(linear)
         if self._imperfections.vignetting:
             height, width = linear.shape[:2]
             rows, columns = (np.linspace(-1, 1, n, dtype=np.float32) if n > 1 else np.zeros(1) for n in (height, width))
