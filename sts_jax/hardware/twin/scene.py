@@ -3,6 +3,7 @@
 import abc
 import bisect
 import enum
+import math
 import threading
 from typing import NamedTuple
 
@@ -16,7 +17,8 @@ from sts_jax.hardware.twin.photometry import Blender, Ends
 from sts_jax.objects import Body
 from sts_jax.sensor import Sensor
 
-MOTION_RATE = 10.0  # drawn poses per second of a moving object
+MOTION_RATE = 10.0  # drawn poses per second of a moving object, up to the size below
+_MOTION_PIXELS = 640 * 480  # a larger view takes longer to render and has proportionally fewer poses, at least 1
 STILL_M = 0.0002  # m, an object whose origin remains within this distance of its last place is still
 STILL_RAD = 0.01  # rad, the same for its orientation
 _BATCH = 4  # trajectories that are simulated at once
@@ -133,7 +135,7 @@ class ObjectScene(Scene):
         sensor: Sensor | None = None,
         scenario: physics.Scenario | None = None,
         resolution: tuple[int, int] = (480, 640),
-        motion_rate: float = MOTION_RATE,
+        motion_rate: float | None = None,
         seed: int = 0,
     ):
         """Describe the scene. Nothing is simulated yet.
@@ -143,9 +145,12 @@ class ObjectScene(Scene):
             sensor: Default: the paper's.
             scenario: Starts and motion. Default: `physics.Released`.
             resolution: (height, width) of the rendered view, pixels.
-            motion_rate: Drawn poses per second of the motion. Each one is rendered once.
+            motion_rate: Drawn poses per second of the motion. Each one is rendered once. Default: 10 up to 640x480
+                pixels, and proportionally fewer for larger views.
             seed: Of the trajectories.
         """
+        if motion_rate is None:
+            motion_rate = max(1.0, MOTION_RATE * min(1.0, _MOTION_PIXELS / math.prod(resolution)))
         if not 0 < motion_rate < float("inf"):
             raise ValueError(f"motion_rate must be positive and finite, got {motion_rate}")
         self.sensor = Sensor() if sensor is None else sensor
