@@ -21,7 +21,6 @@ from sts_jax.hardware.twin.scene import Phase, Scene
 
 ANSWER_S = 0.004  # s, duration of a request on the virtual clock. The levels apply in its middle
 _TICK_S = 0.005  # s, period of the watchdog's checks on the virtual clock
-_FRAME_KINDS = ("repeat", "black", "resize")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +213,7 @@ class Twin:
         elif fault.kind == "stall":
             with self._lock:
                 self._stalled_until_s = self.now_s + fault.seconds
-        elif fault.kind in _FRAME_KINDS:
+        elif fault.kind in faults.IMAGE_KINDS:
             with self._lock:
                 self._waiting.add(fault)
         else:
@@ -244,7 +243,7 @@ class Twin:
             light = self._lights.over(start, end)
             self._lights.forget(start)
             seen = self.scene.at((start + end) / 2)
-            fault = self._waiting.take(*_FRAME_KINDS)
+            fault = self._waiting.take(*faults.IMAGE_KINDS)
             self._made += 1
         self._due_s = max(self._due_s, end + constants.lag_s + self._random.uniform(0, constants.jitter_s))
         kind = None if fault is None or (fault.kind == "repeat" and self._last is None) else fault.kind

@@ -88,6 +88,6 @@ class LightHistory:
         del self._changes[:keep]
 
     def _share(self, change: _Change, time_s: float) -> float:
-        if change.share == change.target or time_s - change.time_s > _RISEN * self._rise_s:
+        if change.share == change.target or time_s - change.time_s >= _RISEN * self._rise_s:
             return change.target
         return change.target + (change.share - change.target) * math.exp((change.time_s - time_s) / self._rise_s)

@@ -11,7 +11,6 @@ from sts_jax.hardware.twin.device import Twin
 from sts_jax.hardware.twin.port import LedPort
 from sts_jax.hardware.twin.stream import CAMERA, CameraThread, WebServer
 
-_FRAME_FAULTS = ("stall", "repeat", "black", "resize", "reboot")
 _OPERATE_S = 0.05  # s, period of the checks of `release_every`
 
 
@@ -107,7 +106,7 @@ class Served:
 
     def inject(self, fault: faults.Fault) -> None:
         """Inject a fault into camera, controller or connections."""
-        if fault.kind in _FRAME_FAULTS:
+        if fault.kind in faults.DEVICE_KINDS:
             self._twin.inject(fault)
         elif fault.kind == "drop":
             self._web.drop()
