@@ -124,7 +124,7 @@ def judge(frames, changes, log, numbers):
         levels = commanded(changes, row["start_s"], row["end_s"])
         if levels is not None:
             check(abs(row["light"] - levels[0] / 255) < 1e-3, f"frame {row['index']}: {levels} against {row}")
-        kind = "mixed" if row["highest"] - row["lowest"] > 0.1 else "on" if row["light"] > 0.5 else "off"
+        kind = "mixed" if row["highest"] - row["lowest"] > 1e-3 else "on" if row["light"] > 0.5 else "off"
         counts[kind] += 1
         for mean, ends in zip(frame[1:4], zip(dark, bright, strict=True), strict=True):
             check(min(ends) - 1 <= mean <= max(ends) + 1, f"frame {row['index']} is {mean}, beyond {ends}")

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 _FULL = 65535  # uint16 value of the linear light 1
-_SPARE = 1 << 18  # random numbers of the noise beyond those of one frame, among which each frame's noise begins
+# Random numbers beyond those of one frame. The noise of each frame begins at another one of them
+_SPARE = 1 << 20
 _STRIP = 1 << 18  # values that are processed at once, so that they stay in the processor's cache
 
 
@@ -87,6 +88,10 @@ class Blender:
         self._warp = warp
         self._rng = np.random.default_rng(seed)
         self._noise = np.zeros(0, np.float32)
+        self._begin = 0
+        self._step = (
+            2 * int(self._rng.integers(_SPARE // 2)) + 1
+        )  # odd, so that it passes all places before a repetition
         values = np.arange(_FULL + 1) / _FULL
         self._to_linear = np.round(_FULL * _linear(values)).astype(np.uint16)
         self._to_srgb = np.round(255 * _srgb(values)).astype(np.uint8)
@@ -116,7 +121,8 @@ class Blender:
         linear = self._mixed(ends, light).reshape(-1)
         if len(self._noise) < linear.size:
             self._noise = self._rng.standard_normal(linear.size + _SPARE, np.float32)
-        noise = self._noise[self._rng.integers(_SPARE) :]
+        self._begin = (self._begin + self._step) % _SPARE
+        noise = self._noise[self._begin :]
         out = np.empty(linear.shape, np.uint8)
         for begin in range(0, linear.size, _STRIP):
             part = linear[begin : begin + _STRIP]
