@@ -19,7 +19,9 @@ def test_a_turn_turns_position_orientation_and_wrench():
     np.testing.assert_allclose(turn_wrench(wrench, 1), [-2, 1, 3, -5, 4, 6], atol=1e-6)
 
 
-@pytest.mark.parametrize("scenario", [sts.physics.Freefall(), sts.physics.Inclined(), sts.physics.Perturbed()])
+@pytest.mark.parametrize(
+    "scenario", [sts.physics.Freefall(), sts.physics.Inclined(), sts.physics.Perturbed(), sts.physics.Released()]
+)
 def test_a_scenarios_symmetries_are_those_that_turn_its_gravity_with_its_condition(scenario):
     condition = jnp.array([[3.0, -7.0, 0.08]])[:, : len(scenario.condition_scale)]
     kept = []

@@ -182,7 +182,7 @@ def test_results_are_independent_of_chunk_thread_and_other_bodies(
         np.testing.assert_array_equal(getattr(other, name), getattr(drops, name)[:12])
 
 
-@pytest.mark.parametrize("scenario", [physics.Freefall(), physics.Inclined(), physics.Perturbed()])
+@pytest.mark.parametrize("scenario", [physics.Freefall(), physics.Inclined(), physics.Perturbed(), physics.Released()])
 def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(
     scenario: physics.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:

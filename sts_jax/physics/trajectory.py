@@ -18,7 +18,8 @@ class Trajectory(NamedTuple):
     pose: Float[Array, "n f 7"]  # mesh frame in the sensor frame, w >= 0
     velocity: Float[Array, "n f 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
     # N, N m about the sensor's origin, exerted by the pad on the object: the mean over the unbroken contact at the end
-    # of the frame's interval, or 0 if the last step of the interval has no contact.
+    # of the frame's interval, or 0 if the last step of the interval has no contact. In frame 0 of an object that is
+    # held on the pad (`Start.carried`), the wrench under the held pose.
     wrench: Float[Array, "n f 6"]
     contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
     wall: Bool[Array, "n f"]  # the stop wall pushes in the frame's last step
