@@ -107,7 +107,9 @@ class Sensor:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Sensor":
-        """Read a sensor from a file that `save` wrote.
+        """Read a sensor from a file that `save` wrote, or from the file of a real sensor (`hardware.Device.save`).
+
+        The object "device" of a real sensor's file is ignored.
 
         Args:
             path: path of the file.
@@ -121,6 +123,8 @@ class Sensor:
             ValueError: a field is missing, unknown, of another shape or out of range (`check`).
         """
         values = read_json(Path(path), "write it again with Sensor.save")
+        if isinstance(values, dict):
+            values.pop("device", None)
         try:
             sensor = _typed(cls(), values, "")
             sensor.check()

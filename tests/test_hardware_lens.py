@@ -212,6 +212,8 @@ def test_small_images_are_means_and_show_no_aliasing():
     stripes = np.where((rows + columns) % 2 == 0, 255, 0).astype(np.uint8)
     image = hardware.rectified(IDEAL, PINHOLE, stripes, (16, 16))
     assert np.abs(image.astype(int) - 127).max() < 12
+    pixel = hardware.rectified(IDEAL, PINHOLE, stripes, (1, 1))
+    assert abs(int(pixel[0, 0]) - 127) < 4
     full = hardware.rectified(IDEAL, PINHOLE, smooth_image((480, 640)), (480, 480))
     small = hardware.rectified(IDEAL, PINHOLE, smooth_image((480, 640)), (48, 48))
     means = full.reshape(48, 10, 48, 10, 3).mean(axis=(1, 3))
@@ -281,7 +283,7 @@ def test_invalid_arguments_raise_errors():
 
 def test_the_lens_and_its_file_import_no_jax():
     folder = Path(hardware.__file__).parent
-    for name in ("lens.py",):
+    for name in ("lens.py", "calibration.py", "sensor_file.py"):
         text = (folder / name).read_text()
         allowed = r"^\s*(import|from) (jax|sts_jax(?!\.hardware|\._files| import _files$))"
         assert not re.search(allowed, text, re.MULTILINE), name

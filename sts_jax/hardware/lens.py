@@ -19,6 +19,7 @@ MOST_ANGLE = math.pi  # rad, a ray at this angle points backwards along the opti
 _MARGIN = 16  # pixels beyond the image's border at which coordinates are clipped
 _BAND = 256  # rows of a map that are computed at once
 _GRAZING = 1e-6  # smallest cosine of the angle between a ray and the pad's normal at which they meet
+_PROBES = 64  # least number of points along the longer side at which the density of a map is measured
 _TABLE = 2048  # angles of the table from which the inversion starts
 
 
@@ -283,7 +284,7 @@ def distorted(
 ) -> NDArray[np.uint8]:
     """The raw image of a camera that sees the pinhole's view, the inverse of `rectified`.
 
-    The maps of the last four combinations of arguments are kept.
+    The maps of the last two combinations of arguments are kept.
 
     Args:
         lens: the camera.
@@ -342,18 +343,20 @@ class _Values:
 @functools.lru_cache(maxsize=8)
 def _rectifying_maps(lens: Lens, pinhole: _Values, resolution: tuple[int, int]) -> tuple[NDArray, NDArray]:
     """OpenCV's maps of `rectified`, at the resolution times the number of samples in each direction."""
-    samples = _samples(rectification(lens, pinhole, resolution), (lens.height, lens.width))
+    probes = math.ceil(_PROBES / max(resolution))  # of each pixel, so that small images are probed densely enough
+    probed = rectification(lens, pinhole, (resolution[0] * probes, resolution[1] * probes))
+    samples = _samples(probed, (lens.height, lens.width), probes)
     fine = resolution[0] * samples, resolution[1] * samples
     return _converted(rectification(lens, pinhole, fine), (lens.height, lens.width))
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=2)
 def _distorting_maps(
     lens: Lens, pinhole: _Values, resolution: tuple[int, int], samples: int | None
 ) -> tuple[NDArray, NDArray]:
     """OpenCV's maps of `distorted`, at the raw size times the number of samples in each direction."""
     if samples is None:
-        samples = _samples(_view_pixels(lens, pinhole, resolution, 1), resolution)
+        samples = _samples(_view_pixels(lens, pinhole, resolution, 1), resolution, 1)
     return _converted(_view_pixels(lens, pinhole, resolution, samples), resolution)
 
 
@@ -377,13 +380,19 @@ def _bands(rows: int) -> list[slice]:
     return [slice(first, first + _BAND) for first in range(0, rows, _BAND)]
 
 
-def _samples(coordinates: NDArray[np.float32], size: tuple[int, int]) -> int:
-    """Samples per pixel and direction with which a map skips no pixel of an image of the given size."""
+def _samples(coordinates: NDArray[np.float32], size: tuple[int, int], probes: int) -> int:
+    """Samples per pixel and direction with which no pixel of an image is skipped.
+
+    Args:
+        coordinates: coordinates in the image at `probes` points of each pixel in each direction.
+        size: (height, width) of the image.
+        probes: see `coordinates`.
+    """
     inside = (coordinates > -0.5) & (coordinates < np.array(size[::-1]) - 0.5)
     coordinates = np.where(inside.all(axis=-1, keepdims=True), coordinates, np.nan)
     steps = [np.hypot(*np.moveaxis(np.diff(coordinates, axis=axis), -1, 0)) for axis in (0, 1)]
     largest = max((float(np.nanmax(step)) for step in steps if np.isfinite(step).any()), default=1.0)
-    return max(1, math.ceil(largest))
+    return max(1, math.ceil(largest * probes))
 
 
 def _converted(coordinates: NDArray[np.float32], size: tuple[int, int]) -> tuple[NDArray, NDArray]:

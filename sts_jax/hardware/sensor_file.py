@@ -1,0 +1,314 @@
+"""The file of a commissioned sensor: the constants of `sts_jax.Sensor`, and the device that they belong to."""
+
+import dataclasses
+import datetime
+import hashlib
+import io
+import math
+import os
+import re
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sts_jax import _files
+from sts_jax.hardware import protocol
+from sts_jax.hardware.lens import Lens
+
+VERSION = 1  # of the format of the object "device"
+NAME = "sensor.json"  # the file in a folder
+
+Stream = Literal["visual", "tactile"]
+
+_COMMISSION = "run `python -m experiments.commission`"
+_WORDS = {float: "a finite number", int: "a whole number", str: "a text"}
+
+
+class SensorFileError(ValueError):
+    """The file of a sensor is damaged, incomplete or of another version. The message names it and the remedy."""
+
+
+class WrongDeviceError(SensorFileError):
+    """The file belongs to another camera or another LED controller. The message names both."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Background:
+    """An image of the sensor without an object, a PNG file beside the sensor file."""
+
+    name: str  # of the file, without folder
+    sha256: str  # of the file's content, hexadecimal
+
+    def __post_init__(self) -> None:
+        if not self.name or self.name != Path(self.name).name:
+            raise ValueError(f"name of a background must be a file name without folder, got {self.name!r}")
+        if not re.fullmatch("[0-9a-f]{64}", self.sha256):
+            raise ValueError(f"sha256 of {self.name} must have 64 hexadecimal digits, got {self.sha256!r}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Device:
+    """A commissioned sensor: its camera, lights and lens, and the values that were measured.
+
+    Raises:
+        ValueError: a value is out of range.
+    """
+
+    camera: str  # path in /dev/v4l/by-id, or URL. User name and password of a URL are not kept
+    fps: float  # frames per second
+    leds: str  # serial number of the LED controller
+    lens: Lens  # of the raw images, with their width and height and the place of the camera
+    settle_on_s: float  # s, from the acknowledgement of the light to the first frame with the light fully on
+    settle_off_s: float  # s, from the acknowledgement of the light to the first frame with the light fully off
+    levels: protocol.Levels  # duty cycles of the channels for the tactile stream, 0 to 255
+    commissioned: str  # date, ISO 8601
+    exposure_visual: float | None = None  # in the driver's unit, None: not set
+    exposure_tactile: float | None = None  # in the driver's unit, None: not set
+    background_visual: Background | None = None  # raw image, light off
+    background_tactile: Background | None = None  # raw image, light on
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "camera", _public(self.camera))
+        for name in ("camera", "leds"):
+            if not getattr(self, name).strip():
+                raise ValueError(f"{name} must not be empty")
+        if not (self.fps > 0 and math.isfinite(self.fps)):
+            raise ValueError(f"fps must be > 0 and finite, got {self.fps}")
+        for name in ("settle_on_s", "settle_off_s", "exposure_visual", "exposure_tactile"):
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                raise ValueError(f"{name} must be finite, got {value}")
+        for name in ("settle_on_s", "settle_off_s"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+        if not all(0 <= level <= 255 for level in self.levels) or not any(self.levels):
+            raise ValueError(f"levels must be in 0..255 and not all 0, got {self.levels}")
+        try:
+            datetime.datetime.fromisoformat(self.commissioned)
+        except ValueError as error:
+            raise ValueError(f"commissioned must be a date such as 2026-05-31, got {self.commissioned!r}") from error
+
+    @property
+    def width(self) -> int:
+        """Width of the raw images (pixels)."""
+        return self.lens.width
+
+    @property
+    def height(self) -> int:
+        """Height of the raw images (pixels)."""
+        return self.lens.height
+
+    def save(
+        self,
+        path: str | os.PathLike,
+        constants: Mapping[str, Any],
+        *,
+        visual: NDArray[np.uint8] | None = None,
+        tactile: NDArray[np.uint8] | None = None,
+    ) -> "Device":
+        """Write one file that both `Device.load` and `sts_jax.Sensor.load` read, and the background images beside it.
+
+        Every file is written completely or not at all, the images first. If the process ends in between, an earlier
+        sensor file no longer matches the images, and loading it raises an error.
+
+        Args:
+            path: path of the file, ending in .json, or of a folder, in which the file is `sensor.json`.
+            constants: the constants of the sensor (`sts_jax.Sensor.constants()`). Its camera is the rectified view.
+            visual: raw image without an object and without light, RGB uint8. None: the one that the device names.
+            tactile: raw image without an object, with light, RGB uint8. None: the one that the device names.
+
+        Returns:
+            This device with the backgrounds that were written.
+
+        Raises:
+            SensorFileError: a background that the device names is missing or differs.
+            ValueError: an image has another size than the lens, or `constants` are not those of a sensor.
+            OSError: a file cannot be written.
+        """
+        if "camera" not in constants or "device" in constants:
+            raise ValueError("constants must be those of a sensor: pass `sts_jax.Sensor.load(...).constants()`")
+        file = sensor_file(path)
+        for stream, image in (("visual", visual), ("tactile", tactile)):
+            if image is not None:
+                self._check_image(stream, image)
+        device = dataclasses.replace(
+            self,
+            background_visual=self.background_visual if visual is None else _written(file, "visual", visual),
+            background_tactile=self.background_tactile if tactile is None else _written(file, "tactile", tactile),
+        )
+        device._check_backgrounds(file)
+        _files.write_json(file, {**constants, "device": {"version": VERSION, **dataclasses.asdict(device)}})
+        return device
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> "Device":
+        """Read the device from a file that `save` wrote, and check the images beside it.
+
+        Args:
+            path: path of the file or of its folder.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            OSError: the file cannot be read or is not JSON.
+            SensorFileError: the file has no device or another version, a field is missing, unknown or out of range, or
+                a background image is missing or damaged.
+        """
+        file = sensor_file(path)
+        values = _files.read_json(file, f"{_COMMISSION} again")
+        device = values.get("device") if isinstance(values, dict) else None
+        if not isinstance(device, dict):
+            raise SensorFileError(
+                f"{file} describes no device, so it belongs to a simulated sensor. To make the file of a real one, "
+                f"{_COMMISSION}."
+            )
+        version = device.pop("version", None)
+        if version != VERSION:
+            raise SensorFileError(
+                f"{file} has version {version!r} of the format, but this version of sts_jax reads {VERSION}. Use the "
+                f"version of sts_jax that wrote it, or {_COMMISSION} again."
+            )
+        try:
+            loaded = _decoded(cls, device, "device")
+        except ValueError as error:
+            raise SensorFileError(f"{file}: {error}. Correct it, or {_COMMISSION} again.") from error
+        loaded._check_backgrounds(file)
+        return loaded
+
+    def background(self, path: str | os.PathLike, stream: Stream) -> NDArray[np.uint8]:
+        """Read a background image.
+
+        Args:
+            path: path of the sensor file or of its folder.
+            stream: "visual" or "tactile".
+
+        Returns:
+            Raw RGB image, shape (height, width, 3), uint8.
+
+        Raises:
+            SensorFileError: the device has no such image, or it is missing or damaged.
+        """
+        background = self._named(stream)
+        if background is None:
+            raise SensorFileError(f"the sensor has no {stream} background. To record it, {_COMMISSION}.")
+        image = _checked_image(sensor_file(path).with_name(background.name), background)
+        self._check_image(stream, image)
+        return image
+
+    def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
+        """Raise an error if the connected camera or LED controller is not the one of this file.
+
+        Args:
+            camera: source of the connected camera. None: not compared.
+            leds: serial number of the connected LED controller. None: not compared.
+
+        Raises:
+            WrongDeviceError: one of them differs.
+        """
+        found = []
+        if camera is not None and _public(camera) != self.camera:
+            found.append(f"camera {_public(camera)}")
+        if leds is not None and leds != self.leds:
+            found.append(f"LED controller {leds}")
+        if found:
+            raise WrongDeviceError(
+                f"the sensor file is that of camera {self.camera} and LED controller {self.leds}, but the connected "
+                f"device has {' and '.join(found)}. Load the file of the connected device. To make one, {_COMMISSION}."
+            )
+
+    def _named(self, stream: Stream) -> Background | None:
+        return self.background_visual if stream == "visual" else self.background_tactile
+
+    def _check_image(self, stream: str, image: NDArray[np.uint8]) -> None:
+        shape = (self.height, self.width, 3)
+        if image.dtype != np.uint8 or image.shape != shape:
+            raise ValueError(
+                f"the {stream} background must be a raw image, uint8 of shape {shape}, got {image.dtype} of shape "
+                f"{image.shape}"
+            )
+
+    def _check_backgrounds(self, file: Path) -> None:
+        for background in (self.background_visual, self.background_tactile):
+            if background is not None:
+                _checked_content(file.with_name(background.name), background)
+
+
+def sensor_file(path: str | os.PathLike) -> Path:
+    """The path of a sensor file, given itself or its folder."""
+    path = Path(path)
+    return path if path.suffix.lower() == ".json" else path / NAME
+
+
+def _public(source: str) -> str:
+    """A camera's source without the user name and password of a URL."""
+    return re.sub(r"(?<=://)[^/@]*@", "", source)
+
+
+def _written(file: Path, stream: Stream, image: NDArray[np.uint8]) -> Background:
+    """Write a background image beside the sensor file."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", compress_level=3)
+    path = file.with_name(f"background_{stream}.png")
+    _files.write_bytes(path, buffer.getvalue())
+    return Background(path.name, hashlib.sha256(buffer.getvalue()).hexdigest())
+
+
+def _checked_content(path: Path, background: Background) -> bytes:
+    """The content of a background image whose checksum is right."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise SensorFileError(
+            f"the background image {path} cannot be read ({error}). Copy it from where the sensor file comes from, or "
+            f"{_COMMISSION} again."
+        ) from error
+    if hashlib.sha256(content).hexdigest() != background.sha256:
+        raise SensorFileError(
+            f"the background image {path} is damaged or belongs to another sensor file, because its checksum differs. "
+            f"Copy it from where the sensor file comes from, or {_COMMISSION} again."
+        )
+    return content
+
+
+def _checked_image(path: Path, background: Background) -> NDArray[np.uint8]:
+    with Image.open(io.BytesIO(_checked_content(path, background))) as image:
+        return np.asarray(image)
+
+
+def _decoded(kind: Any, value: Any, name: str) -> Any:
+    """Convert a value of a JSON file to the type of a dataclass's field."""
+    if typing.get_origin(kind) is types.UnionType:  # `kind | None`
+        return None if value is None else _decoded(typing.get_args(kind)[0], value, name)
+    if dataclasses.is_dataclass(kind):
+        return _decoded_dataclass(kind, value, name)
+    if typing.get_origin(kind) is tuple:
+        kinds = typing.get_args(kind)
+        if not isinstance(value, list) or len(value) != len(kinds):
+            raise ValueError(f"field {name} is {value!r}, but it must be a list of {len(kinds)} numbers")
+        return tuple(_decoded(k, v, name) for k, v in zip(kinds, value, strict=True))
+    allowed = int | float if kind is float else kind
+    if not isinstance(value, allowed) or isinstance(value, bool) or (kind is float and not math.isfinite(value)):
+        raise ValueError(f"field {name} is {value!r}, but it must be {_WORDS[kind]}")
+    return kind(value)
+
+
+def _decoded_dataclass(kind: Any, value: Any, name: str) -> Any:
+    kinds = typing.get_type_hints(kind)
+    known = [field.name for field in dataclasses.fields(kind)]
+    if not isinstance(value, dict):
+        raise ValueError(f"field {name} is {value!r}, but it must have the fields {', '.join(known)}")
+    for field in known:
+        if field not in value:
+            raise ValueError(f"field {name}.{field} is missing")
+    for field in value:
+        if field not in known:
+            raise ValueError(f"field {name}.{field} is unknown. The known fields are {', '.join(known)}")
+    try:
+        return kind(**{field: _decoded(kinds[field], value[field], f"{name}.{field}") for field in known})
+    except OverflowError as error:  # a whole number beyond float's range
+        raise ValueError(f"a number of {name} is too large ({error})") from error

@@ -1,0 +1,325 @@
+"""Calibration of lens and pad from images of a board that a known lens sees."""
+
+import dataclasses
+import math
+import re
+
+import calibration_images
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+import sts_jax as sts
+from sts_jax import hardware
+from sts_jax.hardware import Board, CalibrationError, Lens, calibrate
+
+PINHOLE = sts.Sensor().camera
+BOARD = Board()
+TRUE = Lens(
+    width=640,
+    height=480,
+    fx=291.0,
+    fy=287.5,
+    cx=331.2,
+    cy=228.7,
+    k=(-0.04, 0.012, -0.007, 0.0012),
+    rotation=(0.05, -0.08, 0.03),
+    translation=(0.003, -0.004, 0.103),
+)
+# Board to camera: rotation vector (rad), position of the board's centre (m). In the first pose it lies on the pad.
+POSES = [
+    (TRUE.rotation, TRUE.translation),
+    ((0.5, 0.0, 0.0), (0.0, 0.0, 0.15)),
+    ((-0.5, 0.1, 0.0), (0.03, 0.01, 0.15)),
+    ((0.0, 0.5, 0.2), (-0.03, 0.0, 0.14)),
+    ((0.1, -0.5, 0.1), (0.04, 0.0, 0.14)),
+    ((0.3, 0.3, 1.5), (0.0, -0.03, 0.13)),
+    ((-0.3, 0.4, 0.0), (-0.05, 0.05, 0.13)),
+    ((0.4, -0.3, 0.0), (0.05, 0.05, 0.14)),
+    ((0.1, -0.1, 3.1), (0.07, -0.05, 0.13)),
+    ((-0.2, 0.5, 0.3), (-0.08, -0.04, 0.14)),
+    ((0.2, -0.5, 0.3), (0.09, 0.0, 0.13)),
+]
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return calibration_images.camera_rays(TRUE)
+
+
+@pytest.fixture(scope="module")
+def printed():
+    return calibration_images.printed(BOARD)
+
+
+@pytest.fixture(scope="module")
+def images(rays, printed):
+    return [calibration_images.board_view(rays, *printed, *pose) for pose in POSES]
+
+
+@pytest.fixture(scope="module")
+def noisy(images):
+    rng = np.random.default_rng(0)
+    return [calibration_images.degraded(image, rng) for image in images]
+
+
+def board_pixels(pose):
+    """Exact raw pixels of the board's corners."""
+    rotation, translation = pose
+    matrix = Rotation.from_rotvec(rotation).as_matrix()
+    return hardware.lens.project_camera(TRUE, BOARD.corners @ matrix.T + translation)
+
+
+# ---- The board
+
+
+def test_the_page_shows_the_board_at_the_stated_dimensions():
+    page = hardware.board_image(BOARD)
+    assert page.shape == (2970, 2100)
+    assert page.dtype == np.uint8
+    board = page[100 + 30 : 100 + 30 + 1440, 300 + 30 : 300 + 30 + 1440]  # 10 pixels per mm, in the middle of the frame
+    np.testing.assert_array_equal(board, calibration_images.printed(BOARD)[0])
+    assert (page[99, 299:1801] == 160).all()  # the frame of 150 mm
+    assert (page[100:1600, [299, 1800]] == 160).all()
+    ruler = (page[1610:] == 0).sum(axis=1) == 1000  # 100 mm
+    assert ruler.sum() == 5
+    found = hardware.find_board(page, BOARD)
+    corners = BOARD.corners[found.numbers][:, :2] * 10_000 + [1049.5, 849.5]
+    assert len(found.numbers) == 64
+    np.testing.assert_allclose(found.pixels, corners, atol=0.1)
+
+
+def test_the_board_is_written_at_its_true_size(tmp_path):
+    hardware.save_board(tmp_path / "board.png", BOARD)
+    with Image.open(tmp_path / "board.png") as picture:
+        assert picture.size == (2100, 2970)
+        assert picture.info["dpi"] == pytest.approx((254, 254), abs=0.01)
+    hardware.save_board(tmp_path / "board.pdf", BOARD)
+    box = re.search(rb"/MediaBox \[ ?0 0 ([0-9.]+) ([0-9.]+)", (tmp_path / "board.pdf").read_bytes())
+    assert box is not None
+    size_mm = [float(side) / 72 * 25.4 for side in box.groups()]
+    assert size_mm == pytest.approx([210, 297], abs=0.01)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["board.pdf", "board.png"]
+
+
+def test_boards_that_do_not_exist_or_fit_raise_errors(tmp_path):
+    with pytest.raises(ValueError, match="board of 225 mm x 225 mm does not fit into the outline of 150 mm x 150 mm"):
+        hardware.board_image(Board(square=0.025))
+    with pytest.raises(ValueError, match="must be at most 200 mm x 237 mm"):
+        hardware.board_image(BOARD, outline=(0.21, 0.15))
+    with pytest.raises(ValueError, match=r"written as \.pdf or \.png, got .*board\.tiff"):
+        hardware.save_board(tmp_path / "board.tiff")
+    with pytest.raises(ValueError, match="marker < square"):
+        Board(marker=0.02)
+    with pytest.raises(ValueError, match="dictionary must be a name of OpenCV"):
+        Board(dictionary="DICT_9X9")
+    with pytest.raises(ValueError, match="needs 72 markers, but DICT_4X4_50 has 50"):
+        Board(columns=12, rows=12, square=0.012, marker=0.009)
+    with pytest.raises(ValueError, match="rows must be >= 4, got 2"):
+        Board(rows=2)
+
+
+@pytest.mark.parametrize("index", [0, 1, 6])
+def test_corners_are_found_where_the_lens_shows_them(images, noisy, index):
+    for image, mean_limit in ((images[index], 0.25), (noisy[index], 0.3)):
+        found = hardware.find_board(image, BOARD)
+        errors = np.linalg.norm(found.pixels - board_pixels(POSES[index])[found.numbers], axis=-1)
+        assert len(found.numbers) > 40
+        assert errors.mean() < mean_limit
+    assert len(hardware.find_board(np.full((480, 640, 3), 90, np.uint8)).numbers) == 0
+
+
+# ---- The fit
+
+
+def assert_recovered(calibration, *, view_error, position_error):
+    """Compare raw pixels over the sensor's view (pixels) and the places of camera and pad (m)."""
+    lens = calibration.lens
+    assert (lens.width, lens.height) == (640, 480)
+    assert lens.fx == pytest.approx(TRUE.fx, rel=0.003)
+    assert lens.fy == pytest.approx(TRUE.fy, rel=0.003)
+    assert (lens.cx, lens.cy) == (pytest.approx(TRUE.cx, abs=0.8), pytest.approx(TRUE.cy, abs=0.8))
+    np.testing.assert_allclose(lens.translation, TRUE.translation, atol=position_error)
+    np.testing.assert_allclose(lens.center, TRUE.center, atol=position_error)
+    np.testing.assert_allclose(lens.rotation, TRUE.rotation, atol=math.radians(0.15))
+    maps = [hardware.rectification(which, PINHOLE, (48, 64)) for which in (lens, TRUE)]
+    assert np.linalg.norm(maps[0] - maps[1], axis=-1).max() < view_error
+
+
+def test_a_clean_set_gives_back_the_lens_and_the_pad(images):
+    calibration = calibrate(images, BOARD)
+    assert max(calibration.errors) < 0.3
+    assert calibration.corners[0] == 64
+    assert math.degrees(calibration.largest_angle) > 50
+    assert_recovered(calibration, view_error=0.2, position_error=2e-4)
+
+
+def test_blur_and_noise_give_back_the_lens_and_the_pad(noisy):
+    calibration = calibrate(noisy, BOARD)
+    assert max(calibration.errors) < 0.35
+    assert np.sqrt(np.mean(np.square(calibration.errors))) < 0.3
+    assert_recovered(calibration, view_error=0.3, position_error=5e-4)
+
+
+def test_a_calibrated_lens_rectifies_a_marker_to_its_place_on_the_pad(noisy, rays, printed):
+    lens = calibrate(noisy, BOARD).lens
+    raw = calibration_images.board_view(rays, *printed, *POSES[0])
+    view = hardware.rectified(lens, PINHOLE, raw, (480, 640))
+    found = hardware.find_board(view, BOARD)
+    expected = BOARD.corners[found.numbers][:, :2] / 0.15 * 480 + [319.5, 239.5]  # 0.15 m is the height of the view
+    assert len(found.numbers) == 64
+    errors = np.linalg.norm(found.pixels - expected, axis=-1)
+    assert errors.mean() < 0.3
+    assert errors.max() < 1.0
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_board_that_lies_on_the_pad_in_another_orientation_gives_the_same_pad(images, rays, printed, quarters):
+    turn = Rotation.from_euler("z", quarters * math.pi / 2)
+    rotation = (Rotation.from_rotvec(TRUE.rotation) * turn).as_rotvec()
+    turned = calibration_images.board_view(rays, *printed, rotation, TRUE.translation)
+    assert_recovered(calibrate([*images[1:], turned], BOARD, on_pad=10), view_error=0.2, position_error=2e-4)
+
+
+def test_colour_images_give_the_same_lens_and_images_without_the_board_are_left_out(images):
+    colour = [np.repeat(image[..., None], 3, axis=-1) for image in images]
+    calibration = calibrate([*colour, np.full((480, 640, 3), 90, np.uint8)], BOARD)
+    assert calibration.errors[-1] is None
+    assert calibration.corners[-1] == 0
+    assert calibration.lens == calibrate(images, BOARD).lens
+
+
+def corners_of(lens, poses, noise, rng, project=None):
+    """The corners of boards in given poses (board to camera) that lie in the image, with noise in pixels."""
+    found = []
+    for rotation, translation in poses:
+        points = BOARD.corners @ Rotation.from_rotvec(rotation).as_matrix().T + translation
+        pixels = (project or hardware.lens.project_camera)(lens, points)
+        pixels = pixels + noise * rng.standard_normal(pixels.shape)
+        inside = ((pixels > 2) & (pixels < [lens.width - 3, lens.height - 3])).all(axis=-1)
+        found.append(hardware.FoundCorners(np.flatnonzero(inside), pixels[inside]))
+    return found
+
+
+def pad_points():
+    """Points all over the pad (m), shape (64, 3)."""
+    x, y = np.meshgrid(np.linspace(-0.075, 0.075, 8), np.linspace(-0.075, 0.075, 8))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(64)], axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lenses_of_all_fields_of_view_are_recovered(seed):
+    rng = np.random.default_rng(seed)
+    width, height = [(640, 480), (1640, 1232)][seed % 2]
+    ideal = Lens.ideal(width, height, field_of_view=math.radians(rng.uniform(115, 200)))
+    lens = dataclasses.replace(
+        ideal,
+        cx=ideal.cx + 0.02 * width * rng.uniform(-1, 1),
+        cy=ideal.cy + 0.02 * width * rng.uniform(-1, 1),
+        fy=ideal.fy * rng.uniform(0.98, 1.02),
+        k=tuple(np.array([0.08, 0.03, 0.01, 0.002]) * rng.uniform(-1, 1, 4)),
+        rotation=tuple(rng.uniform(-0.15, 0.15, 3)),
+        translation=(*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.09, 0.12)),
+    )
+    poses = [(lens.rotation, lens.translation)]
+    for x, y in [(x, y) for x in (-0.05, 0, 0.05) for y in (-0.04, 0, 0.04)]:
+        poses.append((rng.uniform(-0.5, 0.5, 3), (x, y, rng.uniform(0.12, 0.16))))
+    calibration = hardware.fit_lens(corners_of(lens, poses, 0.1, rng), (width, height), BOARD)
+    np.testing.assert_allclose(max(calibration.errors), 0.14, atol=0.04)  # 0.1 pixels in both directions
+    points = np.stack(
+        [*np.meshgrid(np.linspace(-0.075, 0.075, 9), np.linspace(-0.075, 0.075, 9)), np.zeros((9, 9))], -1
+    )
+    errors = hardware.project(calibration.lens, points) - hardware.project(lens, points)
+    assert np.linalg.norm(errors, axis=-1).max() < 0.3
+    np.testing.assert_allclose(calibration.lens.center, lens.center, atol=4e-4)
+
+
+def refracted(lens, points, thickness=0.005, index=1.41):
+    """Project points of the camera frame through a gel in front of an untilted camera: a slab with parallel faces."""
+    radius = np.hypot(points[:, 0], points[:, 1])
+    low, high = np.zeros_like(radius), np.full_like(radius, 1.55)
+    for _ in range(60):
+        middle = (low + high) / 2
+        within = np.tan(np.arcsin(np.sin(middle) / index))
+        near = (points[:, 2] - thickness) * np.tan(middle) + thickness * within < radius
+        low, high = np.where(near, middle, low), np.where(near, high, middle)
+    rays = np.stack([np.sin(low) * points[:, 0] / radius, np.sin(low) * points[:, 1] / radius, np.cos(low)], axis=-1)
+    return hardware.lens.project_camera(lens, rays)
+
+
+def test_the_refraction_of_the_gel_becomes_a_part_of_the_lens():
+    rng, lens = np.random.default_rng(0), Lens.ideal(640, 480)
+    poses = [(lens.rotation, lens.translation)] + [
+        (rng.uniform(-0.4, 0.4, 3), (x, y, rng.uniform(0.14, 0.17))) for x in (-0.05, 0, 0.05) for y in (-0.04, 0, 0.04)
+    ]
+    found = corners_of(lens, poses, 0.05, rng, refracted)
+    calibration = hardware.fit_lens(found, (640, 480), BOARD)
+    points = pad_points()
+    seen = refracted(lens, points + lens.translation)
+    ignored = np.linalg.norm(hardware.project(lens, points) - seen, axis=-1)
+    remaining = np.linalg.norm(hardware.project(calibration.lens, points) - seen, axis=-1)
+    assert ignored.max() > 2
+    assert remaining.max() < 0.3
+    assert 0.001 < lens.translation[2] - calibration.lens.translation[2] < 0.0025  # the pad appears nearer
+
+
+# ---- Errors
+
+
+def test_missing_boards_are_named(images):
+    empty = np.full((480, 640), 90, np.uint8)
+    few = images[3].copy()
+    few[:, :250] = 90
+    few[200:] = 90
+    count = len(hardware.find_board(few).numbers)
+    assert 0 < count < 12
+    message = (
+        rf"only 3 of 7 images .* 6 are needed.* not found in images 3, 5, 6.*corners were found in image 4 \({count} "
+    )
+    with pytest.raises(CalibrationError, match=message + ".*Check that the board"):
+        calibrate([*images[:3], empty, few, empty, empty], BOARD)
+    with pytest.raises(CalibrationError, match=r"image 0, in which the board lies on the pad, shows 0 of its corners"):
+        calibrate([empty, *images], BOARD)
+    with pytest.raises(CalibrationError, match="needs at least 6 images of the board in different poses, got 2"):
+        calibrate(images[:2], BOARD)
+
+
+def test_images_with_large_errors_are_named(images, rays, printed):
+    torn = np.roll(images[4], 6, axis=1)
+    torn[240:] = images[4][240:]
+    with pytest.raises(CalibrationError, match=r"larger than 1 pixels in image 4 \(.* pixels\)\. .*leave them out"):
+        calibrate([*images[:4], torn, *images[5:]], BOARD)
+
+
+def test_parallel_boards_are_refused(rays, printed):
+    shifts = [
+        (0.0, 0.0, 0.103),
+        (0.02, 0.0, 0.13),
+        (-0.03, 0.0, 0.14),
+        (0.0, 0.03, 0.15),
+        (0.0, -0.03, 0.12),
+        (0, 0, 0.2),
+    ]
+    views = [calibration_images.board_view(rays, *printed, (0.0, 0.0, 0.0), shift) for shift in shifts]
+    with pytest.raises(CalibrationError, match=r"parallel within \d+ degrees.*Hold the board with tilts of 20 to 40"):
+        calibrate(views, BOARD)
+
+
+def test_a_tilted_or_turned_board_on_the_pad_is_refused(images, rays, printed):
+    tilted = calibration_images.board_view(rays, *printed, (0.7, 0.0, 0.0), (0.0, 0.0, 0.15))
+    with pytest.raises(CalibrationError, match=r"board of image 1 is tilted against the image plane by 40 degrees"):
+        calibrate([images[0], tilted, *images[2:]], BOARD, on_pad=1)
+    turned = calibration_images.board_view(rays, *printed, (0.0, 0.0, 0.7), (0.0, 0.0, 0.12))
+    with pytest.raises(CalibrationError, match=r"board of image 1 is turned in the image plane by 40 degrees"):
+        calibrate([images[0], turned, *images[2:]], BOARD, on_pad=1)
+
+
+def test_wrong_arguments_raise_errors(images):
+    with pytest.raises(ValueError, match="one size, got 320x240, 640x480"):
+        calibrate([*images, images[0][::2, ::2]], BOARD)
+    with pytest.raises(ValueError, match="on_pad must be the index of one of the 11 images, got 11"):
+        calibrate(images, BOARD, on_pad=11)
+    other = dataclasses.replace(BOARD, dictionary="DICT_5X5_50")
+    with pytest.raises(CalibrationError, match="image 0, in which the board lies on the pad, shows 0"):
+        calibrate(images, other)
