@@ -5,6 +5,7 @@ import dataclasses
 import json
 import os
 import random
+import socket
 import subprocess
 import sys
 import threading
@@ -447,6 +448,18 @@ def test_services_listen_on_loopback_and_say_so(served):
     rows = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]]
     local = {row[1].split(":")[0] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == int(listening)}
     assert local == {"0100007F"}
+
+
+def test_idle_connections_end_with_the_server():
+    before = set(threading.enumerate())
+    with twin.Twin(picture()) as device:
+        with twin.Served(device) as server:
+            host, number = server.url.removeprefix("http://").split(":")
+            silent = socket.create_connection((host, int(number)))
+            until(lambda: len(threading.enumerate()) > len(before) + 4)
+        with silent:
+            assert silent.recv(100) == b""
+    assert set(threading.enumerate()) <= before
 
 
 def test_listening_to_other_machines_is_announced():

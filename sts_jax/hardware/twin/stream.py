@@ -79,8 +79,9 @@ class CameraThread:
                     continue
             # A thread that is late skips frames, as a camera does.
             index = max(index + 1, self._newest(self._twin.now_s))
-            if self._stop.wait(max(0.0, self._twin.end_s(index) - self._twin.now_s)):
-                return
+            while (wait_s := self._twin.end_s(index) - self._twin.now_s) > 0:
+                if self._stop.wait(wait_s):
+                    return
             made = self._twin.make(index)
             if made is not None:
                 with self._changed:
@@ -103,19 +104,24 @@ class WebServer(http.server.ThreadingHTTPServer):
         self.twin = twin
         self.camera = camera
         self.inject = inject
+        self.connections: set[socket.socket] = set()
         self.streams: set[socket.socket] = set()  # connections that receive frames
         super().__init__(address, _Handler)
 
     def drop(self) -> None:
         """Close the connections that receive frames."""
-        for connection in list(self.streams):
-            with contextlib.suppress(OSError):  # it is closed already
-                connection.shutdown(socket.SHUT_RDWR)
+        _shut_down(self.streams)
 
     def server_close(self) -> None:
         """Close the server and all connections, and wait for their threads."""
-        self.drop()
+        _shut_down(self.connections)
         super().server_close()
+
+
+def _shut_down(connections: set[socket.socket]) -> None:
+    for connection in list(connections):
+        with contextlib.suppress(OSError):  # it is closed already
+            connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
@@ -191,8 +197,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         """Limit the send buffer."""
+        self.server.connections.add(self.request)
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         super().setup()
+
+    def finish(self) -> None:
+        """Forget the connection."""
+        self.server.connections.discard(self.request)
+        with contextlib.suppress(OSError):  # the client has gone
+            super().finish()
 
 
 _FAULT_FIELDS = {"kind": str, "count": int, "seconds": float}
