@@ -1,0 +1,111 @@
+"""Frames per second of the digital twin at both sizes.
+
+    python -m benchmarks.twin
+
+Prints the time of each step of a frame, the frames per second that a second process receives through OpenCV while the
+light is on half of the time, and those of the virtual clock. Values are medians. The processes run on one CPU core.
+"""
+
+import dataclasses
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from sts_jax.hardware import Lens, twin
+from sts_jax.hardware.twin import photometry
+
+SIZES = ((480, 640), (1232, 1640))  # height and width, pixels
+RATE = 200.0  # frames/s of the camera, more than the machine makes
+WINDOW = 10  # frames in one measurement of the rate
+
+# Prints the seconds between the frames that OpenCV reads.
+CLIENT = """
+import sys, time, cv2
+capture, last = cv2.VideoCapture(sys.argv[1], cv2.CAP_FFMPEG), None
+for _ in range(int(sys.argv[2])):
+    good, image = capture.read()
+    assert good
+    now = time.monotonic()
+    if last is not None:
+        print(now - last)
+    last = now
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Number of frames."""
+
+    frames: int = 200  # of each measurement
+
+
+def timed(call: Callable[[], object], number: int) -> float:
+    """Median time of a call (ms)."""
+    times = []
+    for _ in range(number):
+        start = time.perf_counter()
+        call()
+        times.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(times)
+
+
+def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
+    """A twin in which a camera is held, seen through a lens of 160 degrees."""
+    sensor = sts.Sensor()
+    scene = twin.ObjectScene(sts.objects.make(jax.random.key(0), "camera"), sensor=sensor, resolution=size)
+    warp = twin.lens_warp(Lens.ideal(size[1], size[0]), sensor.camera, size)
+    device = twin.Twin(scene, rate=RATE, imperfections=twin.Imperfections(exposure_s=exposure_s), warp=warp)
+    return device, scene
+
+
+def served(size: tuple[int, int], number: int) -> float:
+    """Median rate over windows of frames that a second process receives (frames/s)."""
+    device, _ = held(size, 1 / RATE)
+    device.scene.prepare("hold", device.blender)
+    with device, twin.Served(device) as server:
+        device.command("hold")
+        done = subprocess.run(
+            [sys.executable, "-c", CLIENT, server.camera, str(number)], check=True, capture_output=True, text=True
+        )
+    gaps = np.array([float(line) for line in done.stdout.split()])
+    windows = gaps[: len(gaps) // WINDOW * WINDOW].reshape(-1, WINDOW)
+    return float(np.median(WINDOW / windows.sum(axis=1)))
+
+
+def main(args: Args) -> None:
+    """Measure both sizes."""
+    core = min(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {core})
+    for size in SIZES:
+        device, scene = held(size, 1 / RATE)
+        with device:
+            device.command("hold")
+            blender, seen = device.blender, scene.at(device.now_s)
+            frame = blender.frame(scene.ends(seen, blender), 0.5)
+            poses = iter([seen._replace(frame=i) for i in range(1, 8)])
+            scene.ends(next(poses), blender)
+            render = timed(lambda: scene.ends(next(poses), blender), 5)  # noqa: B023
+            blend = timed(lambda: blender.frame(scene.ends(seen, blender), 0.5), args.frames)  # noqa: B023
+            jpeg = timed(lambda: photometry.encode(frame, 92), args.frames)  # noqa: B023
+            device.ping()
+            virtual = timed(device.capture, args.frames)
+        rate = served(size, args.frames)
+        print(
+            f"{size[1]}x{size[0]}: rendering of a pose {render:.0f} ms, frame with noise {blend:.1f} ms, JPEG "
+            f"{jpeg:.1f} ms, virtual clock {1e3 / virtual:.1f} frames/s, served {rate:.1f} frames/s",
+            flush=True,
+        )
+    print(f"one core, load average of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+if __name__ == "__main__":
+    sts.enable_compilation_cache()
+    main(tyro.cli(Args, description=__doc__))

@@ -1,0 +1,32 @@
+"""The digital twin of the sensor: camera and LED controller of simulated objects."""
+
+from sts_jax.hardware.twin.device import Made, State, Twin
+from sts_jax.hardware.twin.faults import Fault
+from sts_jax.hardware.twin.lights import Light, LightHistory
+from sts_jax.hardware.twin.log import Exposure, read_log
+from sts_jax.hardware.twin.photometry import Blender, Ends, Imperfections, Warp
+from sts_jax.hardware.twin.scene import ObjectScene, Phase, Picture, Scene, Seen
+from sts_jax.hardware.twin.server import Served
+from sts_jax.hardware.twin.view import lens_warp
+
+__all__ = [
+    "Blender",
+    "Ends",
+    "Exposure",
+    "Fault",
+    "Imperfections",
+    "Light",
+    "LightHistory",
+    "Made",
+    "ObjectScene",
+    "Phase",
+    "Picture",
+    "Scene",
+    "Seen",
+    "Served",
+    "State",
+    "Twin",
+    "Warp",
+    "lens_warp",
+    "read_log",
+]

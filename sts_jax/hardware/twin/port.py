@@ -1,0 +1,147 @@
+"""The pseudo-terminal of the twin's LED controller."""
+
+import contextlib
+import os
+import select
+import termios
+import threading
+import time
+import tty
+from pathlib import Path
+
+from sts_jax.hardware.twin import faults
+from sts_jax.hardware.twin.device import Twin
+
+_WAIT_S = 0.003  # s, longest wait for bytes. The watchdog and late answers are checked as often
+_SPEED = termios.B115200  # of the protocol
+
+
+class LedPort:
+    """A pseudo-terminal that speaks the LED protocol, with a thread that serves it.
+
+    A host that sets another baud rate than 115200 sends and receives unreadable bytes, as on a real line.
+    """
+
+    def __init__(self, twin: Twin, link: str | os.PathLike | None = None):
+        """Open the pseudo-terminal and start the thread.
+
+        Args:
+            twin: On the real clock.
+            link: Symbolic link to the pseudo-terminal, which gives the port a name that does not change. A link that
+                exists is replaced.
+
+        Raises:
+            FileExistsError: `link` exists and is not a symbolic link.
+            OSError: The link cannot be made.
+        """
+        self._twin = twin
+        self._link = None if link is None else Path(link)
+        self._queue = faults.Queue()
+        self._lock = threading.Lock()  # of the queue and the absence
+        self._absent_s: float | None = None  # requested absence of the port
+        self._late: list[tuple[float, bytes]] = []
+        self._partial = b""
+        self._open()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="twin's LED port", daemon=True)
+        self._thread.start()
+
+    @property
+    def device(self) -> str:
+        """Name of the port: the link if there is one."""
+        return self._name if self._link is None else str(self._link)
+
+    def inject(self, fault: faults.Fault) -> None:
+        """Inject `deaf`, `lost`, `late`, `doubled`, `garbled` or `vanish`."""
+        with self._lock:
+            if fault.kind == "vanish":
+                self._absent_s = fault.seconds
+            else:
+                self._queue.add(fault)
+
+    def close(self) -> None:
+        """End the thread, close the pseudo-terminal and remove the link."""
+        self._stop.set()
+        self._thread.join()
+        self._close()
+
+    def _open(self) -> None:
+        if self._link is not None and self._link.exists() and not self._link.is_symlink():
+            raise FileExistsError(f"{self._link} exists and is not a symbolic link: choose another name for the port")
+        # The slave stays open here. Otherwise reading fails while no host has opened it.
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._name = os.ttyname(self._slave)
+        if self._link is not None:
+            try:
+                self._link.unlink(missing_ok=True)
+                self._link.symlink_to(self._name)
+            except OSError:
+                self._close()
+                raise
+
+    def _close(self) -> None:
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self._name:
+            self._link.unlink()
+        for descriptor in (self._master, self._slave):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            with self._lock:
+                absent_s, self._absent_s = self._absent_s, None
+            if absent_s is not None:
+                self._vanish(absent_s)
+                continue
+            readable = select.select([self._master], [], [], _WAIT_S)[0]
+            self._send(self._twin.tick())
+            now = time.monotonic()
+            due, self._late = [x for x in self._late if x[0] <= now], [x for x in self._late if x[0] > now]
+            for _, line in due:
+                self._send(line)
+            if readable:
+                with contextlib.suppress(BlockingIOError):
+                    self._receive(os.read(self._master, 4096))
+
+    def _vanish(self, seconds: float) -> None:
+        """Remove the port for a time. The controller and its watchdog run on, as with a power supply of their own."""
+        self._close()
+        self._partial, self._late = b"", []
+        until = time.monotonic() + seconds
+        while time.monotonic() < until and not self._stop.wait(_WAIT_S):
+            self._twin.tick()
+        self._open()
+
+    def _receive(self, data: bytes) -> None:
+        if not self._right_speed():
+            self._send(b"\xff" * len(data))
+            return
+        *lines, self._partial = (self._partial + data).split(b"\n")
+        self._partial = self._partial[:1024]
+        for line in lines:
+            with self._lock:
+                fault = self._queue.take()
+            if fault is not None and fault.kind == "deaf":
+                continue
+            for answer in self._twin.receive(line + b"\n").splitlines(keepends=True):
+                match fault.kind if fault is not None else None:
+                    case None:
+                        self._send(answer)
+                    case "late":
+                        self._late.append((time.monotonic() + fault.seconds if fault else 0.0, answer))
+                    case "doubled":
+                        self._send(answer + answer)
+                    case "garbled":
+                        self._send(faults.garble(answer))
+
+    def _right_speed(self) -> bool:
+        attributes = termios.tcgetattr(self._slave)
+        return attributes[4] == attributes[5] == _SPEED
+
+    def _send(self, data: bytes) -> None:
+        """Send bytes. They are lost if no host reads and the line's buffer is full."""
+        if data:
+            with contextlib.suppress(BlockingIOError):
+                os.write(self._master, data)

@@ -1,0 +1,139 @@
+"""`Served`: a twin behind a serial port and a camera stream, on the real clock."""
+
+import ipaddress
+import os
+import threading
+import time
+from types import TracebackType
+
+from sts_jax.hardware.twin import faults
+from sts_jax.hardware.twin.device import Twin
+from sts_jax.hardware.twin.port import LedPort
+from sts_jax.hardware.twin.stream import CAMERA, CameraThread, WebServer
+
+_OPERATE_S = 0.05  # s, period of the checks of `release_every`
+
+
+class Served:
+    """A twin that other processes use as if it were a sensor.
+
+    ```python
+    with Twin(ObjectScene(body)) as twin, Served(twin) as served:
+        print(served.description)
+        ...
+    ```
+
+    Threads serve the pseudo-terminal, the camera, each HTTP connection, the renderer and `release_every`. `close` ends
+    all of them.
+    """
+
+    def __init__(
+        self,
+        twin: Twin,
+        *,
+        link: str | os.PathLike | None = None,
+        host: str = "127.0.0.1",
+        http_port: int = 0,
+    ):
+        """Start to serve. The twin's clock becomes `time.monotonic`.
+
+        Args:
+            twin: Whose virtual clock has not advanced.
+            link: Symbolic link that gives the serial port a fixed name.
+            host: Address of the interface on which HTTP listens. Other machines reach an address that is not loopback,
+                and there is no password.
+            http_port: 0: a free port.
+
+        Raises:
+            OSError: The address or the link cannot be used. The message names it.
+        """
+        twin.run_on(time.monotonic)
+        self._twin = twin
+        self._camera = CameraThread(twin)
+        try:
+            self._web = WebServer((host, http_port), twin, self._camera, self.inject)
+        except OSError as error:
+            self._camera.close()
+            raise type(error)(
+                f"cannot listen on {host}, port {http_port} ({error}): choose another host or http_port"
+            ) from error
+        try:
+            self._leds = LedPort(twin, link)
+        except OSError:
+            self._web.server_close()
+            self._camera.close()
+            raise
+        twin.scene.start(twin.blender)
+        self._stop = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._web.serve_forever, args=(0.05,), name="twin's HTTP server", daemon=True),
+            threading.Thread(target=self._operate, name="twin's hand", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def port(self) -> str:
+        """Name of the serial port of the LED controller."""
+        return self._leds.device
+
+    @property
+    def url(self) -> str:
+        """URL of the HTTP server."""
+        host, port = self._web.server_address[:2]
+        return f"http://{host!s}:{port}"
+
+    @property
+    def camera(self) -> str:
+        """URL of the camera, for `cv2.VideoCapture`."""
+        return self.url + CAMERA
+
+    @property
+    def description(self) -> str:
+        """How to connect, and from where."""
+        host = str(self._web.server_address[0])
+        reach = (
+            f"{host} is the loopback interface: only this machine can connect."
+            if ipaddress.ip_address(host).is_loopback
+            else f"Listening on {host}: OTHER MACHINES CAN CONNECT, without a password."
+        )
+        return (
+            f"LED controller: {self.port}\n"
+            f"camera:         {self.camera}\n"
+            f"state:          {self.url}/state\n"
+            f"commands:       curl -X POST {self.url}/hold (release, clear)\n{reach}"
+        )
+
+    def inject(self, fault: faults.Fault) -> None:
+        """Inject a fault into camera, controller or connections."""
+        if fault.kind in faults.DEVICE_KINDS:
+            self._twin.inject(fault)
+        elif fault.kind == "drop":
+            self._web.drop()
+        else:
+            self._leds.inject(fault)
+
+    def close(self) -> None:
+        """End all threads, close port and sockets, and remove the link. Closing twice is allowed."""
+        if self._stop.is_set():
+            return
+        self._stop.set()
+        self._camera.close()
+        self._web.shutdown()
+        self._web.server_close()
+        self._leds.close()
+        self._twin.scene.close()
+        for thread in self._threads:
+            thread.join()
+
+    def __enter__(self) -> "Served":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _operate(self) -> None:
+        while not self._stop.wait(_OPERATE_S):
+            self._twin.operate()

@@ -1,0 +1,594 @@
+"""The digital twin: light over exposures, photometry against `expose`, scene, virtual clock, and second clients."""
+
+import ast
+import dataclasses
+import json
+import os
+import random
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import serial
+import tyro
+from led_peer import until
+
+import sts_jax as sts
+from experiments import twin as command
+from sts_jax import hardware
+from sts_jax.hardware import Lens, protocol, twin
+
+ON, OFF = (255,) * 4, (0,) * 4
+CLIENT = Path(__file__).parent / "twin_client.py"
+PERFECT = twin.Imperfections(leakage=0, vignetting=0, read_noise=0, full_well=1e12, rise_s=0, jpeg_quality=100)
+
+
+def picture(height=48, width=64):
+    """A red view under a blue light."""
+    ramp = np.linspace(0.2, 1, width)[None, :, None] * np.ones((height, 1, 1))
+    return twin.Picture(ramp * [0.8, 0.3, 0.1], ramp * [0.1, 0.3, 0.8])
+
+
+# ---- Light
+
+
+def random_history(rise_s, seed):
+    rng = random.Random(seed)
+    times = sorted(rng.uniform(0, 1) for _ in range(8))
+    changes = [(t, tuple(rng.choice([0, 255, rng.randrange(256)]) for _ in range(4))) for t in times]
+    history = twin.LightHistory(rise_s)
+    for time_s, levels in changes:
+        history.set(time_s, levels)
+    return history, changes
+
+
+@pytest.mark.parametrize("rise_s", [0.0, 0.004, 0.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_light_of_an_interval_equals_small_steps(rise_s, seed):
+    history, changes = random_history(rise_s, seed)
+    step = 1e-5
+    times = np.arange(-0.1, 1.2, step)
+    target, share, shares = 0.0, 0.0, np.empty(len(times))
+    waiting = list(changes)
+    for i, time_s in enumerate(times):
+        while waiting and waiting[0][0] <= time_s:
+            target = sum(waiting.pop(0)[1]) / 1020
+        share = target if rise_s == 0 else share + (target - share) * step / rise_s
+        shares[i] = share
+    rng = random.Random(seed + 100)
+    for _ in range(20):
+        start = rng.uniform(-0.1, 1.0)
+        end = start + rng.uniform(0.001, 0.15)
+        chosen = shares[(times >= start) & (times < end)]
+        light = history.over(start, end)
+        assert light.mean == pytest.approx(chosen.mean(), abs=0.015)
+        assert light.lowest == pytest.approx(chosen.min(), abs=0.003)
+        assert light.highest == pytest.approx(chosen.max(), abs=0.003)
+        assert light.lowest <= light.mean <= light.highest
+
+
+def test_half_an_exposure_under_the_light_is_half_the_light():
+    history = twin.LightHistory()
+    history.set(1.0, ON)
+    assert history.over(0.9, 1.1) == (pytest.approx(0.5), 0.0, 1.0)
+    history.set(1.05, (255, 255, 0, 0))
+    assert history.over(0.9, 1.1).mean == pytest.approx((0.05 + 0.5 * 0.05) / 0.2)
+
+
+def test_forgotten_changes_do_not_alter_later_intervals():
+    history, _ = random_history(0.01, 5)
+    before = history.over(0.6, 0.9)
+    history.forget(0.6)
+    assert history.over(0.6, 0.9) == before
+
+
+def test_light_history_refuses_wrong_times():
+    history = twin.LightHistory()
+    history.set(1.0, ON)
+    with pytest.raises(ValueError, match="at least that of the last change"):
+        history.set(0.5, OFF)
+    with pytest.raises(ValueError, match="less than end_s"):
+        history.over(2.0, 2.0)
+    with pytest.raises(ValueError, match="rise_s"):
+        twin.LightHistory(-1.0)
+
+
+# ---- Photometry
+
+
+def random_frame(seed=0, size=(32, 48)):
+    rng = np.random.default_rng(seed)
+    visual, tactile = (jnp.asarray(rng.random((*size, 3)) ** 2, jnp.float32) for _ in range(2))
+    empty = jnp.zeros(size)
+    return sts.Frame(
+        visual, tactile, empty, empty > 0, jnp.zeros(7), jnp.asarray(True), jnp.zeros((4, 4)), jnp.zeros(4)
+    )
+
+
+@pytest.mark.parametrize("exposure", [1.0, 0.3, 4.0])
+@pytest.mark.parametrize("light", [0.0, 0.03, 0.25, 0.5, 0.9, 1.0])
+def test_blend_equals_expose(exposure, light):
+    sensor = sts.Sensor()
+    sensor = dataclasses.replace(sensor, room=dataclasses.replace(sensor.room, exposure=exposure))
+    frame = random_frame()
+    blender = twin.Blender(PERFECT, exposure=exposure)
+    found = blender.blend(blender.ends(np.asarray(frame.visual), np.asarray(frame.tactile)), light)
+    expected = 255 * np.asarray(sts.expose(sensor, frame, light))
+    assert found.dtype == np.uint8
+    assert np.abs(found - expected).max() <= 1
+
+
+def to_linear(image):
+    return np.asarray(sts.optics.to_linear(jnp.asarray(image) / 255), float)
+
+
+@pytest.mark.parametrize("value", [0.2, 0.6])
+def test_noise_has_the_stated_deviation_in_linear_light(value):
+    constants = twin.Imperfections(leakage=0, vignetting=0, read_noise=0.01, full_well=2000.0)
+    blender = twin.Blender(constants, seed=1)
+    flat = np.full((200, 200, 3), float(sts.optics.to_srgb(jnp.asarray(value))))
+    found = to_linear(blender.frame(blender.ends(flat, flat), 0.0))
+    assert found.mean() == pytest.approx(value, abs=0.002)
+    assert found.std() == pytest.approx(np.hypot(0.01, np.sqrt(value / 2000)), rel=0.05)
+
+
+def test_noise_differs_between_frames_and_repeats_with_the_seed():
+    def frames(seed):
+        blender = twin.Blender(twin.Imperfections(), seed=seed)
+        ends = blender.ends(*np.full((2, 20, 30, 3), 0.5))
+        return np.stack([blender.frame(ends, 0.5) for _ in range(1500)])
+
+    first = frames(0)
+    assert len({frame.tobytes() for frame in first}) == len(first)
+    assert np.array_equal(first, frames(0))
+    assert not np.array_equal(first, frames(1))
+
+
+def test_vignetting_takes_its_share_in_the_corners():
+    blender = twin.Blender(dataclasses.replace(PERFECT, vignetting=0.4))
+    ends = blender.ends(*np.ones((2, 41, 61, 3)))
+    assert ends.visual[20, 30] == pytest.approx(65535)
+    assert ends.visual[[0, 0, -1, -1], [0, -1, 0, -1]] == pytest.approx(0.6 * 65535, abs=1)
+
+
+def test_leakage_is_the_light_that_remains():
+    leaking = twin.Blender(dataclasses.replace(PERFECT, leakage=0.2))
+    perfect = twin.Blender(PERFECT)
+    frame = random_frame()
+    ends = perfect.ends(np.asarray(frame.visual), np.asarray(frame.tactile))
+    np.testing.assert_array_equal(leaking.blend(ends, 0.0), perfect.blend(ends, 0.2))
+    np.testing.assert_array_equal(leaking.blend(ends, 1.0), perfect.blend(ends, 1.0))
+
+
+def test_lens_is_that_of_distorted():
+    lens = Lens.ideal(80, 60)
+    pinhole = sts.Sensor().camera
+    image = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
+    smooth = cv2.GaussianBlur(image, (0, 0), 3)
+    expected = hardware.distorted(lens, pinhole, smooth, outside=0.0, samples=2).astype(float)
+    found = twin.lens_warp(lens, pinhole, (60, 80), samples=2).apply(257 * smooth.astype(np.uint16)) / 257
+    assert np.abs(found - expected).max() <= 1
+    assert (found[:2, :2] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("exposure_s", 0.0), ("lag_s", -1.0), ("leakage", 1.5), ("full_well", 0.0), ("jpeg_quality", 0)],
+)
+def test_imperfections_out_of_range_are_named(field, value):
+    with pytest.raises(ValueError, match=f"{field} must be .*{value}"):
+        twin.Imperfections(**{field: value})
+
+
+# ---- Virtual clock
+
+
+def run(seed, path):
+    """Captures with random switches. Returns the switches, the truths and the images."""
+    rng = random.Random(seed)
+    constants = twin.Imperfections(lag_s=rng.uniform(0.015, 0.12), jitter_s=0.01, rise_s=0.0, exposure_s=0.015)
+    changes, truths, images = [], [], []
+    with twin.Twin(picture(), rate=60, imperfections=constants, seed=seed, log=path) as device:
+        for _ in range(40):
+            changes.append(device.set(rng.choice([ON, OFF, (255, 0, 128, 1)])))
+            device.step(rng.uniform(0, 0.1))
+            for _ in range(rng.randrange(5)):
+                truth, image = device.capture()
+                assert truth.end_s + constants.lag_s <= truth.due_s <= device.now_s
+                truths.append(truth)
+                images.append(image)
+    return changes, truths, images
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_log_agrees_with_the_acknowledged_lights(seed, tmp_path):
+    changes, truths, _ = run(seed, tmp_path / "log")
+    assert twin.read_log(tmp_path / "log") == truths
+    pure = mixed = 0
+    for truth in truths:
+        for lit, following in zip(changes, [*changes[1:], None], strict=True):
+            if lit.acknowledged_s <= truth.start_s and (following is None or truth.end_s <= following.sent_s):
+                assert truth.light == truth.lowest == truth.highest == sum(lit.levels) / 1020
+                pure += 1
+        mixed += truth.lowest < truth.highest
+    assert pure
+    assert mixed
+
+
+def test_the_same_seed_gives_the_same_frames(tmp_path):
+    first, second = run(3, tmp_path / "a"), run(3, tmp_path / "b")
+    assert first[1] == second[1]
+    np.testing.assert_array_equal(first[2], second[2])
+
+
+def test_images_are_rgb_and_follow_the_light():
+    with twin.Twin(picture(), imperfections=PERFECT) as device:
+        dark = device.capture()[1]
+        device.set(ON)
+        device.step(0.1)
+        bright = device.capture()[1]
+    red, blue = dark.mean((0, 1)), bright.mean((0, 1))
+    assert red[0] > 2 * red[1] > 2 * red[2]
+    assert blue[2] > 2 * blue[1] > 2 * blue[0]
+
+
+def test_watchdog_turns_the_virtual_lights_off():
+    with twin.Twin(picture()) as device:
+        device.set(ON)
+        device.step(0.9)
+        assert device.ping().levels == ON
+        device.step(1.1)
+        lit = device.ping()
+        assert lit.levels == OFF
+        assert lit.counter == 2
+        device.step(0.2)
+        assert device.capture()[0].light == 0
+
+
+@pytest.mark.parametrize("kind", ["repeat", "black", "resize", "stall"])
+def test_fault_of_the_camera_on_the_virtual_clock(kind):
+    with twin.Twin(picture()) as device:
+        before, image = device.capture()
+        device.inject(twin.Fault(kind, count=2, seconds=0.5))
+        (during, found), (_, second), (after, last) = (device.capture() for _ in range(3))
+    assert last.shape == image.shape
+    assert after.fault is None
+    if kind == "stall":
+        assert during.index - before.index >= 15
+        return
+    assert (during.fault, during.index) == (kind, before.index + 1)
+    match kind:
+        case "repeat":
+            np.testing.assert_array_equal([found, second], [image, image])
+            assert (during.start_s, during.end_s) == (before.start_s, before.end_s)
+        case "black":
+            assert not found.any()
+            assert not second.any()
+            assert last.any()
+        case "resize":
+            assert found.shape == (24, 32, 3)
+
+
+def test_restart_of_the_controller_turns_the_lights_off_and_counts():
+    with twin.Twin(picture()) as device:
+        lit = device.set(ON)
+        device.inject(twin.Fault("reboot"))
+        assert device.ping().boot == lit.boot + 1
+        assert device.ping().levels == OFF
+
+
+def test_twin_refuses_bad_input():
+    with pytest.raises(ValueError, match="lower rate or exposure_s"):
+        twin.Twin(picture(), rate=100.0)
+    with pytest.raises(ValueError, match="kind must be one of"):
+        twin.Fault("fire")
+    with twin.Twin(picture()) as device:
+        with pytest.raises(ValueError, match=r"Served\.inject"):
+            device.inject(twin.Fault("vanish"))
+        with pytest.raises(ValueError, match="does not change"):
+            device.command("hold")
+        device.step(1.0)
+        with pytest.raises(RuntimeError, match="make a new Twin"):
+            twin.Served(device)
+
+
+# ---- Scene
+
+
+@pytest.fixture(scope="module")
+def held():
+    """A small camera, in a view of few pixels."""
+    body = sts.objects.make(jax.random.key(0), "camera")
+    return body, twin.ObjectScene(body, resolution=(24, 32), seed=2)
+
+
+def test_object_is_held_moves_and_lies_still_as_simulated(held):
+    body, scene = held
+    phases, frames = [], []
+    with twin.Twin(scene, imperfections=PERFECT) as device:
+        with pytest.raises(ValueError, match="Send hold first"):
+            device.command("release")
+        for count, name in [(3, None), (3, "hold"), (80, "release"), (3, "clear")]:
+            if name:
+                device.command(name)
+            for _ in range(count):
+                truth, _ = device.capture()
+                phases.append(truth.phase)
+                frames.append(truth)
+    order = list(dict.fromkeys(phases))
+    assert order == ["empty", "held", "moving", "still"]
+    assert phases[-1] == "empty"
+    trajectory = sts.physics.simulate(
+        jax.random.fold_in(jax.random.key(2), 0), body, scene.sensor, scene.scenario, num=4
+    )
+    number = int(np.flatnonzero(trajectory.settled)[0])
+    for truth in frames:
+        if truth.pose is not None:
+            np.testing.assert_array_equal(truth.pose, np.asarray(trajectory.pose[number, truth.frame]))
+    assert scene.outcome(0) == scene.scenario.named(int(trajectory.outcome[number]))
+    moving = [truth for truth in frames if truth.phase == "moving"]
+    assert moving[0].frame == 0
+    assert [a.frame for a in moving] == sorted(a.frame for a in moving)
+    assert all(truth.frame == 59 for truth in frames if truth.phase == "still")
+
+
+def test_ends_are_the_frame_of_sense(held):
+    body, scene = held
+    blender = twin.Blender(PERFECT)
+    seen = twin.Seen(twin.Phase.STILL, 1, 59, None)
+    fresh = twin.ObjectScene(body, resolution=(24, 32), seed=2)
+    ends = fresh.ends(seen, blender)
+    motion = fresh._motion(1)
+    frame = sts.sense(
+        scene.sensor, body, jnp.asarray(motion.pose[59]), jnp.asarray(motion.wrench[59]), resolution=(24, 32)
+    )
+    for light in (0.0, 0.4, 1.0):
+        expected = 255 * np.asarray(sts.expose(scene.sensor, frame, light))
+        assert np.abs(blender.blend(ends, light) - expected).max() <= 1
+    empty = fresh.ends(twin.Seen(twin.Phase.EMPTY, -1, 0, None), blender)
+    assert empty.visual.std() < ends.visual.std()
+
+
+def test_objects_are_released_at_random(held, tmp_path):
+    body, _ = held
+    scene = twin.ObjectScene(body, resolution=(24, 32), seed=2, motion_rate=2)
+    with twin.Twin(scene, release_every=2.0, log=tmp_path / "log", seed=1) as device:
+        while device.state.trajectory < 2:
+            device.capture()
+    seen = [(truth.trajectory, truth.phase) for truth in twin.read_log(tmp_path / "log")]
+    order = list(dict.fromkeys(seen))
+    assert order[:7] == [(-1, "empty")] + [(n, phase) for n in (0, 1) for phase in ("held", "moving", "still")]
+
+
+def test_scenario_in_which_nothing_settles_is_refused(held, monkeypatch):
+    scene = twin.ObjectScene(held[0], resolution=(24, 32))
+    monkeypatch.setattr(scene, "_simulate", list)
+    with pytest.raises(ValueError, match="give the scenario more frames"):
+        scene.prepare("hold", twin.Blender(PERFECT))
+
+
+# ---- Served to other processes
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A served picture, with its log."""
+    before = set(threading.enumerate())
+    constants = twin.Imperfections(exposure_s=0.03, lag_s=0.05)
+    with (
+        twin.Twin(picture(), imperfections=constants, log=tmp_path / "log", record=tmp_path / "record.mjpeg") as device,
+        twin.Served(device, link=tmp_path / "leds") as server,
+    ):
+        yield device, server
+    assert set(threading.enumerate()) <= before
+    assert not (tmp_path / "leds").is_symlink()
+
+
+def post(server, path):
+    with urllib.request.urlopen(urllib.request.Request(server.url + path, method="POST"), timeout=30) as answer:
+        return json.load(answer)
+
+
+def judge(tmp_path, *, rate, lag_s, switches):
+    """Let the second client judge a twin. Returns its summary."""
+    constants = twin.Imperfections(exposure_s=0.9 / rate, lag_s=lag_s)
+    log, record = tmp_path / "log", tmp_path / "record.mjpeg"
+    with (
+        twin.Twin(picture(120, 160), rate=rate, imperfections=constants, log=log, record=record) as device,
+        twin.Served(device) as server,
+    ):
+        options = {"port": server.port, "camera": server.camera, "log": log, "record": record, "switches": switches}
+        words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
+        done = subprocess.run([sys.executable, CLIENT, *words], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return json.loads(done.stdout)
+
+
+def check_summary(found, switches):
+    assert found["frames"] == 6 * switches
+    assert min(found["on"], found["off"], found["mixed"]) > 0
+    blue, green, red = found["dark_bgr"]  # OpenCV's order
+    assert red > 2 * green > 2 * blue
+    blue, green, red = found["bright_bgr"]
+    assert blue > 2 * green > 2 * red
+
+
+@pytest.mark.parametrize("lag_s", [0.015, 0.12])
+def test_second_client_confirms_the_light_of_every_frame(lag_s, tmp_path):
+    check_summary(judge(tmp_path, rate=30, lag_s=lag_s, switches=12), 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lag_s", [0.015, 0.05, 0.12])
+def test_second_client_confirms_the_light_at_60_frames_a_second(lag_s, tmp_path):
+    check_summary(judge(tmp_path, rate=60, lag_s=lag_s, switches=120), 120)
+
+
+def test_second_client_imports_nothing_of_the_library():
+    tree = ast.parse(CLIENT.read_text())
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    assert imported <= {"argparse", "json", "sys", "time", "zlib", "cv2", "serial"}
+
+
+def test_services_listen_on_loopback_and_say_so(served):
+    _, server = served
+    assert server.url.startswith("http://127.0.0.1:")
+    assert "only this machine can connect" in server.description
+    listening = server.url.rsplit(":", 1)[1]
+    rows = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]]
+    local = {row[1].split(":")[0] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == int(listening)}
+    assert local == {"0100007F"}
+
+
+def test_idle_connections_end_with_the_server():
+    before = set(threading.enumerate())
+    with twin.Twin(picture()) as device:
+        with twin.Served(device) as server:
+            host, number = server.url.removeprefix("http://").split(":")
+            silent = socket.create_connection((host, int(number)))
+            until(lambda: len(threading.enumerate()) > len(before) + 4)
+        with silent:
+            assert silent.recv(100) == b""
+    assert set(threading.enumerate()) <= before
+
+
+def test_listening_to_other_machines_is_announced():
+    with twin.Twin(picture()) as device, twin.Served(device, host="0.0.0.0") as server:
+        assert "OTHER MACHINES CAN CONNECT" in server.description
+
+
+def test_address_in_use_is_named(served):
+    number = int(served[1].url.rsplit(":", 1)[1])
+    with twin.Twin(picture()) as device, pytest.raises(OSError, match=f"cannot listen on 127.0.0.1, port {number}"):
+        twin.Served(device, http_port=number)
+
+
+def test_link_does_not_replace_a_file(tmp_path):
+    (tmp_path / "leds").write_text("precious")
+    with twin.Twin(picture()) as device, pytest.raises(FileExistsError, match="not a symbolic link"):
+        twin.Served(device, link=tmp_path / "leds")
+    assert (tmp_path / "leds").read_text() == "precious"
+
+
+def test_commands_and_state_over_http(held):
+    body, _ = held
+    scene = twin.ObjectScene(body, resolution=(24, 32), seed=2, motion_rate=2)
+    with twin.Twin(scene) as device, twin.Served(device) as server:
+        assert post(server, "/hold")["phase"] == "held"
+        assert post(server, "/release")["phase"] in ("moving", "still")
+        until(lambda: device.state.phase == "still")
+        with urllib.request.urlopen(server.url + "/state", timeout=30) as answer:
+            state = json.load(answer)
+        assert state["pose"] == list(device.state.pose)
+        for path, code, words in (("/release", 400, "Send hold first"), ("/jump", 404, "is not one of GET /camera")):
+            with pytest.raises(urllib.error.HTTPError) as found:
+                post(server, path)
+            with found.value as answer:
+                assert answer.code == code
+                assert words in json.load(answer)["error"]
+        assert post(server, "/clear")["pose"] is None
+
+
+def test_host_switches_the_lights_despite_faulty_answers(served):
+    device, server = served
+    with hardware.Leds.connect(server.port, answer_s=30.0, watchdog_ms=10_000) as leds:
+        assert leds.serial_number == "TWIN0"
+        for i, kind in enumerate(("deaf", "lost", "late", "doubled", "garbled")):
+            server.inject(twin.Fault(kind, count=2, seconds=0.15))
+            level = (i + 1, 0, 0, 0)
+            assert leds.set(level).levels == level
+            assert device.state.levels == level
+            assert leds.ping().levels == level
+
+
+def test_host_finds_the_port_again(served):
+    device, server = served
+    with hardware.Leds.connect(server.port, answer_s=30.0, watchdog_ms=10_000) as leds:
+        leds.set(ON)
+        server.inject(twin.Fault("vanish", seconds=0.5))
+        until(lambda: not os.path.islink(server.port))
+        with pytest.raises(hardware.LedError):
+            leds.set(ON)
+        leds.reconnect(limit_s=60.0)
+        assert leds.ping().levels == OFF
+        leds.set(ON)
+        assert device.state.levels == ON
+
+
+def test_watchdog_turns_the_lights_off_after_the_host_has_gone(served):
+    device, server = served
+    text = "1 SET 255 255 255 255"
+    line = f"{text}*{protocol.checksum(text.encode()):04X}\n".encode()
+    with serial.Serial(server.port, 115200, timeout=30) as port:
+        port.write(line)
+        assert port.readline().startswith(b"1 OK SET 255 255 255 255")
+        assert port.readline().startswith(b"0 OFF watchdog 2")
+    assert device.state.levels == OFF
+
+
+def test_wrong_baud_rate_is_recognised(served):
+    with pytest.raises(hardware.NotALedControllerError, match="opened at 9600 baud"):
+        hardware.Leds.connect(served[1].port, baud=9600, timeout_s=0.5)
+
+
+def test_faults_of_the_camera_reach_opencv(served):
+    _, server = served
+    capture = cv2.VideoCapture(server.camera, cv2.CAP_FFMPEG)
+    assert capture.read()[1].mean() > 20
+    assert post(server, "/fault?kind=black&count=3") == {"kind": "black", "count": 3}
+    until(lambda: capture.read()[1].mean() < 3)
+    until(lambda: capture.read()[1].mean() > 20)
+    post(server, "/fault?kind=drop")
+    until(lambda: not capture.read()[0])
+    capture.release()
+    capture = cv2.VideoCapture(server.camera, cv2.CAP_FFMPEG)
+    assert capture.read()[0]
+    capture.release()
+
+
+# ---- Command
+
+
+def test_command_makes_the_twin_of_its_options():
+    config = tyro.cli(
+        command.Config, args=["--resolution", "24", "32", "--imperfections.lag-s", "0.1", "--field-of-view", "None"]
+    )
+    with command.make(config) as device:
+        assert device.imperfections.lag_s == 0.1
+        assert device.capture()[1].shape == (24, 32, 3)
+    with pytest.raises(ValueError, match="must be one of"):
+        command.make(dataclasses.replace(config, object_class="unicorn"))
+
+
+@pytest.mark.slow
+def test_command_serves_until_it_is_ended(tmp_path):
+    link = tmp_path / "leds"
+    words = ["--resolution", "24", "32", "--port", str(link), "--log", str(tmp_path / "log")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.twin", *words], stdout=subprocess.PIPE, text=True, cwd=CLIENT.parents[1]
+    )
+    try:
+        lines = [process.stdout.readline() for _ in range(7)]
+        assert str(link) in lines[1]
+        camera = lines[2].split()[-1]
+        capture = cv2.VideoCapture(camera, cv2.CAP_FFMPEG)
+        assert capture.read()[0]
+        capture.release()
+        with hardware.Leds.connect(str(link)) as leds:
+            assert leds.set(ON).levels == ON
+    finally:
+        process.terminate()
+        assert process.wait(60) == 0
+        process.stdout.close()
+    assert not link.is_symlink()
+    assert twin.read_log(tmp_path / "log")
