@@ -19,15 +19,19 @@ from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
-from sts_jax.hardware.settling import Settling, Switch, Thumbnail, light_share, settling, thumbnail
+from sts_jax.hardware.settling import Settling, Switch, Thumbnail, difference, settling, thumbnail
 
 Stream = Literal["visual", "tactile"]
 
-_DEPARTED = 0.5  # least share of a stream's light in its frames
+_DEPARTED = 0.5  # of the contrast, by which a frame must differ from the last one before the switch
+_AGAIN_S = 1.0  # s, after which a switch that does not show is repeated
 _SWITCHES = 8  # of each direction, to measure the settling
 _PHASE = 0.618  # of a period, by which the phase of the measured switches advances
 _GRACE_S = 0.2  # s, by which a wait for the camera may exceed a limit, so that the cause of a delay is the one reported
-_STILL = 3.0  # of 255, largest change of a thumbnail's pixel while nothing moves
+_STILL = 6.0  # of 255, change of a thumbnail's pixel that always counts as still
+_NOISE = (
+    8.0  # times the median change of all pixels, which counts as still too. The noise's largest one is 5 times that
+)
 
 
 class LightError(RuntimeError):
@@ -84,9 +88,9 @@ class STS:
     ```
 
     A frame counts as of one light if it arrives later than the settling time after the controller's acknowledgement, if
-    it and the frame before it look like the last image of this light rather than that of the other one, and if the
-    controller's next answer proves that its lights have not changed in between. All other frames are discarded, also
-    those of a stalled stream that arrive late.
+    two frames in a row have shown since the switch that the image has changed, and if the controller's next answer
+    proves that its lights have not changed in between. All other frames are discarded, also those of a stalled stream
+    that arrive late.
 
     One thread may use a sensor at a time.
     """
@@ -130,9 +134,10 @@ class STS:
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
         self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
         self._stream: Stream = "visual"
-        self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
+        self._contrast: float | None = None  # of images without and with the light, of 255
         self._previous: Captured | None = None  # the last frame of the camera
-        self._departed = 0  # successive frames since the switch that show the new light
+        self._reference: Thumbnail | None = None  # of the last frame before the switch
+        self._departed = 0  # successive frames since the switch that show the new light, 2 and more: all are of it
         self._background: _Background | None = None
         self._stopping = False  # whether the thread in the background is to end
         self.discarded = 0  # frames that could not be proven to be of one light
@@ -194,7 +199,7 @@ class STS:
         """Turn the lights off and close both devices. Without a connection, it does nothing."""
         self._stop_background()
         leds, self._leds, self._lit = self._leds, None, None
-        self._looks = {}
+        self._contrast = None
         if leds is not None:
             leds.close()
         self._camera.disconnect()
@@ -278,7 +283,8 @@ class STS:
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
         """Wait until nothing moves in the visual stream.
 
-        The view is still if no block of the image changes by more than 3 of 255 during a window.
+        The view is still if no block of the image changes by more than 6 of 255, or by more than the noise of all
+        blocks explains, during a window.
 
         Args:
             timeout_s: Longest wait (s).
@@ -293,11 +299,12 @@ class STS:
         """
         self._stop_background()
         deadline, first = time.monotonic() + timeout_s, None
-        look, change = None, 0.0
+        look, change, allowed = None, 0.0, _STILL
         for shot in self._images(0.0, 1):
             now = thumbnail(shot.image)
-            change = 0.0 if look is None else float(np.abs(now - look).max())
-            if first is None or look is None or change > _STILL or shot.epoch != first.epoch:
+            changes = np.zeros(1) if look is None else np.abs(now - look)
+            change, allowed = float(changes.max()), max(_STILL, _NOISE * float(np.median(changes)))
+            if first is None or look is None or change > allowed or shot.epoch != first.epoch:
                 first, look = shot, now
             elif shot.time_s - first.time_s >= window_s:
                 return shot
@@ -305,7 +312,7 @@ class STS:
                 break
         raise NotStillError(
             f"the view still changes after {timeout_s:g} s, by {change:.0f} of 255 in one block (allowed are "
-            f"{_STILL:g}): wait longer, or check the room's light."
+            f"{allowed:.0f}): wait longer, or check the room's light."
         )
 
     def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 1.0) -> Settling:
@@ -331,7 +338,7 @@ class STS:
             on.append(self._watched("tactile", shorter_s))
             off.append(self._watched("visual", shorter_s))
         found = self._settled(on, off, period_s, shorter_s)
-        self._looks = {"visual": off[-1].thumbnails[-1], "tactile": on[-1].thumbnails[-1]}
+        self._contrast = found.contrast
         return found
 
     def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
@@ -387,7 +394,6 @@ class STS:
                 deadline += time.monotonic() - lost_s
                 continue
             if until_s is not None:
-                self._looks[stream] = thumbnail(frame.image)
                 return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
             self.discarded += 1
 
@@ -407,19 +413,23 @@ class STS:
                 frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
             except CameraLostError:
                 continue
-            self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
+            if self._departed < 2:
+                self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame)
             self._previous = frame
             if self._departed >= 2 and frame.time_s >= max(lit.acknowledged_s + settled_s, after_s):
                 return lit, frame
             self.discarded += 1
+            if self._departed == 0 and frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
+                # The scene may have changed at the switch. It is repeated, and compared with a newer frame.
+                self._watched("tactile" if stream == "visual" else "visual", settled_s)
+                lit = self._set(stream)
         raise LightError("the thread that takes pairs was stopped.")
 
-    def _shows(self, frame: Captured, stream: Stream) -> bool:
-        """Whether a frame looks more like the last image of its stream than like that of the other one."""
-        if len(self._looks) < 2:
+    def _shows(self, frame: Captured) -> bool:
+        """Whether the image has changed since the switch by at least half as much as it does with the light."""
+        if self._reference is None or self._contrast is None:
             return True
-        share = light_share(thumbnail(frame.image), self._looks["visual"], self._looks["tactile"])
-        return (share if stream == "tactile" else 1 - share) > _DEPARTED
+        return difference(thumbnail(frame.image), self._reference) > _DEPARTED * self._contrast
 
     def _in_order(self, frame: Captured) -> bool:
         """Whether a frame is the next one after the last."""
@@ -434,7 +444,9 @@ class STS:
         return self._lit
 
     def _set(self, stream: Stream) -> Lit:
+        before = self._previous if self._lit is not None and self._stream != stream else None
         lit = self.leds.set(self._levels if stream == "tactile" else protocol.DARK)
+        self._reference = None if before is None else thumbnail(before.image)
         self._lit, self._stream, self._departed = lit, stream, 0
         return lit
 
@@ -456,7 +468,7 @@ class STS:
         delays: list[float] = []
         looks: list[Thumbnail] = []
         while not delays or delays[-1] < watch_s:
-            frame = self._camera.async_read()
+            frame = self._previous = self._camera.async_read()
             delays.append(frame.time_s - lit.acknowledged_s)
             looks.append(thumbnail(frame.image))
         return Switch(np.array(delays, np.float32), np.array(looks, np.float32))
