@@ -50,6 +50,6 @@ def test_pairs_of_a_held_and_released_object_are_of_the_right_light(tmp_path, la
     for shot in shots:
         exposure = log[places[checksum(shot.image)]]
         wanted = 1.0 if shot.stream == "tactile" else 0.0
-        assert (exposure.lowest, exposure.highest) == (wanted, wanted)
+        assert abs(exposure.lowest - wanted) + abs(exposure.highest - wanted) < 1e-6
         phases.add(exposure.phase)
     assert {"held", "still"} <= phases or {"held", "moving"} <= phases
