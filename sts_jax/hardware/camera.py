@@ -108,9 +108,12 @@ class Camera:
 
     @property
     def source(self) -> str:
-        """The source under which the camera is found again: its path with its serial number if it has one, or a URL."""
+        """The camera's identity: its path, which contains its serial number if it has one, or its URL.
+
+        User name and password of a URL are left out.
+        """
         config = _with_stable_path(self.config)
-        return devices.device_path(config.target) if config.kind == "device" else str(config.target)
+        return devices.device_path(config.target) if config.kind == "device" else config.public
 
     @property
     def locked(self) -> dict[str, float]:
