@@ -1,6 +1,7 @@
 """Commissioning against a sensor of a pseudo-terminal and a motion JPEG server that shows rendered boards."""
 
 import dataclasses
+import functools
 import math
 import time
 
@@ -16,7 +17,7 @@ import sts_jax as sts
 from experiments import commission
 from experiments.shared import boards
 from sts_jax import hardware
-from sts_jax.hardware import Device
+from sts_jax.hardware import Device, capture
 
 WIDTH, HEIGHT = 640, 480
 PINHOLE = sts.Sensor().camera
@@ -112,6 +113,14 @@ def held(folder, pictures, number=None):
     return folder
 
 
+def measure_briefly(monkeypatch):
+    """Fewer switches and pairs, and a shorter search for the controller."""
+    brief = functools.partialmethod(hardware.STS.measure_settling, 3, watch_s=0.5)
+    monkeypatch.setattr(hardware.STS, "measure_settling", brief)
+    monkeypatch.setattr(hardware.Leds, "connect", functools.partial(hardware.Leds.connect, timeout_s=1.0))
+    monkeypatch.setattr(commission, "BACKGROUNDS", 5)
+
+
 def hands(peer, monkeypatch, *, stop_at=None):
     """Replace the person: shows the next board at each request, and interrupts at one of them."""
     asked = []
@@ -136,6 +145,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
     config = dataclasses.replace(config, camera=peer.url)
     peer.folder = config.out / "board"
     hands(peer, monkeypatch, stop_at=4)
+    measure_briefly(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         commission.main(config)
     assert peer.leds.controller.levels == (0, 0, 0, 0)
@@ -173,7 +183,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
     view = hardware.rectified(device.lens, PINHOLE, pair.tactile.image, (60, 80))
     assert view.min() > 150  # no part of the view is outside of the raw image
 
-    with pytest.raises(hardware.WrongDeviceError, match="camera http://127.0.0.1:9/video"):
+    with pytest.raises(hardware.WrongDeviceError, match=r"camera http://127\.0\.0\.1:9/video"):
         hardware.STS.from_file(config.out, camera="http://127.0.0.1:9/video", leds=peer.path)
     with pytest.raises(hardware.PortNotFoundError, match="EMULATED was not found"):
         hardware.STS.from_file(config.out).connect()
@@ -193,7 +203,7 @@ def test_another_controller_on_the_port_is_refused(tmp_path, peer):
         commissioned="2026-05-31",
     )
     device.save(tmp_path / "bench", sts.Sensor().constants())
-    with pytest.raises(hardware.WrongDeviceError, match="LED controller OTHER, but .* LED controller EMULATED"):
+    with pytest.raises(hardware.WrongDeviceError, match=r"LED controller OTHER, but .* LED controller EMULATED"):
         hardware.STS.from_file(tmp_path / "bench", leds=peer.path).connect()
     hardware.Leds.connect(peer.path).close()  # the port is free again
 
@@ -293,6 +303,63 @@ def test_exposure_stops_at_the_limits(no_lag):
         hardware.choose_exposure(Metered(1.0, settable=False), longest=300)
 
 
+class Video:
+    """A V4L2 device of OpenCV that sees the lights and shows its exposure."""
+
+    def __init__(self, controller):
+        values = {"AUTO_EXPOSURE": 3, "EXPOSURE": 40, "AUTO_WB": 1, "WB_TEMPERATURE": 4600, "FPS": 100}
+        self.values = {getattr(cv2, f"CAP_PROP_{name}"): value for name, value in values.items()}
+        self.values |= {cv2.CAP_PROP_FRAME_WIDTH: 0, cv2.CAP_PROP_FRAME_HEIGHT: 0}
+        self.controller, self.number = controller, 0
+
+    def get(self, prop):
+        return float(self.values.get(prop, -1))
+
+    def set(self, prop, value):
+        if prop in self.values:
+            self.values[prop] = round(value)
+        return prop in self.values
+
+    def isOpened(self):
+        return True
+
+    def grab(self):
+        time.sleep(0.01)
+        self.number += 1
+        return True
+
+    def retrieve(self):
+        light = 2.0 + 8.0 * sum(self.controller.levels) / 1020
+        image = np.full((48, 64, 3), min(self.get(cv2.CAP_PROP_EXPOSURE) * light, 255), np.uint8)
+        image[:8, :8] = self.number % 2
+        return True, image
+
+    def release(self):
+        pass
+
+
+def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, capsys):
+    device = Video(peer.leds.controller)
+    monkeypatch.setattr(capture, "check_source", lambda config: None)
+    monkeypatch.setattr(capture, "_open", lambda config: device)
+    measure_briefly(monkeypatch)
+    config = dataclasses.replace(config, camera="0", width=64, height=48, ideal_lens=160.0, every=0.0)
+    commission.main(config)
+    assert "NOT calibrated" in capsys.readouterr().out
+    found = Device.load(config.out)
+    assert (found.camera, found.lens_from) == ("/dev/video0", "ideal")
+    assert found.white_balance == 4600
+    assert found.exposures is not None
+    assert found.exposures[0] > 3 * found.exposures[1]
+    for stream in ("visual", "tactile"):
+        assert 170 <= hardware.brightness(found.background(config.out, stream)) <= 230
+    with hardware.STS.from_file(config.out, leds=peer.path) as sensor:
+        for _ in range(3):
+            pair = sensor.read()
+            assert pair.visual.image[20, 20, 0] == round(min(2 * found.exposures[0], 255))
+            assert pair.tactile.image[20, 20, 0] == round(min(10 * found.exposures[1], 255))
+
+
 # ---- Options and devices
 
 
@@ -340,7 +407,8 @@ def test_bad_options_are_named(config, changes, message):
         commission.main(dataclasses.replace(config, **changes))
 
 
-def test_a_missing_port_and_another_device_are_named(config, tmp_path):
+def test_a_missing_port_and_another_device_are_named(config, tmp_path, monkeypatch):
+    measure_briefly(monkeypatch)
     config = dataclasses.replace(config, ideal_lens=160.0, every=0.0)
     with pytest.raises(hardware.PortNotFoundError, match="there is no port"):
         commission.main(config)
