@@ -272,10 +272,10 @@ def main(config: Config) -> None:
             say(f"background: mean of {BACKGROUNDS} pairs, noise {visual:.2f} (visual), {tactile:.2f} (tactile) of 255")
             rate = camera.statistics.rate
             assert rate is not None
-            limit = 1 / (2 / rate + (settling.visual_s + settling.tactile_s) / 2)
+            nominal = 1 / (2 / rate + (settling.visual_s + settling.tactile_s) / 2)
             say(
-                f"speed: {backgrounds.rate:.2f} pairs/s, {backgrounds.rate / limit:.0%} of the limit of {limit:.2f} "
-                "(two frames and the latency)"
+                f"speed: {backgrounds.rate:.2f} pairs/s, {backgrounds.rate / nominal:.0%} of {nominal:.2f}, which are "
+                "two frames and the mean latency a pair"
             )
             source: Literal["board", "ideal"] = "board" if config.ideal_lens is None else "ideal"
             if lens is None:

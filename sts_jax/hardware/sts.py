@@ -400,8 +400,10 @@ class STS:
         found = self._settled(on, off, period_s, watch_s)
         shorter_s = min(3 * max(found.visual_s, found.tactile_s) + 3 * period_s, watch_s)
         for number in range(1, switches):
-            time.sleep(period_s * (_PHASE * number % 1))
+            phase_s = period_s * (_PHASE * number % 1)  # a watch ends just after a frame
+            time.sleep(phase_s)
             on.append(self._watched("tactile", shorter_s))
+            time.sleep(phase_s)
             off.append(self._watched("visual", shorter_s))
         found = self._settled(on, off, period_s, shorter_s)
         self._looks = {"visual": off[-1].thumbnails[-1], "tactile": on[-1].thumbnails[-1]}
