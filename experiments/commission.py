@@ -228,8 +228,6 @@ def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
 def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> hardware.Lens:
     """The lens from pictures that are taken now, and those of an interrupted run."""
     folder, size = config.out / "board", (config.width, config.height)
-    claim = {"camera": sensor.camera.source, "width": config.width, "height": config.height}
-    _files.claim(folder / "camera.json", claim)
     pictures = boards.Pictures.read(folder, config.board, size)
     if pictures.names:
         say(f"board: {len(pictures.names)} pictures of an earlier run are kept. To start anew, delete {folder}")
@@ -241,6 +239,32 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
             f"{error} The pictures are kept: delete the bad ones, then run the same command again, with a larger "
             f"--pictures than {config.pictures} to add some."
         ) from error
+
+
+def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> None:
+    """Check that the folder belongs to this sensor or to none.
+
+    Raises:
+        ValueError: It has the sensor file of other devices.
+    """
+    try:
+        there = hardware.Device.load(config.out)
+    except (OSError, hardware.SensorFileError):
+        return  # there is none, or a damaged one, which is replaced
+    try:
+        there.check_identity(camera=camera.source, leds=leds.serial_number)
+    except hardware.WrongDeviceError as error:
+        raise ValueError(f"{config.out} has the file of another sensor: give another --out. {error}") from error
+
+
+def claim_pictures(config: Config, camera: hardware.Camera) -> None:
+    """Reserve the folder of live pictures for one camera, size and board.
+
+    Raises:
+        ValueError: It has pictures of others.
+    """
+    made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
+    _files.claim(config.out / "board" / "camera.json", made)
 
 
 def main(config: Config) -> None:
@@ -262,6 +286,9 @@ def main(config: Config) -> None:
     elif config.board_images is not None:
         lens = fit(boards.Pictures.read(config.board_images, config.board, size), pinhole)
     with opened(config) as (camera, leds):
+        check_folder(config, camera, leds)
+        if lens is None:
+            claim_pictures(config, camera)
         boards.wait("Take everything off the pad, and leave the sensor untouched.", config.every)
         exposures = expose(config, camera, leds)
         with hardware.STS(camera=camera, leds=leds, levels=config.levels, exposures=exposures).connect() as sensor:

@@ -187,8 +187,14 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
         hardware.STS.from_file(config.out, camera="http://127.0.0.1:9/video", leds=peer.path)
     with pytest.raises(hardware.PortNotFoundError, match="EMULATED was not found"):
         hardware.STS.from_file(config.out).connect()
+    camera = hardware.Camera(hardware.CameraConfig("http://127.0.0.1:9/video"))
     with pytest.raises(ValueError, match=r"board/camera.json was made with camera = "):
-        commission._files.claim(peer.folder / "camera.json", {"camera": "other", "width": WIDTH, "height": HEIGHT})
+        commission.claim_pictures(config, camera)
+    with (
+        hardware.Leds.connect(peer.path) as leds,
+        pytest.raises(ValueError, match="file of another sensor: give another"),
+    ):
+        commission.check_folder(config, camera, leds)
 
 
 def test_another_controller_on_the_port_is_refused(tmp_path, peer):

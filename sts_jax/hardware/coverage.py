@@ -10,6 +10,9 @@ from sts_jax.hardware.lens import Lens, Pinhole, rectification, window
 
 _RESOLUTION = 480, 640  # pixels of the view at which it is checked
 _EXTRAPOLATION = math.radians(3)  # by which the view may exceed the corners of all boards
+# Share of the image's width and height, from each border. Where a lens of 160 degrees sees the view's border. The board
+# on the pad ends before it.
+_OUTER = 0.2
 _ROWS = "top", "middle", "bottom"
 _COLUMNS = "left", "centre", "right"
 PARTS = tuple(f"{row} {column}" for row in _ROWS for column in _COLUMNS)
@@ -57,16 +60,16 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
 
 
 def covered(found: Sequence[FoundCorners], size: tuple[int, int]) -> tuple[str, ...]:
-    """The parts of the raw image that contain corners of a board.
+    """The parts of the raw image that contain corners of a board: the middle, and the outer fifths at the borders.
 
     Args:
         found: the corners of each image.
         size: width and height of the raw images (pixels).
 
     Returns:
-        Names of thirds in both directions, such as "top left", in the order of `coverage.PARTS`.
+        Names such as "top left", in the order of `coverage.PARTS`.
     """
     pixels = np.concatenate([np.zeros((0, 2)), *(corners.pixels for corners in found)])
-    thirds = np.clip((3 * (pixels + 0.5) / np.asarray(size)).astype(int), 0, 2)
+    thirds = np.digitize((pixels + 0.5) / np.asarray(size), [_OUTER, 1 - _OUTER])
     present = {f"{_ROWS[row]} {_COLUMNS[column]}" for column, row in thirds}
     return tuple(part for part in PARTS if part in present)
