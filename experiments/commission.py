@@ -2,7 +2,7 @@
 
     python -m experiments.commission                                    # list cameras and serial ports
     python -m experiments.commission --print-board board.pdf            # the board to print
-    python -m experiments.commission --camera /dev/video0 --leds /dev/ttyACM0 --out bench     # about five minutes
+    python -m experiments.commission --camera /dev/video0 --leds /dev/ttyACM0 --out bench
 
 Finds the exposure of each stream, measures the switching latency, records backgrounds, and calibrates the lens from
 pictures of the board. Writes OUT/sensor.json, which `Sensor.load` and `hardware.STS.from_file` read. The pictures in
@@ -251,10 +251,11 @@ def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -
         there = hardware.Device.load(config.out)
     except (OSError, hardware.SensorFileError):
         return  # there is none, or a damaged one, which is replaced
-    try:
-        there.check_identity(camera=camera.source, leds=leds.serial_number)
-    except hardware.WrongDeviceError as error:
-        raise ValueError(f"{config.out} has the file of another sensor: give another --out. {error}") from error
+    if (there.camera, there.leds) != (camera.source, leds.serial_number):
+        raise ValueError(
+            f"{config.out} has the file of another sensor, of camera {there.camera} and LED controller {there.leds}: "
+            "give another --out, or delete the file"
+        )
 
 
 def claim_pictures(config: Config, camera: hardware.Camera) -> None:

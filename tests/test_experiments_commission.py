@@ -261,6 +261,37 @@ def test_few_pictures_name_their_folder(tmp_path, pictures):
         read.fit(PINHOLE)
 
 
+class Handheld:
+    """A sensor whose camera returns given images. It is its own camera."""
+
+    def __init__(self, images):
+        self.images, self.camera = list(images), self
+
+    def stream(self, duty):
+        yield duty
+
+    def read(self):
+        return hardware.Captured(self.images.pop(0), 0.0, 0, 0, 0, 0, False)
+
+
+def test_pictures_without_or_with_a_moving_board_are_not_kept(tmp_path, pictures):
+    blank, there = np.full_like(pictures[0], 90), pictures[0]
+    moved = np.roll(there, 4, axis=1)
+    sensor, lines = Handheld([blank, blank, moved, there, there, there]), []
+    taken = boards.take(
+        boards.Pictures(tmp_path, hardware.Board(), (WIDTH, HEIGHT)), sensor, 1, every=0.0, say=lines.append
+    )
+    assert [line.split(",")[0] for line in lines] == [
+        "  not kept: 0 corners of the board were found",
+        "  not kept: the board moved",
+        "  000.png: 64 corners",
+    ]
+    assert taken.names == ("000.png",)
+    assert [path.name for path in tmp_path.iterdir()] == ["000.png"]
+    read = boards.Pictures.read(tmp_path, hardware.Board(), (WIDTH, HEIGHT))
+    np.testing.assert_array_equal(read.found[0].pixels, taken.found[0].pixels)
+
+
 def test_covered_parts_are_named():
     corners = hardware.FoundCorners(np.arange(2), np.array([[1.0, 1.0], [WIDTH - 1.0, HEIGHT / 2]]))
     assert hardware.covered([corners], (WIDTH, HEIGHT)) == ("top left", "middle right")
