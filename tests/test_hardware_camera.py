@@ -657,6 +657,29 @@ def test_a_device_is_locked_after_its_warm_up_and_again_after_a_loss(device):
         assert device.get(cv2.CAP_PROP_AUTO_WB) == 0
 
 
+def test_the_exposure_of_a_device_is_set_between_frames_and_again_after_a_loss(device):
+    with Camera(config(0, lock=True)).connect(warmup_s=0.05) as camera:
+        assert camera.locked == {"exposure": 157, "white_balance": 4600}
+        assert camera.set_exposure(80.4) == 80
+        assert camera.locked == {"exposure": 80, "white_balance": 4600}
+        device.plugged = False
+        assert next_error(camera, CameraLostError)
+        device.set(cv2.CAP_PROP_EXPOSURE, 157)
+        device.plugged = True
+        assert next_frame(camera).epoch == 1
+        assert device.get(cv2.CAP_PROP_EXPOSURE) == 80
+        device.stuck = {cv2.CAP_PROP_AUTO_EXPOSURE}
+        device.values[cv2.CAP_PROP_AUTO_EXPOSURE] = 3
+        assert camera.set_exposure(60) is None
+        with pytest.raises(ValueError, match="exposure must be > 0, got 0"):
+            camera.set_exposure(0)
+
+
+def test_the_exposure_of_a_stream_is_left_to_its_server(server):
+    with connected(server) as camera, pytest.raises(CameraError, match="set it at its server"):
+        camera.set_exposure(80)
+
+
 def test_a_device_that_refuses_a_setting_is_warned_about(device):
     device.stuck = {cv2.CAP_PROP_AUTO_WB}
     with pytest.warns(UserWarning, match=r"camera 0 did not accept a setting. AUTO_WB: asked for 0, found 1"):

@@ -11,7 +11,7 @@ from sensor_peer import CORNER, DARK, LIT, SensorPeer
 from sts_jax import hardware
 from sts_jax.hardware.settling import Settling, Switch, settling
 
-SETTLING = Settling(visual_s=0.1, tactile_s=0.1, contrast=30.0)
+SETTLING = Settling(visual_s=0.1, tactile_s=0.1)
 
 
 def config(url, **changes):
@@ -59,7 +59,6 @@ def test_measured_settling_covers_lag_and_exposure(tmp_path, lag_s, exposure_s):
         with hardware.STS(camera=config(peer.url), leds=peer.path).connect(0.2) as sensor:
             assert sensor.settling.visual_s > lag_s + exposure_s
             assert sensor.settling.tactile_s > lag_s + exposure_s
-            np.testing.assert_allclose(sensor.settling.contrast, LIT - DARK, rtol=0.1)
             assert all(judged(peer, shot) for _ in range(10) for shot in _both(sensor.read()))
     finally:
         peer.stop()
@@ -75,7 +74,7 @@ def test_settling_time_of_known_switches_is_that_of_the_last_mixed_frame():
     delays = np.array([-0.01, 0.01, 0.03, 0.05, 0.07, 0.09], np.float32)
     on, off = Switch(delays, dark + mixes * lit), Switch(delays + 0.001, lit - mixes * lit)
     found = settling([on, on], [off], period_s=0.02)
-    np.testing.assert_allclose((found.tactile_s, found.visual_s, found.contrast), (0.07, 0.071, 100), rtol=1e-5)
+    np.testing.assert_allclose((found.tactile_s, found.visual_s), (0.07, 0.071), rtol=1e-5)
     with pytest.raises(hardware.NoContrastError, match="wiring"):
         settling([on], [on], period_s=0.02)
 
@@ -226,8 +225,8 @@ def test_bad_calls_are_refused(sensor):
         sensor.read(timeout_ms=0)
     with pytest.raises(ValueError, match="max_age_ms must be > 0, got -1"):
         sensor.read_latest(-1)
-    with pytest.raises(ValueError, match="contrast must be at least 2"):
-        dataclasses.replace(sensor.settling, contrast=1.0)
+    with pytest.raises(ValueError, match=r"visual_s must be in \(0, 60\) s, got 0"):
+        dataclasses.replace(sensor.settling, visual_s=0.0)
 
 
 @pytest.mark.slow

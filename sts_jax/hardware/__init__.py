@@ -27,7 +27,9 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
+from sts_jax.hardware.coverage import check_view, covered, view_angle
 from sts_jax.hardware.devices import FoundCamera, find_cameras
+from sts_jax.hardware.exposure import Exposed, brightness, choose_exposure
 from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
@@ -68,6 +70,7 @@ __all__ = [
     "Device",
     "DisconnectedError",
     "EndOfVideoError",
+    "Exposed",
     "FoundCamera",
     "FoundCorners",
     "FoundSensors",
@@ -95,7 +98,11 @@ __all__ = [
     "WrongDeviceError",
     "WrongVersionError",
     "board_image",
+    "brightness",
     "calibrate",
+    "check_view",
+    "choose_exposure",
+    "covered",
     "distorted",
     "distortion",
     "find_board",
@@ -108,4 +115,5 @@ __all__ = [
     "rectification",
     "rectified",
     "save_board",
+    "view_angle",
 ]

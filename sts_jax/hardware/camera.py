@@ -106,6 +106,39 @@ class Camera:
         """The settings that the driver did not accept when it was last opened."""
         return tuple(self._connected().refused)
 
+    @property
+    def source(self) -> str:
+        """The camera's identity: its path, which contains its serial number if it has one, or its URL.
+
+        User name and password of a URL are left out.
+        """
+        config = _with_stable_path(self.config)
+        return devices.device_path(config.target) if config.kind == "device" else config.public
+
+    @property
+    def locked(self) -> dict[str, float]:
+        """The values of the locked settings of a device, by field of `CameraConfig`. Empty for streams and files."""
+        return self._connected().held
+
+    def set_exposure(self, exposure: float) -> float | None:
+        """Set the exposure of a device, between two frames. The frames that show it first come some frames later.
+
+        Args:
+            exposure: in the driver's unit (V4L2: 0.1 ms).
+
+        Returns:
+            The exposure that the device has now, which drivers round and limit. None: the driver does not let it be
+            set.
+
+        Raises:
+            CameraError: the source is no device, or no frame has arrived in time.
+        """
+        if not exposure > 0:
+            raise ValueError(f"exposure must be > 0, got {exposure}")
+        if self.config.kind != "device":
+            raise CameraError(f"the exposure of {self.config.name} is not set from here: set it at its server.")
+        return self._connected().set_exposure(exposure, self.config.timeout_s)
+
     def read(self, timeout_ms: float | None = None) -> Captured:
         """Return a frame that was exposed after the call.
 

@@ -76,6 +76,11 @@ class CameraConfig:
         return "device" if self.target.startswith("/dev/") or Path(self.target).is_char_device() else "file"
 
     @property
+    def public(self) -> str:
+        """The source without the user name and password of a URL."""
+        return re.sub(r"(?<=://)[^/@]*@", "", str(self.target))
+
+    @property
     def name(self) -> str:
         """The source for messages. A password in a URL is hidden."""
         if isinstance(self.target, int):

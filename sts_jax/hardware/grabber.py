@@ -53,6 +53,7 @@ class Grabber:
         self._epoch = -1
         self._opened = False
         self._settle = False  # the settings are to be locked at their current values
+        self._wanted: float | None = None  # exposure that is to be set
         self._held: dict[str, float] = settings.asked(config) if config.kind == "device" else {}
         self.refused: list[str] = []
         self._stop = threading.Event()
@@ -105,6 +106,32 @@ class Grabber:
                 raise self._problem() if self._problem is not None else self._timeout(timeout_s)
             self._queue.clear()
             return list(self.refused)
+
+    def set_exposure(self, value: float, timeout_s: float) -> float | None:
+        """Set the exposure between two frames. A lost camera is waited for.
+
+        Returns:
+            The exposure that the device has now, or None if it cannot be set.
+
+        Raises:
+            CameraError: no frame has arrived meanwhile.
+        """
+        with self._changed:
+            self._wanted = value
+            self._changed.wait_for(lambda: self._wanted is None or self._ended(), timeout_s)
+            if self._wanted is not None:
+                self._wanted = None
+                raise self._problem() if self._problem is not None else self._timeout(timeout_s)
+            return self._held.get("exposure")
+
+    def _ended(self) -> bool:
+        return self._stop.is_set() or (self._problem is not None and self._problem.final)
+
+    @property
+    def held(self) -> dict[str, float]:
+        """The values of the locked settings, by field of `CameraConfig`."""
+        with self._changed:
+            return dict(self._held)
 
     @property
     def running(self) -> bool:
@@ -306,6 +333,7 @@ class Grabber:
             image.flags.writeable = False
             self._publish(Captured(image, time_s, sequence, self._epoch, dropped, repeats, black))
             self._settle_now(capture)
+            self._expose_now(capture)
         return False
 
     def _turn(self, playback: "_Playback") -> bool:
@@ -341,6 +369,20 @@ class Grabber:
             self._held = held
             self.refused = capture.warnings + [str(refusal) for refusal in refusals]
             self._settle = False
+            self._changed.notify_all()
+
+    def _expose_now(self, capture: Capture) -> None:
+        """Set the exposure if this was asked for."""
+        wanted = self._wanted
+        if wanted is None:
+            return
+        held, refusals = settings.lock(capture.properties, {"exposure": wanted})
+        automatic = any(refusal.name == "AUTO_EXPOSURE" for refusal in refusals)
+        with self._changed:
+            self._held.pop("exposure", None)
+            if not automatic:
+                self._held.update(held)
+            self._wanted = None
             self._changed.notify_all()
 
     def _count(self, **more: int) -> None:

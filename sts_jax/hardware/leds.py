@@ -112,6 +112,38 @@ class Leds:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
         return cls(port, baud=baud, timeout_s=timeout_s, answer_s=answer_s, watchdog_ms=watchdog_ms)
 
+    @classmethod
+    def find(cls, serial_number: str, *, timeout_s: float = 5.0) -> "Leds":
+        """Open the controller with a serial number.
+
+        The controller states its number itself, so USB ports are opened one after the other until it is found. Ports
+        whose USB serial number is the same come first. Opening a port restarts most boards.
+
+        Args:
+            serial_number: Serial number of the controller, which `Leds.serial_number` has.
+            timeout_s: Longest time until the device on a port answers (s).
+
+        Raises:
+            PortNotFoundError: It is on none of the ports. The message lists them with what was found.
+        """
+        tried = {}
+        candidates = [port for port in ports.find_controllers() if port.vendor is not None]
+        for port in sorted(candidates, key=lambda port: port.serial_number != serial_number):
+            try:
+                leds = cls.connect(port.device, timeout_s=timeout_s)
+            except ports.LedError as error:
+                tried[port.device] = str(error)
+                continue
+            if leds.serial_number == serial_number:
+                return leds
+            tried[port.device] = f"controller {leds.serial_number}"
+            leds.close()
+        found = ", ".join(f"{name} ({result})" for name, result in tried.items()) or "none"
+        raise ports.PortNotFoundError(
+            f"LED controller {serial_number} was not found. Connect it by USB, or give the name of its port. USB ports "
+            f"tried: {found}."
+        )
+
     @property
     def port(self) -> str:
         """Name of the port."""

@@ -19,6 +19,7 @@ from PIL import Image
 
 from sts_jax import _files
 from sts_jax.hardware import protocol
+from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.lens import Lens
 
 VERSION = 1  # of the format of the object "device"
@@ -72,6 +73,10 @@ class Device:
     exposure_tactile: float | None = None  # in the driver's unit, None: not set
     background_visual: Background | None = None  # raw image, light off
     background_tactile: Background | None = None  # raw image, light on
+    fourcc: str | None = None  # pixel format of the camera, None: the driver's
+    white_balance: float | None = None  # K, None: not set
+    focus: float | None = None  # in the driver's unit, None: not set
+    lens_from: str = "board"  # "board": calibrated from pictures of a board, "ideal": assumed without error
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "camera", _public(self.camera))
@@ -80,7 +85,16 @@ class Device:
                 raise ValueError(f"{name} must not be empty")
         if not (self.fps > 0 and math.isfinite(self.fps)):
             raise ValueError(f"fps must be > 0 and finite, got {self.fps}")
-        for name in ("settle_on_s", "settle_off_s", "exposure_visual", "exposure_tactile"):
+        if self.lens_from not in ("board", "ideal"):
+            raise ValueError(f"lens_from must be 'board' or 'ideal', got {self.lens_from!r}")
+        for name in (
+            "settle_on_s",
+            "settle_off_s",
+            "exposure_visual",
+            "exposure_tactile",
+            "white_balance",
+            "focus",
+        ):
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"{name} must be finite, got {value}")
@@ -103,6 +117,30 @@ class Device:
     def height(self) -> int:
         """Height of the raw images (pixels)."""
         return self.lens.height
+
+    @property
+    def exposures(self) -> tuple[float, float] | None:
+        """Exposures of the visual and the tactile stream, or None if one of them is not set."""
+        if self.exposure_visual is None or self.exposure_tactile is None:
+            return None
+        return self.exposure_visual, self.exposure_tactile
+
+    def camera_config(self, source: str | None = None) -> CameraConfig:
+        """The configuration with which the camera was commissioned.
+
+        Args:
+            source: another name of the same camera, such as its URL with a password. None: that of the file.
+        """
+        config = CameraConfig(self.camera if source is None else source, self.width, self.height, fps=self.fps)
+        if config.kind != "device":
+            return dataclasses.replace(config, lock=False)
+        return dataclasses.replace(
+            config,
+            fourcc=self.fourcc,
+            exposure=self.exposure_visual,
+            white_balance=self.white_balance,
+            focus=self.focus,
+        )
 
     def save(
         self,

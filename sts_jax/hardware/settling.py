@@ -24,15 +24,12 @@ class Settling:
 
     visual_s: float  # after the lights went off (s)
     tactile_s: float  # after the lights went on (s)
-    contrast: float  # mean difference of both lights' thumbnails, of 255
 
     def __post_init__(self) -> None:
         for name in ("visual_s", "tactile_s"):
             value = getattr(self, name)
             if not 0 < value < 60:
                 raise ValueError(f"{name} must be in (0, 60) s, got {value}")
-        if not self.contrast >= _LEAST_CONTRAST:
-            raise ValueError(f"contrast must be at least {_LEAST_CONTRAST} of 255, got {self.contrast}")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,7 +84,7 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
             "exposure."
         )
     last_off, last_on = (max(last_mixed(switch, dark, lit) for switch in switches) for switches in (off, on))
-    return Settling(last_off + period_s, last_on + period_s, contrast)
+    return Settling(last_off + period_s, last_on + period_s)
 
 
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:

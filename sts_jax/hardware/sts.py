@@ -1,6 +1,7 @@
 """`STS`: camera and lights as one sensor. Every image is proven to be of one light."""
 
 import dataclasses
+import os
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,12 @@ from jaxtyping import UInt8
 from sts_jax.hardware import protocol
 from sts_jax.hardware.camera import Camera
 from sts_jax.hardware.camera_config import CameraConfig
-from sts_jax.hardware.camera_errors import CameraLostError, CameraNotConnectedError, StaleFrameError
+from sts_jax.hardware.camera_errors import CameraError, CameraLostError, CameraNotConnectedError, StaleFrameError
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
+from sts_jax.hardware.sensor_file import Device
 from sts_jax.hardware.settling import Settling, Switch, Thumbnail, difference, settling, thumbnail
 
 Stream = Literal["visual", "tactile"]
@@ -102,6 +104,7 @@ class STS:
         leds: str | Leds,
         levels: Sequence[int] = (255, 255, 255, 255),
         settling: Settling | None = None,
+        exposures: tuple[float, float] | None = None,
         timeout_s: float = 5.0,
         reconnect_s: float = 30.0,
     ):
@@ -113,12 +116,16 @@ class STS:
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255. All are 0 in the visual stream.
             settling: Times after which a switch shows, from the sensor file or an earlier connection. None: measured by
                 `connect`, which needs a scene at rest.
+            exposures: Exposure of the visual and of the tactile stream, in the unit of the camera's driver, set at each
+                switch of the lights. None: the camera's own. Needs a camera that is a device.
             timeout_s: Longest time of one image (s), without the time of a reconnection.
             reconnect_s: Longest search for a lost controller (s).
 
         Raises:
-            ValueError: A level is out of range or all are 0, or a time is not positive.
+            ValueError: A level is out of range or all are 0, or a time or an exposure is not positive.
         """
+        if exposures is not None and not min(exposures) > 0:
+            raise ValueError(f"exposures must be > 0, got {exposures}")
         self._levels = checked_levels(levels)
         for name, value in (("timeout_s", timeout_s), ("reconnect_s", reconnect_s)):
             if not 0 < value < float("inf"):
@@ -131,6 +138,8 @@ class STS:
         self._port = leds
         self._leds: Leds | None = leds if isinstance(leds, Leds) else None
         self._settling = settling
+        self._exposures = exposures
+        self._device: Device | None = None
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
         self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
         self._stream: Stream = "visual"
@@ -141,6 +150,64 @@ class STS:
         self._background: _Background | None = None
         self._stopping = False  # whether the thread in the background is to end
         self.discarded = 0  # frames that could not be proven to be of one light
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | os.PathLike,
+        *,
+        camera: CameraConfig | str | None = None,
+        leds: str | None = None,
+        timeout_s: float = 5.0,
+        reconnect_s: float = 30.0,
+    ) -> "STS":
+        """The sensor of a file that `python -m experiments.commission` wrote.
+
+        ```python
+        with STS.from_file("bench") as sensor:
+            pair = sensor.read()
+        ```
+
+        The camera is the one at the path or URL of the file. The LED controller is looked for on all USB ports by its
+        serial number. Size, rate, exposures, light levels and settling times are those of the file, so the scene need
+        not be at rest.
+
+        Args:
+            path: Path of the sensor file or of its folder.
+            camera: Source of the camera, such as its URL with a password, or its whole configuration. None: that of the
+                file.
+            leds: Port of the controller, such as a pseudo-terminal, which is not on the list of USB ports. None: found
+                by `connect`.
+            timeout_s: As in `STS`.
+            reconnect_s: As in `STS`.
+
+        Returns:
+            The sensor, which is not connected yet.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            SensorFileError: The file is damaged or describes no device.
+            WrongDeviceError: The camera is not the one of the file. `connect` raises it if the controller is not.
+        """
+        device = Device.load(path)
+        config = camera if isinstance(camera, CameraConfig) else device.camera_config(camera)
+        device.check_identity(camera=Camera(config).source)
+        sensor = cls(
+            camera=config,
+            leds=leds or "",
+            levels=device.levels,
+            settling=Settling(device.settle_off_s, device.settle_on_s),
+            exposures=device.exposures if config.kind == "device" else None,
+            timeout_s=timeout_s,
+            reconnect_s=reconnect_s,
+        )
+        sensor._device = device
+        return sensor
+
+    @property
+    def device(self) -> Device | None:
+        """The content of the sensor file, or None if the sensor was not made by `from_file`."""
+        return self._device
 
     @property
     def camera(self) -> Camera:
@@ -182,10 +249,16 @@ class STS:
             LedError: The controller cannot be opened. Subclasses name the cause.
             CameraError: The camera cannot be opened. Subclasses name the cause.
             NoContrastError: The lights do not change the image.
+            WrongDeviceError: The controller is not the one of the sensor file.
         """
         if self._leds is None:
-            self._leds = Leds.connect(str(self._port))
+            if self._device is not None and not self._port:
+                self._leds = Leds.find(self._device.leds)
+            else:
+                self._leds = Leds.connect(str(self._port))
         try:
+            if self._device is not None:
+                self._device.check_identity(leds=self._leds.serial_number)
             if not self._camera.is_connected:
                 self._camera.connect(warmup_s)
             if self._settling is None:
@@ -334,11 +407,13 @@ class STS:
         found = self._settled(on, off, period_s, watch_s)
         shorter_s = min(3 * max(found.visual_s, found.tactile_s) + 3 * period_s, watch_s)
         for number in range(1, switches):
-            time.sleep(period_s * (_PHASE * number % 1))
+            phase_s = period_s * (_PHASE * number % 1)  # a watch ends just after a frame
+            time.sleep(phase_s)
             on.append(self._watched("tactile", shorter_s))
+            time.sleep(phase_s)
             off.append(self._watched("visual", shorter_s))
         found = self._settled(on, off, period_s, shorter_s)
-        self._contrast = found.contrast
+        self._contrast = difference(off[-1].thumbnails[-1], on[-1].thumbnails[-1])
         return found
 
     def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
@@ -445,10 +520,20 @@ class STS:
 
     def _set(self, stream: Stream) -> Lit:
         before = self._previous if self._lit is not None and self._stream != stream else None
+        if self._exposures is not None and self._exposures[0] != self._exposures[1]:
+            self._expose(self._exposures[stream == "tactile"])
         lit = self.leds.set(self._levels if stream == "tactile" else protocol.DARK)
         self._reference = None if before is None else thumbnail(before.image)
         self._lit, self._stream, self._departed = lit, stream, 0
         return lit
+
+    def _expose(self, exposure: float) -> None:
+        """Set the exposure before the lights, so that the settling covers both."""
+        if self._camera.set_exposure(exposure) is None:
+            raise CameraError(
+                f"the driver of {self._camera.config.name} does not let the exposure be set to {exposure:g}: give "
+                "exposures=None."
+            )
 
     def _proof(self, before: Lit, then: Stream | None) -> float | None:
         """The time until which the lights are proven to be unchanged, or None if they changed. May switch them."""

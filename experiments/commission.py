@@ -1,0 +1,348 @@
+"""Commission a real sensor: from its camera and LED controller to the sensor file.
+
+    python -m experiments.commission                                    # list cameras and serial ports
+    python -m experiments.commission --print-board board.pdf            # the board to print
+    python -m experiments.commission --camera /dev/video0 --leds /dev/ttyACM0 --out bench
+
+Finds the exposure of each stream, measures the switching latency, records backgrounds, and calibrates the lens from
+pictures of the board. Writes OUT/sensor.json, which `Sensor.load` and `hardware.STS.from_file` read. The pictures in
+OUT/board are kept, so the same command continues after an interruption.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import math
+import shlex
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+from jaxtyping import UInt8
+
+import sts_jax as sts
+from experiments.shared import boards, errors, output
+from experiments.shared.command import Folder
+from sts_jax import _files, hardware
+
+BACKGROUNDS = 20  # pairs of images whose mean is the background
+FRAME_SHARE = 0.9  # of the time between two frames, the longest exposure
+DARK = (0, 0, 0, 0)  # levels of the visual stream
+V4L2_UNIT = 1e-4  # s, unit of a device's exposure
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """The devices, the folder, and the source of the lens."""
+
+    camera: str | None = None  # path such as /dev/v4l/by-id/..., or URL. Default: list the cameras
+    leds: str | None = None  # port such as /dev/ttyACM0. Default: list the ports
+    out: Folder = Path("bench")  # folder for the sensor file
+    width: int = 1640  # pixels
+    height: int = 1232  # pixels
+    fps: float | None = None  # frames per second (default: the camera's)
+    fourcc: str | None = None  # pixel format of the camera, such as MJPG (default: the driver's)
+    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # of the LED channels in the tactile stream, 0 to 255
+    board_images: Path | None = None  # a folder of PNG files instead of live pictures. First by name: board on the pad
+    ideal_lens: float | None = None  # degrees, field of view of an assumed lens, instead of pictures
+    pictures: int = 15  # live pictures of the board
+    every: float | None = None  # s, waits instead of the Enter key
+    ruler: float = 100.0  # mm, measured length of the printed ruler, which is 100 mm at the right scale
+    print_board: Path | None = None  # write the board to this PDF or PNG file and stop
+
+    @property
+    def board(self) -> hardware.Board:
+        """The board as it was printed."""
+        scale, nominal = self.ruler / 100, hardware.Board()
+        return dataclasses.replace(nominal, square=scale * nominal.square, marker=scale * nominal.marker)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Backgrounds:
+    """The mean images of both streams with nothing on the pad."""
+
+    visual: UInt8[np.ndarray, "height width 3"]
+    tactile: UInt8[np.ndarray, "height width 3"]
+    noise: tuple[float, float]  # standard deviation of one pixel over time in each stream, of 255
+    rate: float  # pairs per second
+
+
+def check(config: Config) -> None:
+    """Check the options before any work.
+
+    Raises:
+        ValueError: An option is out of range, or two contradict each other.
+        OSError: The folder of pictures does not exist, or `out` cannot be written to.
+    """
+    hardware.CameraConfig(config.camera or 0, config.width, config.height, fps=config.fps, fourcc=config.fourcc)
+    hardware.sts.checked_levels(config.levels)
+    if config.board_images is not None and config.ideal_lens is not None:
+        raise ValueError("--board-images and --ideal-lens contradict each other: give one of them")
+    if config.ideal_lens is not None and not 0 < config.ideal_lens <= 360:
+        raise ValueError(f"ideal-lens is {config.ideal_lens:g}, but it must be an angle from 0 to 360 degrees")
+    if config.every is not None and not 0 <= config.every < math.inf:
+        raise ValueError(f"every is {config.every}, but it must be >= 0 seconds")
+    if config.pictures < hardware.calibration.FEWEST_IMAGES:
+        raise ValueError(f"pictures is {config.pictures}, but it must be >= {hardware.calibration.FEWEST_IMAGES}")
+    if not 80 <= config.ruler <= 120:
+        raise ValueError(
+            f"ruler is {config.ruler:g} mm, but it must be 80 to 120 mm: measure the line of 100 mm on the print"
+        )
+    if config.board_images is not None and not config.board_images.is_dir():
+        raise FileNotFoundError(f"there is no folder {config.board_images}: give the folder of the board's pictures")
+    output.make_folder(config.out)
+
+
+def find(config: Config) -> str:
+    """The cameras and ports of this machine, and the command to run next.
+
+    Raises:
+        ValueError: A device that is not given was not found.
+    """
+    found, lines, words = hardware.find_sensors(), [], ["python", "-m", "experiments.commission"]
+    ports = [port for port in found.ports if port.vendor is not None]
+    cameras = [str(camera) for camera in found.cameras]
+    for option, given, there, names, remedy in (
+        ("--camera", config.camera, cameras, [c.source for c in found.cameras], "connect it, or give the URL of one"),
+        (
+            "--leds",
+            config.leds,
+            [f"{port.device} ({port.description}, serial number {port.serial_number})" for port in ports],
+            [port.device for port in ports],
+            "connect the controller by USB, or give the name of another port",
+        ),
+    ):
+        if given is not None:
+            words += [option, given]
+            continue
+        kind = {"--camera": "camera", "--leds": "USB serial port"}[option]
+        if not there:
+            raise ValueError(f"no {kind} was found: {remedy} with {option}")
+        lines += [f"{kind}s:", *(f"  {line}" for line in there)]
+        words += [option, names[0] if len(names) == 1 else option[2:].upper()]
+    return "\n".join([*lines, f"next: {shlex.join([*words, '--out', str(config.out)])}"])
+
+
+@contextlib.contextmanager
+def opened(config: Config) -> Iterator[tuple[hardware.Camera, hardware.Leds]]:
+    """Open both devices. The lights are off."""
+    assert config.camera is not None
+    assert config.leds is not None
+    source = hardware.CameraConfig(
+        config.camera, config.width, config.height, fps=config.fps, fourcc=config.fourcc, buffer=8
+    )
+    with hardware.Leds.connect(config.leds) as leds:
+        say(f"LED controller {leds.serial_number}: {leds.board}, firmware {leds.firmware}")
+        with hardware.Camera(dataclasses.replace(source, lock=source.kind == "device")) as camera:
+            while camera.statistics.rate is None:
+                camera.async_read()
+            say(f"camera {camera.source}: {config.width} x {config.height}, {camera.statistics.rate:.1f} frames/s")
+            yield camera, leds
+
+
+def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tuple[float, float] | None:
+    """Choose the exposure of each stream, or None if it is not set from here."""
+    now, rate = camera.locked.get("exposure"), camera.statistics.rate
+    assert rate is not None
+    settable = now is not None and now > 0 and camera.set_exposure(now) is not None
+    chosen = []
+    for stream, levels in (("visual", DARK), ("tactile", config.levels)):
+        leds.set(levels)
+        if settable:
+            exposure, seen = hardware.choose_exposure(camera, longest=FRAME_SHARE / rate / V4L2_UNIT)
+            chosen.append(exposure)
+            words = f"{exposure:g} in the driver's unit"
+        else:
+            time.sleep(hardware.exposure.LAG_S)
+            seen = hardware.brightness(camera.read().image)
+            words = "left to the server" if camera.config.kind == "stream" else "the driver does not let it be set"
+        if seen >= hardware.exposure.SATURATED:
+            words += f". SATURATED: {'lower --levels' if stream == 'tactile' else 'darken the room'}"
+            words += "" if settable else ", or lower the exposure at the camera"
+        say(f"exposure of the {stream} stream: brightness {seen:.0f} of 255, {words}")
+    leds.set(DARK)
+    return (chosen[0], chosen[1]) if settable else None
+
+
+def record(sensor: hardware.STS) -> Backgrounds:
+    """Record the backgrounds, the noise and the number of pairs per second."""
+    sums: dict[str, np.ndarray] = {}
+    squares: dict[str, np.ndarray] = {}
+    taken_s = 0.0
+    sensor.wait_until_still()
+    sensor.read()
+    for _ in range(BACKGROUNDS):
+        start = time.monotonic()
+        pair = sensor.read()
+        taken_s += time.monotonic() - start
+        for shot in (pair.visual, pair.tactile):
+            image = shot.image.astype(np.uint32)
+            sums[shot.stream] = sums.get(shot.stream, 0) + image
+            squares[shot.stream] = squares.get(shot.stream, 0) + image**2
+    means, noise = [], []
+    for stream in ("visual", "tactile"):
+        mean = sums[stream] / BACKGROUNDS
+        variance = (squares[stream] / BACKGROUNDS - mean**2) * BACKGROUNDS / (BACKGROUNDS - 1)
+        means.append(np.round(mean).astype(np.uint8))
+        noise.append(math.sqrt(max(float(variance.mean()), 0.0)))
+    return Backgrounds(means[0], means[1], (noise[0], noise[1]), BACKGROUNDS / taken_s)
+
+
+def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
+    """The lens that is assumed.
+
+    Raises:
+        CalibrationError: The raw image would not show the whole view.
+    """
+    assert config.ideal_lens is not None
+    lens = hardware.Lens.ideal(
+        config.width,
+        config.height,
+        field_of_view=math.radians(config.ideal_lens),
+        distance=float(pinhole.distance),
+    )
+    hardware.check_view(lens, pinhole)
+    return lens
+
+
+def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
+    """The lens from pictures of the board. Prints the error of each picture."""
+    say(f"board: {len(pictures.names)} pictures in {pictures.folder}, {pictures.describe()}")
+    calibration = pictures.fit(pinhole)
+    for name, corners, error in zip(pictures.names, calibration.corners, calibration.errors, strict=True):
+        say(f"  {name}: {corners} corners, " + ("not used" if error is None else f"error {error:.2f} pixels"))
+    used = [error for error in calibration.errors if error is not None]
+    needed = hardware.view_angle(calibration.lens, pinhole)
+    x, y, z = (1e3 * c for c in calibration.lens.center)
+    say(
+        f"lens: reprojection errors {min(used):.2f} to {max(used):.2f} pixels, corners up to "
+        f"{math.degrees(calibration.largest_angle):.1f} degrees, the view needs {math.degrees(needed):.1f}"
+    )
+    say(f"camera at x = {x:.1f}, y = {y:.1f}, z = {z:.1f} mm from the centre of the pad")
+    return calibration.lens
+
+
+def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> hardware.Lens:
+    """The lens from pictures that are taken now, and those of an interrupted run."""
+    folder, size = config.out / "board", (config.width, config.height)
+    pictures = boards.Pictures.read(folder, config.board, size)
+    if pictures.names:
+        say(f"board: {len(pictures.names)} pictures of an earlier run are kept. To start anew, delete {folder}")
+    pictures = boards.take(pictures, sensor, config.pictures, config.every, say)
+    try:
+        return fit(pictures, pinhole)
+    except hardware.CalibrationError as error:
+        raise hardware.CalibrationError(
+            f"{error} The pictures are kept: delete the bad ones, then run the same command again, with a larger "
+            f"--pictures than {config.pictures} to add some."
+        ) from error
+
+
+def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> None:
+    """Check that the folder belongs to this sensor or to none.
+
+    Raises:
+        ValueError: It has the sensor file of other devices.
+    """
+    try:
+        there = hardware.Device.load(config.out)
+    except (OSError, hardware.SensorFileError):
+        return  # there is none, or a damaged one, which is replaced
+    if (there.camera, there.leds) != (camera.source, leds.serial_number):
+        raise ValueError(
+            f"{config.out} has the file of another sensor, of camera {there.camera} and LED controller {there.leds}: "
+            "give another --out, or delete the file"
+        )
+
+
+def claim_pictures(config: Config, camera: hardware.Camera) -> None:
+    """Reserve the folder of live pictures for one camera, size and board.
+
+    Raises:
+        ValueError: It has pictures of others.
+    """
+    made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
+    _files.claim(config.out / "board" / "camera.json", made)
+
+
+def main(config: Config) -> None:
+    """Run all steps and write the sensor file."""
+    if config.print_board is not None:
+        hardware.save_board(config.print_board)
+        print(f"{config.print_board}: print it at 100 % on A4. The ruler on the page must measure 100 mm")
+        return
+    if config.camera is None or config.leds is None:
+        print(find(config))
+        return
+    check(config)
+    simulated, size = sts.Sensor(), (config.width, config.height)
+    pinhole: hardware.Pinhole = simulated.camera
+    lens: hardware.Lens | None = None
+    if config.ideal_lens is not None:
+        lens = ideal(config, pinhole)
+        say(f"lens: assumed without error, {config.ideal_lens:g} degrees across the diagonal, NOT calibrated")
+    elif config.board_images is not None:
+        lens = fit(boards.Pictures.read(config.board_images, config.board, size), pinhole)
+    with opened(config) as (camera, leds):
+        check_folder(config, camera, leds)
+        if lens is None:
+            claim_pictures(config, camera)
+        boards.wait("Take everything off the pad, and leave the sensor untouched.", config.every)
+        exposures = expose(config, camera, leds)
+        with hardware.STS(camera=camera, leds=leds, levels=config.levels, exposures=exposures).connect() as sensor:
+            settling = sensor.settling
+            say(f"latency: light on {1e3 * settling.tactile_s:.0f} ms, off {1e3 * settling.visual_s:.0f} ms")
+            backgrounds = record(sensor)
+            visual, tactile = backgrounds.noise
+            say(f"background: mean of {BACKGROUNDS} pairs, noise {visual:.2f} (visual), {tactile:.2f} (tactile) of 255")
+            rate = camera.statistics.rate
+            assert rate is not None
+            nominal = 1 / (2 / rate + (settling.visual_s + settling.tactile_s) / 2)
+            say(
+                f"speed: {backgrounds.rate:.2f} pairs/s, {backgrounds.rate / nominal:.0%} of {nominal:.2f}, which are "
+                "two frames and the mean latency a pair"
+            )
+            source: Literal["board", "ideal"] = "board" if config.ideal_lens is None else "ideal"
+            if lens is None:
+                lens = live(config, sensor, pinhole)
+            device = hardware.Device(
+                camera=camera.source,
+                fps=config.fps or round(rate, 2),
+                leds=leds.serial_number,
+                lens=lens,
+                settle_on_s=settling.tactile_s,
+                settle_off_s=settling.visual_s,
+                levels=config.levels,
+                commissioned=datetime.date.today().isoformat(),
+                exposure_visual=exposures[0] if exposures else None,
+                exposure_tactile=exposures[1] if exposures else None,
+                fourcc=config.fourcc,
+                white_balance=camera.locked.get("white_balance"),
+                focus=camera.locked.get("focus"),
+                lens_from=source,
+            )
+    device.save(config.out, simulated.constants(), visual=backgrounds.visual, tactile=backgrounds.tactile)
+    print(f"{config.out / hardware.sensor_file.NAME}: camera {device.camera}, controller {device.leds}, lens {source}")
+    print(
+        f"next, in Python: `with sts_jax.hardware.STS.from_file({str(config.out)!r}) as sensor: pair = sensor.read()`"
+    )
+
+
+def say(text: str) -> None:
+    """Print one line at once."""
+    print(text, flush=True)
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Config, description=__doc__)
+    try:
+        with errors.on_one_line():
+            main(arguments)
+    except (hardware.CameraError, hardware.LightError, hardware.NoContrastError) as error:
+        raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        number = len(list((arguments.out / "board").glob("*.png")))
+        raise SystemExit(f"interrupted: {number} pictures of the board are kept for the same command") from None

@@ -1,0 +1,160 @@
+"""Pictures of the calibration board: taken with a live sensor, kept in a folder, and fitted."""
+
+import dataclasses
+import io
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, UnidentifiedImageError
+
+from sts_jax import _files, hardware
+from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES
+from sts_jax.hardware.coverage import PARTS
+
+STILL = 1.0  # pixels, median movement of the corners between two frames while the board is held still
+_LAY = "Lay the board on the pad, print to the camera, edges on edges."
+_HOLD = "Hold the board above the pad, tilted by 20 to 40 degrees, each time elsewhere."
+
+Say = Callable[[str], None]
+
+
+def wait(text: str, every: float | None) -> str:
+    """Show what to do, then wait for Enter, or for a number of seconds.
+
+    Returns:
+        What was typed before Enter.
+
+    Raises:
+        ValueError: There is no keyboard.
+    """
+    if every is not None:
+        print(f"{text} Continues in {every:g} s.", flush=True)
+        time.sleep(every)
+        return ""
+    try:
+        return input(f"{text} Then press Enter. ").strip().lower()
+    except EOFError:
+        raise ValueError(
+            "there is no keyboard to press Enter on: give --every SECONDS to continue by time, and --board-images "
+            "FOLDER or --ideal-lens DEGREES for the lens"
+        ) from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictures:
+    """The pictures of a folder in the order of their names. In the first one, the board lies on the pad."""
+
+    folder: Path
+    board: hardware.Board
+    size: tuple[int, int]  # width and height, pixels
+    names: tuple[str, ...] = ()
+    found: tuple[hardware.FoundCorners, ...] = ()
+
+    @classmethod
+    def read(cls, folder: Path, board: hardware.Board, size: tuple[int, int]) -> "Pictures":
+        """Find the board in all PNG files of a folder.
+
+        Raises:
+            ValueError: A picture has another size or cannot be read.
+        """
+        pictures = cls(folder, board, size)
+        for path in sorted(folder.glob("*.png")):
+            try:
+                with Image.open(path) as picture:
+                    image = np.asarray(picture.convert("RGB"))
+            except (OSError, UnidentifiedImageError) as error:
+                raise ValueError(f"{path} cannot be read ({error}): delete it, or take it again") from error
+            if image.shape[1::-1] != size:
+                raise ValueError(
+                    f"{path} has {image.shape[1]} x {image.shape[0]} pixels, but the camera's size is {size[0]} x "
+                    f"{size[1]}: give the size of both with --width and --height, or take the pictures again"
+                )
+            pictures = pictures.with_one(path.name, hardware.find_board(image, board))
+        return pictures
+
+    def with_one(self, name: str, found: hardware.FoundCorners) -> "Pictures":
+        """These pictures and one more."""
+        return dataclasses.replace(self, names=(*self.names, name), found=(*self.found, found))
+
+    def describe(self) -> str:
+        """The parts of the image that contain corners."""
+        there = hardware.covered(self.found, self.size)
+        missing = [part for part in PARTS if part not in there]
+        return f"{len(there)} of {len(PARTS)} parts of the image covered" + (
+            f", not yet {', '.join(missing)}" if missing else ""
+        )
+
+    def fit(self, pinhole: hardware.Pinhole) -> hardware.Calibration:
+        """Calibrate the lens, and check that it covers the sensor's view.
+
+        Raises:
+            CalibrationError: See `hardware.fit_lens` and `hardware.check_view`.
+        """
+        try:
+            calibration = hardware.fit_lens(self.found, self.size, self.board)
+            hardware.check_view(calibration.lens, pinhole, calibration.largest_angle)
+        except hardware.CalibrationError as error:
+            numbers = "" if not self.names else f" Image 0 is {self.names[0]}, the others follow in the order of names."
+            raise hardware.CalibrationError(
+                f"the pictures in {self.folder} do not determine the lens: {error}{numbers}"
+            ) from error
+        return calibration
+
+
+def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | None, say: Say = print) -> Pictures:
+    """Take pictures of the board until there are enough. Each is written at once.
+
+    Args:
+        pictures: The pictures of an earlier run, which are kept.
+        sensor: The connected sensor.
+        number: Pictures in which the board is found.
+        every: Time between two pictures (s). None: the keyboard.
+        say: Receives one line for each picture.
+
+    Raises:
+        OSError: A picture cannot be written.
+    """
+    while len(pictures.names) < number:
+        enough = len(pictures.names) >= FEWEST_IMAGES
+        if not pictures.names:
+            text = _LAY
+        else:
+            text = f"{_HOLD} {'Type `done` if these are enough.' if enough and every is None else ''}".rstrip()
+        typed = wait(text, every)
+        if typed == "done" and enough:
+            break
+        image, found, problem = _picture(sensor, pictures.board)
+        if problem:
+            say(f"  not kept: {problem}")
+            continue
+        name = f"{1 + max((int(Path(n).stem) for n in pictures.names if Path(n).stem.isdecimal()), default=-1):03d}.png"
+        _write(pictures.folder / name, image)
+        pictures = pictures.with_one(name, found)
+        say(f"  {name}: {len(found.numbers)} corners, {len(pictures.names)} of {number}, {pictures.describe()}")
+    return pictures
+
+
+def _picture(
+    sensor: hardware.STS, board: hardware.Board
+) -> tuple[UInt8[np.ndarray, "height width 3"], hardware.FoundCorners, str]:
+    """A picture with the lights off, its corners, and the reason why it cannot be used, or nothing."""
+    next(sensor.stream(0.0))  # the lights are off
+    first = hardware.find_board(sensor.camera.read().image, board)
+    image = sensor.camera.read().image
+    found = hardware.find_board(image, board)
+    if len(found.numbers) < FEWEST_CORNERS:
+        return image, found, f"{len(found.numbers)} corners of the board were found, but {FEWEST_CORNERS} are needed"
+    _, before, after = np.intersect1d(first.numbers, found.numbers, return_indices=True)
+    moved = np.hypot(*(found.pixels[after] - first.pixels[before]).T) if len(before) else np.array([np.inf])
+    if np.median(moved) > STILL:
+        return image, found, "the board moved, hold it still"
+    return image, found, ""
+
+
+def _write(path: Path, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", compress_level=3)
+    _files.write_bytes(path, buffer.getvalue())

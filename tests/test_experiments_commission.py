@@ -1,0 +1,472 @@
+"""Commissioning against a sensor of a pseudo-terminal and a motion JPEG server that shows rendered boards."""
+
+import dataclasses
+import functools
+import math
+import time
+
+import calibration_images
+import cv2
+import numpy as np
+import pytest
+from led_peer import Peer
+from PIL import Image
+from sensor_peer import DARK, LIT, Lights, SeenLights
+
+import sts_jax as sts
+from experiments import commission
+from experiments.shared import boards
+from sts_jax import hardware
+from sts_jax.hardware import Device, capture
+
+WIDTH, HEIGHT = 640, 480
+PINHOLE = sts.Sensor().camera
+TRUE = hardware.Lens(
+    width=WIDTH,
+    height=HEIGHT,
+    fx=291.0,
+    fy=287.5,
+    cx=331.2,
+    cy=228.7,
+    k=(-0.04, 0.012, -0.007, 0.0012),
+    rotation=(0.02, -0.03, 0.03),
+    translation=(0.003, -0.004, 0.103),
+)
+# Board to camera: rotation vector (rad), position of the board's centre (m). In the first pose it lies on the pad.
+POSES = [
+    (TRUE.rotation, TRUE.translation),
+    ((0.5, 0.0, 0.0), (0.0, 0.0, 0.15)),
+    ((-0.5, 0.1, 0.0), (0.08, 0.06, 0.13)),
+    ((0.0, 0.5, 0.2), (-0.08, 0.06, 0.14)),
+    ((0.1, -0.5, 0.1), (0.09, -0.05, 0.13)),
+    ((0.2, 0.4, 0.3), (-0.08, -0.05, 0.13)),
+]
+
+
+class SeenBoards(SeenLights):
+    """The camera. `board` is the number of the board that it sees, or None. The images have noise."""
+
+    def __init__(self, lights, pictures):
+        rng = np.random.default_rng(0)
+        self.board, self.pictures = None, pictures
+        self.noise = [rng.integers(0, 5, (HEIGHT, WIDTH, 3), np.uint8) for _ in range(3)]
+        super().__init__(lights, fps=30, lag_s=0.01, exposure_s=0.01)
+
+    def _frame(self):
+        end_s = time.monotonic() - self.lag_s
+        shares, mean = self.lights.shares(end_s - self.exposure_s, end_s)
+        self.shown[self.number] = shares
+        if self.board is None:
+            image = np.full((HEIGHT, WIDTH, 3), DARK + mean * (LIT - DARK), np.uint8)
+        else:
+            image = self.pictures[self.board]
+        noisy = cv2.add(image, self.noise[self.number % 3])
+        return cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+
+
+class BoardPeer:
+    """Both devices. `url` and `path` are what a host connects to."""
+
+    def __init__(self, path, pictures):
+        self.leds = Peer(path)
+        self.leds._now_s = time.monotonic  # the watchdog's clock is real
+        self.leds.controller = type(self.leds.controller)(now_s=time.monotonic())
+        self.camera = SeenBoards(Lights(self.leds.controller), pictures)
+        self.path, self.url = str(path), self.camera.url
+
+    def stop(self):
+        self.camera.stop()
+        self.leds.vanish()
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    rays, printed = calibration_images.camera_rays(TRUE), calibration_images.printed(hardware.Board())
+    views = [calibration_images.board_view(rays, *printed, *pose) for pose in POSES]
+    return [cv2.cvtColor((20 + 0.7 * view).astype(np.uint8), cv2.COLOR_GRAY2BGR) for view in views]
+
+
+@pytest.fixture
+def peer(tmp_path, pictures):
+    made = BoardPeer(tmp_path / "leds", pictures)
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def config(tmp_path):
+    return commission.Config(
+        camera="http://127.0.0.1:9/video",
+        leds=str(tmp_path / "leds"),
+        out=tmp_path / "bench",
+        width=WIDTH,
+        height=HEIGHT,
+        pictures=len(POSES),
+    )
+
+
+def held(folder, pictures, number=None):
+    """A folder of PNG files, the first pictures of the board."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, picture in enumerate(pictures[:number]):
+        Image.fromarray(picture).save(folder / f"{i:03d}.png")
+    return folder
+
+
+def measure_briefly(monkeypatch):
+    """Fewer switches and pairs, and a shorter search for the controller."""
+    brief = functools.partialmethod(hardware.STS.measure_settling, 3, watch_s=0.5)
+    monkeypatch.setattr(hardware.STS, "measure_settling", brief)
+    monkeypatch.setattr(hardware.Leds, "connect", functools.partial(hardware.Leds.connect, timeout_s=1.0))
+    monkeypatch.setattr(commission, "BACKGROUNDS", 5)
+
+
+def hands(peer, monkeypatch, *, stop_at=None):
+    """Replace the person: shows the next board at each request, and interrupts at one of them."""
+    asked = []
+
+    def wait(text, every):
+        asked.append(text)
+        if text.startswith(("Lay", "Hold")):
+            number = len(list(peer.folder.glob("*.png")))
+            if number == stop_at:
+                raise KeyboardInterrupt
+            peer.camera.board = number
+            time.sleep(0.3)
+        else:
+            peer.camera.board = None
+        return ""
+
+    monkeypatch.setattr(boards, "wait", wait)
+    return asked
+
+
+def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer, config, monkeypatch, capsys):
+    config = dataclasses.replace(config, camera=peer.url)
+    peer.folder = config.out / "board"
+    hands(peer, monkeypatch, stop_at=4)
+    measure_briefly(monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        commission.main(config)
+    assert peer.leds.controller.levels == (0, 0, 0, 0)
+    kept = {path.name: path.read_bytes() for path in peer.folder.glob("*.png")}
+    assert sorted(kept) == ["000.png", "001.png", "002.png", "003.png"]
+    assert not (config.out / "sensor.json").exists()
+
+    peer.camera.board = None
+    capsys.readouterr()
+    asked = hands(peer, monkeypatch)
+    commission.main(config)
+    printed = capsys.readouterr().out
+    assert len(asked) == 1 + len(POSES) - len(kept)
+    assert all((peer.folder / name).read_bytes() == content for name, content in kept.items())
+    assert "4 pictures of an earlier run are kept" in printed
+    assert printed.count("left to the server") == 2
+    assert "pairs/s" in printed
+
+    device = Device.load(config.out)
+    assert (device.camera, device.leds, device.levels) == (peer.url, "EMULATED", (255, 255, 255, 255))
+    assert (device.lens_from, device.exposures) == ("board", None)
+    assert device.settle_on_s > peer.camera.lag_s + peer.camera.exposure_s
+    np.testing.assert_allclose(device.lens.center, TRUE.center, atol=1e-3)
+    assert abs(float(np.median(device.background(config.out, "visual"))) - DARK - 2) <= 2
+    assert abs(float(np.median(device.background(config.out, "tactile"))) - LIT - 2) <= 2
+    assert sts.Sensor.load(config.out / "sensor.json").constants() == sts.Sensor().constants()
+
+    peer.camera.board = None
+    with hardware.STS.from_file(config.out, leds=peer.path) as sensor:
+        assert sensor.device == device
+        assert sensor.settling == hardware.Settling(device.settle_off_s, device.settle_on_s)
+        pair = sensor.read()
+    assert abs(float(np.median(pair.visual.image)) - DARK - 2) <= 3
+    assert abs(float(np.median(pair.tactile.image)) - LIT - 2) <= 3
+    view = hardware.rectified(device.lens, PINHOLE, pair.tactile.image, (60, 80))
+    assert view.min() > 150  # no part of the view is outside of the raw image
+
+    with pytest.raises(hardware.WrongDeviceError, match=r"camera http://127\.0\.0\.1:9/video"):
+        hardware.STS.from_file(config.out, camera="http://127.0.0.1:9/video", leds=peer.path)
+    with pytest.raises(hardware.PortNotFoundError, match="EMULATED was not found"):
+        hardware.STS.from_file(config.out).connect()
+    camera = hardware.Camera(hardware.CameraConfig("http://127.0.0.1:9/video"))
+    with pytest.raises(ValueError, match=r"board/camera.json was made with camera = "):
+        commission.claim_pictures(config, camera)
+    with (
+        hardware.Leds.connect(peer.path) as leds,
+        pytest.raises(ValueError, match=r"file of another sensor, of camera .*give another"),
+    ):
+        commission.check_folder(config, camera, leds)
+
+
+def test_another_controller_on_the_port_is_refused(tmp_path, peer):
+    device = Device(
+        camera=peer.url,
+        fps=30.0,
+        leds="OTHER",
+        lens=TRUE,
+        settle_on_s=0.1,
+        settle_off_s=0.1,
+        levels=(255, 255, 255, 255),
+        commissioned="2026-05-31",
+    )
+    device.save(tmp_path / "bench", sts.Sensor().constants())
+    with pytest.raises(hardware.WrongDeviceError, match=r"LED controller OTHER, but .* LED controller EMULATED"):
+        hardware.STS.from_file(tmp_path / "bench", leds=peer.path).connect()
+    hardware.Leds.connect(peer.path).close()  # the port is free again
+
+
+def test_the_controller_is_found_by_its_own_serial_number(tmp_path, monkeypatch):
+    peers = [Peer(tmp_path / name, serial_number=name) for name in ("AAA", "BBB")]
+    found = [hardware.Port(str(peer.path), "", None, 1, 1) for peer in peers]
+    monkeypatch.setattr(hardware.ports, "find_controllers", lambda: found)
+    try:
+        with hardware.Leds.find("BBB") as leds:
+            assert leds.port == str(tmp_path / "BBB")
+        with pytest.raises(hardware.PortNotFoundError, match=r"CCC was not found.*AAA \(controller AAA\)"):
+            hardware.Leds.find("CCC")
+    finally:
+        for peer in peers:
+            peer.vanish()
+
+
+# ---- The lens
+
+
+def test_the_lens_is_fitted_from_a_folder(tmp_path, pictures, capsys):
+    folder = held(tmp_path / "board", pictures)
+    lens = commission.fit(boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT)), PINHOLE)
+    np.testing.assert_allclose(lens.center, TRUE.center, atol=5e-4)
+    printed = capsys.readouterr().out
+    assert "6 pictures" in printed
+    assert printed.count("corners, error 0.") == len(POSES)
+
+
+def test_boards_that_do_not_reach_the_corners_are_refused(tmp_path, pictures):
+    with pytest.raises(hardware.CalibrationError, match=r"the view's|corners of the sensor's view are at 5\d"):
+        hardware.check_view(TRUE, PINHOLE, math.radians(40))
+    hardware.check_view(TRUE, PINHOLE, hardware.view_angle(TRUE, PINHOLE))
+
+
+def test_a_view_that_the_camera_does_not_see_is_refused(config):
+    shifted = dataclasses.replace(hardware.Lens.ideal(WIDTH, HEIGHT), cx=60.0)
+    with pytest.raises(hardware.CalibrationError, match=r"lacks \d.*middle left.*under the middle of the pad"):
+        hardware.check_view(shifted, PINHOLE)
+    with pytest.raises(hardware.CalibrationError, match="larger field of view"):
+        commission.main(dataclasses.replace(config, ideal_lens=90.0))
+
+
+def test_few_pictures_name_their_folder(tmp_path, pictures):
+    folder = held(tmp_path / "board", pictures, 3)
+    read = boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
+    with pytest.raises(hardware.CalibrationError, match=r"board do not determine the lens: .*at least 6.*000.png"):
+        read.fit(PINHOLE)
+
+
+class Handheld:
+    """A sensor whose camera returns given images. It is its own camera."""
+
+    def __init__(self, images):
+        self.images, self.camera = list(images), self
+
+    def stream(self, duty):
+        yield duty
+
+    def read(self):
+        return hardware.Captured(self.images.pop(0), 0.0, 0, 0, 0, 0, False)
+
+
+def test_pictures_without_or_with_a_moving_board_are_not_kept(tmp_path, pictures):
+    blank, there = np.full_like(pictures[0], 90), pictures[0]
+    moved = np.roll(there, 4, axis=1)
+    sensor, lines = Handheld([blank, blank, moved, there, there, there]), []
+    taken = boards.take(
+        boards.Pictures(tmp_path, hardware.Board(), (WIDTH, HEIGHT)), sensor, 1, every=0.0, say=lines.append
+    )
+    assert [line.split(",")[0] for line in lines] == [
+        "  not kept: 0 corners of the board were found",
+        "  not kept: the board moved",
+        "  000.png: 64 corners",
+    ]
+    assert taken.names == ("000.png",)
+    assert [path.name for path in tmp_path.iterdir()] == ["000.png"]
+    read = boards.Pictures.read(tmp_path, hardware.Board(), (WIDTH, HEIGHT))
+    np.testing.assert_array_equal(read.found[0].pixels, taken.found[0].pixels)
+
+
+def test_covered_parts_are_named():
+    corners = hardware.FoundCorners(np.arange(2), np.array([[1.0, 1.0], [WIDTH - 1.0, HEIGHT / 2]]))
+    assert hardware.covered([corners], (WIDTH, HEIGHT)) == ("top left", "middle right")
+    assert hardware.covered([], (WIDTH, HEIGHT)) == ()
+
+
+# ---- The exposure
+
+
+class Metered(hardware.Camera):
+    """A device whose images are as bright as its exposure times the light, up to 255."""
+
+    def __init__(self, light, settable=True):
+        super().__init__(hardware.CameraConfig(0))
+        self.light, self.exposure, self.settable = light, 150.0, settable
+
+    @property
+    def locked(self):
+        return {"exposure": self.exposure}
+
+    def set_exposure(self, exposure):
+        self.exposure = float(round(exposure))
+        return self.exposure if self.settable else None
+
+    def read(self, timeout_ms=None):
+        image = np.full((8, 8, 3), min(self.exposure * self.light, 255), np.uint8)
+        return hardware.Captured(image, 0.0, 0, 0, 0, 0, False)
+
+
+@pytest.fixture
+def no_lag(monkeypatch):
+    monkeypatch.setattr(hardware.exposure, "LAG_S", 0.0)
+
+
+@pytest.mark.parametrize("light", [0.8, 1.3, 40.0])
+def test_exposure_is_bright_and_not_saturated(no_lag, light):
+    found = hardware.choose_exposure(Metered(light), longest=300)
+    assert 170 <= found.brightness <= 230
+    assert found.brightness == pytest.approx(found.exposure * light, abs=1)
+
+
+def test_exposure_stops_at_the_limits(no_lag):
+    assert hardware.choose_exposure(Metered(0.1), longest=300) == (300, 30)
+    assert hardware.choose_exposure(Metered(400.0), longest=300) == (1, 255)
+    with pytest.raises(hardware.CameraError, match="does not let the exposure be set"):
+        hardware.choose_exposure(Metered(1.0, settable=False), longest=300)
+
+
+class Video:
+    """A V4L2 device of OpenCV that sees the lights and shows its exposure."""
+
+    def __init__(self, controller):
+        values = {"AUTO_EXPOSURE": 3, "EXPOSURE": 40, "AUTO_WB": 1, "WB_TEMPERATURE": 4600, "FPS": 100}
+        self.values = {getattr(cv2, f"CAP_PROP_{name}"): value for name, value in values.items()}
+        self.values |= {cv2.CAP_PROP_FRAME_WIDTH: 0, cv2.CAP_PROP_FRAME_HEIGHT: 0}
+        self.controller, self.number = controller, 0
+
+    def get(self, prop):
+        return float(self.values.get(prop, -1))
+
+    def set(self, prop, value):
+        if prop in self.values:
+            self.values[prop] = round(value)
+        return prop in self.values
+
+    def isOpened(self):
+        return True
+
+    def grab(self):
+        time.sleep(0.01)
+        self.number += 1
+        return True
+
+    def retrieve(self):
+        light = 2.0 + 8.0 * sum(self.controller.levels) / 1020
+        image = np.full((48, 64, 3), min(self.get(cv2.CAP_PROP_EXPOSURE) * light, 255), np.uint8)
+        image[:8, :8] = self.number % 2
+        return True, image
+
+    def release(self):
+        pass
+
+
+def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, capsys):
+    device = Video(peer.leds.controller)
+    monkeypatch.setattr(capture, "check_source", lambda config: None)
+    monkeypatch.setattr(capture, "_open", lambda config: device)
+    measure_briefly(monkeypatch)
+    config = dataclasses.replace(config, camera="0", width=64, height=48, ideal_lens=160.0, every=0.0)
+    commission.main(config)
+    assert "NOT calibrated" in capsys.readouterr().out
+    found = Device.load(config.out)
+    assert (found.camera, found.lens_from) == ("/dev/video0", "ideal")
+    assert found.white_balance == 4600
+    assert found.exposures is not None
+    assert found.exposures[0] > 3 * found.exposures[1]
+    for stream in ("visual", "tactile"):
+        assert 170 <= hardware.brightness(found.background(config.out, stream)) <= 230
+    with hardware.STS.from_file(config.out, leds=peer.path) as sensor:
+        for _ in range(3):
+            pair = sensor.read()
+            assert pair.visual.image[20, 20, 0] == round(min(2 * found.exposures[0], 255))
+            assert pair.tactile.image[20, 20, 0] == round(min(10 * found.exposures[1], 255))
+
+
+# ---- Options and devices
+
+
+def test_devices_are_listed_with_the_next_command(config, monkeypatch, capsys):
+    camera = hardware.FoundCamera("/dev/v4l/by-id/usb-A-index0", "/dev/video0", "A", ())
+    ports = [hardware.Port("/dev/ttyACM0", "Uno", "55", 1, 1), hardware.Port("/dev/ttyS0", "n/a", None, None, None)]
+    monkeypatch.setattr(hardware, "find_sensors", lambda: hardware.FoundSensors([camera], ports))
+    commission.main(dataclasses.replace(config, camera=None, leds=None))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:4] == [
+        "cameras:",
+        "  /dev/v4l/by-id/usb-A-index0 (A)",
+        "USB serial ports:",
+        "  /dev/ttyACM0 (Uno, serial number 55)",
+    ]
+    assert "--camera /dev/v4l/by-id/usb-A-index0 --leds /dev/ttyACM0 --out" in lines[4]
+    monkeypatch.setattr(hardware, "find_sensors", lambda: hardware.FoundSensors([camera], []))
+    with pytest.raises(ValueError, match="no USB serial port was found: connect the controller"):
+        commission.main(dataclasses.replace(config, leds=None))
+
+
+def test_the_board_is_printed(tmp_path, capsys):
+    commission.main(commission.Config(print_board=tmp_path / "board.pdf"))
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    assert "100 mm" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"board_images": "missing"}, "there is no folder missing"),
+        ({"board_images": ".", "ideal_lens": 160.0}, "contradict each other"),
+        ({"ideal_lens": 0.0}, "ideal-lens is 0"),
+        ({"levels": (0, 0, 0, 0)}, "at least one above 0"),
+        ({"pictures": 3}, "pictures is 3, but it must be >= 6"),
+        ({"ruler": 10.0}, "ruler is 10 mm"),
+        ({"every": -1.0}, "every is -1.0"),
+        ({"width": 0}, "width must be >= 1"),
+    ],
+)
+def test_bad_options_are_named(config, changes, message):
+    if "board_images" in changes:
+        changes = {**changes, "board_images": commission.Path(changes["board_images"])}
+    with pytest.raises((ValueError, OSError), match=message):
+        commission.main(dataclasses.replace(config, **changes))
+
+
+def test_a_missing_port_and_another_device_are_named(config, tmp_path, monkeypatch):
+    measure_briefly(monkeypatch)
+    config = dataclasses.replace(config, ideal_lens=160.0, every=0.0)
+    with pytest.raises(hardware.PortNotFoundError, match="there is no port"):
+        commission.main(config)
+    other = Peer(tmp_path / "leds", talk=b"$GPGGA,1,2\r\n")
+    try:
+        with pytest.raises(hardware.NotALedControllerError):
+            commission.main(config)
+    finally:
+        other.vanish()
+
+
+def test_pictures_of_another_size_are_refused(tmp_path, pictures):
+    folder = held(tmp_path / "board", pictures, 1)
+    with pytest.raises(ValueError, match=r"000.png has 640 x 480 pixels, but the camera's size is 1640 x 1232"):
+        boards.Pictures.read(folder, hardware.Board(), (1640, 1232))
+
+
+def test_a_missing_keyboard_is_named(monkeypatch):
+    def closed(text):
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", closed)
+    with pytest.raises(ValueError, match="give --every SECONDS"):
+        boards.wait("Take everything off the pad.", None)
