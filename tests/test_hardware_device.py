@@ -5,9 +5,9 @@ import threading
 
 import numpy as np
 import pytest
-from camera_server import SIZE, number_of
-from sensor_peer import CORNER, DARK, LIT, SensorPeer
 
+from benchmarks.instruments.camera_server import SIZE
+from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from sts_jax import hardware
 from sts_jax.hardware.settling import Settling, Switch, settling
 
@@ -34,8 +34,7 @@ def sensor(peer):
 
 def judged(peer, shot):
     """Whether the frame that an image shows had its stream's light during all of its exposure."""
-    shares = peer.camera.shown[number_of(shot.image[:CORNER, :CORNER])]
-    return shares == [1.0 if shot.stream == "tactile" else 0.0]
+    return peer.judged(shot.image, lit=shot.stream == "tactile")
 
 
 def test_pairs_are_of_the_right_light(peer, sensor):
@@ -101,8 +100,7 @@ def test_lights_that_go_off_in_between_are_noticed(peer, sensor):
 
     def disturb():
         while not stopped.wait(0.35):
-            peer.leds.controller._apply((0, 0, 0, 0))
-            peer.leds.controller.counter += 1
+            peer.leds.fire_watchdog()
 
     thread = threading.Thread(target=disturb)
     thread.start()
@@ -142,25 +140,11 @@ def test_no_contrast_at_connection_is_named_and_devices_are_closed(peer):
         sensor.read()
 
 
-def test_a_controller_that_returns_is_found_again(tmp_path):
-    peer = SensorPeer(tmp_path / "leds")
-    try:
-        with hardware.STS(camera=config(peer.url), leds=peer.path, settling=SETTLING).connect(0.1) as sensor:
-            sensor.read()
-            peer.leds.vanish()
-            again = []
-
-            def plug():
-                again.append(SensorPeer(tmp_path / "leds"))
-                peer.camera.lights = again[0].camera.lights
-
-            threading.Timer(0.5, plug).start()
-            shots = _both(sensor.read())
-            assert all(judged(peer, shot) for shot in shots)
-    finally:
-        peer.camera.stop()
-        for other in again:
-            other.stop()
+def test_a_controller_that_returns_is_found_again(tmp_path, peer, sensor):
+    sensor.read()
+    peer.unplug()
+    threading.Timer(0.5, lambda: peer.plug_in(tmp_path / "leds")).start()
+    assert all(judged(peer, shot) for shot in _both(sensor.read()))
 
 
 def test_async_read_and_read_latest(peer, sensor):

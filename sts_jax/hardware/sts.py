@@ -16,7 +16,7 @@ from sts_jax.hardware.camera import Camera
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.camera_errors import CameraLostError, CameraNotConnectedError, StaleFrameError
 from sts_jax.hardware.devices import FoundCamera, find_cameras
-from sts_jax.hardware.frames import Captured
+from sts_jax.hardware.frames import BLACK, Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
 from sts_jax.hardware.settling import Settling, Switch, Thumbnail, light_share, settling, thumbnail
@@ -26,6 +26,7 @@ Stream = Literal["visual", "tactile"]
 _DEPARTED = 0.5  # least share of a stream's light in its frames
 _SWITCHES = 8  # of each direction, to measure the settling
 _PHASE = 0.618  # of a period, by which the phase of the measured switches advances
+_CHECK_S = 0.1  # s, least time between two questions to the controller while frames show another light
 _GRACE_S = 0.2  # s, by which a wait for the camera may exceed a limit, so that the cause of a delay is the one reported
 _STILL = 3.0  # of 255, largest change of a thumbnail's pixel while nothing moves
 
@@ -86,7 +87,8 @@ class STS:
     A frame counts as of one light if it arrives later than the settling time after the controller's acknowledgement, if
     it and the frame before it look like the last image of this light rather than that of the other one, and if the
     controller's next answer proves that its lights have not changed in between. All other frames are discarded, also
-    those of a stalled stream that arrive late.
+    those of a stalled stream that arrive late, those that repeat the frame before them (unless the camera's
+    `frozen_after_s` is None), and black ones of a stream that was not black.
 
     One thread may use a sensor at a time.
     """
@@ -206,7 +208,8 @@ class STS:
         successive pairs need one switch each.
 
         Args:
-            timeout_ms: Longest time (ms), None: two times `timeout_s`. A reconnection comes on top.
+            timeout_ms: Longest time (ms), None: two times `timeout_s`. A reconnection comes on top, and so does the
+                last request to the controller, whose time `Leds` states.
 
         Raises:
             LightError: No frame could be proven to be of the wanted light in time.
@@ -393,7 +396,7 @@ class STS:
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
         """A frame that arrives when the light has settled, and the answer of the controller before it."""
-        lit = self._switched(stream)
+        lit, checked_s = self._switched(stream), 0.0
         settled_s = self.settling.visual_s if stream == "visual" else self.settling.tactile_s
         while not self._stopping:
             left_s = deadline - time.monotonic()
@@ -406,20 +409,35 @@ class STS:
             try:
                 frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
             except CameraLostError:
+                if time.monotonic() >= deadline:
+                    raise
                 continue
-            self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
+            if not self._repeats(frame):
+                self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
             self._previous = frame
-            if self._departed >= 2 and frame.time_s >= max(lit.acknowledged_s + settled_s, after_s):
+            late_s = frame.time_s - max(lit.acknowledged_s + settled_s, after_s)
+            if self._departed >= 2 and late_s >= 0 and not self._repeats(frame):
                 return lit, frame
             self.discarded += 1
+            if not self._departed and late_s >= 0 and time.monotonic() >= checked_s + _CHECK_S:
+                # The frames have another light. If the controller has turned its lights off, they are set again.
+                if not self.leds.ping().unchanged_since(lit):
+                    lit = self._set(stream)
+                checked_s = time.monotonic()
         raise LightError("the thread that takes pairs was stopped.")
 
     def _shows(self, frame: Captured, stream: Stream) -> bool:
         """Whether a frame looks more like the last image of its stream than like that of the other one."""
         if len(self._looks) < 2:
             return True
+        if frame.black and self._looks[stream].max() > BLACK:
+            return False
         share = light_share(thumbnail(frame.image), self._looks["visual"], self._looks["tactile"])
         return (share if stream == "tactile" else 1 - share) > _DEPARTED
+
+    def _repeats(self, frame: Captured) -> bool:
+        """Whether a frame is the one before once more, in a scene that is not free of noise."""
+        return frame.repeats > 0 and self._camera.config.frozen_after_s is not None
 
     def _in_order(self, frame: Captured) -> bool:
         """Whether a frame is the next one after the last."""
