@@ -123,6 +123,7 @@ class SensorPeer:
         size: tuple[int, int] = SIZE,
     ):
         self.lights = Lights()
+        self._boots = 0
         self.path = str(path)
         self.plug_in(path)
         self.camera = SeenLights(self.lights, fps=fps, lag_s=lag_s, exposure_s=exposure_s, size=size)
@@ -134,9 +135,9 @@ class SensorPeer:
 
     def plug_in(self, path: Path) -> None:
         """Plug the controller in, which boots. The watchdog's clock is real."""
-        boot = self.leds.controller.boot + 1 if hasattr(self, "leds") else 1
+        self._boots += 1
         self.leds = Peer(path, clock=time.monotonic, make=functools.partial(SeenController, self.lights))
-        self.leds.controller.boot = boot
+        self.leds.controller.boot = self._boots
 
     def unplug(self) -> None:
         """Unplug the controller, whose lights go off."""

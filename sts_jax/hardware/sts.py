@@ -19,7 +19,16 @@ from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import BLACK, Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
-from sts_jax.hardware.settling import Settling, Switch, Thumbnail, light_share, settling, thumbnail
+from sts_jax.hardware.settling import (
+    Settling,
+    Switch,
+    Thumbnail,
+    check_contrast,
+    difference,
+    light_share,
+    settling,
+    thumbnail,
+)
 
 Stream = Literal["visual", "tactile"]
 
@@ -167,7 +176,7 @@ class STS:
         return self._settling
 
     def connect(self, warmup_s: float = 1.0) -> "STS":
-        """Open both devices, turn the lights off, and measure the settling times unless they were given.
+        """Open both devices, switch the lights on and off, and measure the settling times unless they were given.
 
         Args:
             warmup_s: Time for the camera's automatic controls to settle (s).
@@ -187,6 +196,8 @@ class STS:
                 self._camera.connect(warmup_s)
             if self._settling is None:
                 self._settling = self.measure_settling()
+            else:
+                self._see_both(self._settling)
         except BaseException:
             self.disconnect()
             raise
@@ -337,6 +348,13 @@ class STS:
         self._looks = {"visual": off[-1].thumbnails[-1], "tactile": on[-1].thumbnails[-1]}
         return found
 
+    def _see_both(self, settling: Settling) -> None:
+        """Take an image of each light, with which the first frames are compared."""
+        lit = self._watched("tactile", 2 * settling.tactile_s).thumbnails[-1]
+        dark = self._watched("visual", 2 * settling.visual_s).thumbnails[-1]
+        check_contrast(difference(dark, lit))
+        self._looks = {"visual": dark, "tactile": lit}
+
     def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
         found = settling(on, off, period_s)
         slowest_s = max(found.visual_s, found.tactile_s)
@@ -401,11 +419,7 @@ class STS:
         while not self._stopping:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
-                raise LightError(
-                    f"no frame could be proven to be of the {stream} stream in time ({self.discarded} frames were "
-                    "discarded so far): check that the LEDs light up, that the camera's exposure is locked, and its "
-                    "rate."
-                )
+                raise self._light_error(stream)
             try:
                 frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
             except CameraLostError:
@@ -425,6 +439,15 @@ class STS:
                     lit = self._set(stream)
                 checked_s = time.monotonic()
         raise LightError("the thread that takes pairs was stopped.")
+
+    def _light_error(self, stream: Stream) -> LightError:
+        cause = "check that the LEDs light up, that the camera's exposure is locked, and its rate"
+        if self._previous is not None and self._previous.black:
+            cause = "its frames are black now, so check the camera, or connect again if the scene has become dark"
+        return LightError(
+            f"no frame of {self._camera.config.name} could be proven to be of the {stream} stream in time "
+            f"({self.discarded} frames were discarded so far): {cause}."
+        )
 
     def _shows(self, frame: Captured, stream: Stream) -> bool:
         """Whether a frame looks more like the last image of its stream than like that of the other one."""
