@@ -131,14 +131,20 @@ def report(found: list[Measured]) -> str:
     return "\n".join(lines)
 
 
-def main(args: Args) -> str:
-    """Measure all lags and return the table."""
+def measure_all(args: Args) -> list[Measured]:
+    """Measure all lags, which share the pairs."""
     number = len(args.lags_ms)
     found = []
     with tempfile.TemporaryDirectory() as folder:
         for index, lag_ms in enumerate(args.lags_ms):
             pairs = args.pairs * (index + 1) // number - args.pairs * index // number
             found.append(measure(lag_ms, pairs, Path(folder) / "leds"))
+    return found
+
+
+def main(args: Args) -> str:
+    """Measure and return the table."""
+    found = measure_all(args)
     load = os.getloadavg()[1] if hasattr(os, "getloadavg") else float("nan")
     text = (
         report(found) + f"\n{os.cpu_count()} CPU cores, with a load of {load:.1f} processes over the last 5 minutes\n"

@@ -1,6 +1,6 @@
 """Faults of a sensor's devices while a program reads pairs of images, and the behaviour of `hardware.STS`.
 
-    python -m benchmarks.faults                                                 # 325 faults, about 15 minutes
+    python -m benchmarks.faults                                                 # 300 faults, about a quarter of an hour
     python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
     python -m benchmarks.faults --number 32 --only reset unplugged              # two kinds of faults
 
@@ -55,17 +55,20 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: `number` is smaller than 1, or a kind is unknown.
+        ValueError: `number` or `long` is out of range, or a kind is unknown.
     """
 
-    number: int = 325  # faults
+    number: int = 300  # faults
     seed: int = 0  # of their order, times and lengths
+    long: float = 0.15  # share of the faults that can last for any time and that last longer than a read may, 0 to 1
     only: tuple[str, ...] = ()  # kinds of faults (default: all)
     out: Path | None = None  # file of the table
 
     def __post_init__(self) -> None:
         if self.number < 1:
             raise ValueError(f"--number must be at least 1, got {self.number}")
+        if not 0 <= self.long <= 1:
+            raise ValueError(f"--long must be in [0, 1], got {self.long}")
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
             raise ValueError(f"--only has unknown kinds {sorted(unknown)}, known are: {', '.join([*KINDS, KILLED])}")
 
@@ -90,8 +93,8 @@ class Count:
 class Bench:
     """The devices, and a sensor that reads them."""
 
-    def __init__(self, folder: Path, draw: random.Random):
-        self.folder, self.draw = folder, draw
+    def __init__(self, folder: Path, draw: random.Random, long: float):
+        self.folder, self.draw, self.long = folder, draw, long
         self.peer = SensorPeer(
             folder / "leds", fps=FPS, lag_s=draw.uniform(0.015, 0.12), exposure_s=draw.uniform(0.004, 0.016)
         )
@@ -100,11 +103,13 @@ class Bench:
     @contextlib.contextmanager
     def connected(self) -> Iterator[hardware.STS]:
         """The sensor with its settling times measured."""
-        leds = hardware.Leds.connect(self.peer.path, timeout_s=HANDSHAKE_S, answer_s=ANSWER_S, watchdog_ms=WATCHDOG_MS)
-        made = hardware.STS(camera=self.camera(), leds=leds, timeout_s=TIMEOUT_S, reconnect_s=RECONNECT_S)
-        listed = unittest.mock.patch("serial.tools.list_ports.comports", side_effect=lambda: self.ports)
-        with listed, made as sensor:
-            yield sensor
+        with unittest.mock.patch("serial.tools.list_ports.comports", side_effect=lambda: self.ports):
+            leds = hardware.Leds.connect(
+                self.peer.path, timeout_s=HANDSHAKE_S, answer_s=ANSWER_S, watchdog_ms=WATCHDOG_MS
+            )
+            made = hardware.STS(camera=self.camera(), leds=leds, timeout_s=TIMEOUT_S, reconnect_s=RECONNECT_S)
+            with made.connect(warmup_s=0.1) as sensor:
+                yield sensor
 
     def camera(self) -> hardware.CameraConfig:
         """The camera's configuration."""
@@ -130,8 +135,8 @@ def _usb_port(path: str) -> list_ports_common.ListPortInfo:
 
 
 def _length_s(bench: Bench, least_s: float, longest_s: float) -> float:
-    """The length of a fault. A quarter of the faults last longer than a read may."""
-    return bench.draw.uniform(5, 7) if bench.draw.random() < 0.25 else bench.draw.uniform(least_s, longest_s)
+    """The length of a fault. A share of the faults last longer than a read may."""
+    return bench.draw.uniform(5, 7) if bench.draw.random() < bench.long else bench.draw.uniform(least_s, longest_s)
 
 
 # Each kind of fault lasts for as long as its function runs, in a thread beside the reads.
@@ -340,7 +345,7 @@ def measure(args: Args) -> dict[str, Count]:
     todo = [kind for kind in order if kind != KILLED]
     with tempfile.TemporaryDirectory() as folder:
         while todo:  # one bench for each 40 faults, so several lags are drawn
-            bench = Bench(Path(folder), draw)
+            bench = Bench(Path(folder), draw, args.long)
             try:
                 with bench.connected() as sensor:
                     for kind in todo[:40]:
@@ -349,7 +354,7 @@ def measure(args: Args) -> dict[str, Count]:
                 bench.peer.stop()
             todo = todo[40:]
         if killed := order.count(KILLED):
-            bench = Bench(Path(folder), draw)
+            bench = Bench(Path(folder), draw, args.long)
             try:
                 for _ in range(killed):
                     kill(bench, counts[KILLED])

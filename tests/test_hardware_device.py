@@ -130,6 +130,55 @@ def test_leds_that_do_not_light_up_are_named(peer, sensor):
     sensor.read()
 
 
+def test_lights_that_go_off_during_a_read_are_set_again(peer, sensor):
+    sensor.read()
+    threading.Timer(0.05, peer.leds.fire_watchdog).start()
+    assert all(judged(peer, shot) for _ in range(4) for shot in _both(sensor.read(timeout_ms=3000)))
+
+
+def test_a_lost_camera_is_named(peer, sensor):
+    sensor.read()
+    peer.camera.stop()
+    with pytest.raises(hardware.CameraLostError, match="was lost"):
+        sensor.read(timeout_ms=700)
+    peer.camera.start()
+    assert all(judged(peer, shot) for shot in _both(sensor.read()))
+
+
+def test_black_images_of_a_broken_camera_are_no_visual_images(peer, sensor):
+    sensor.read()
+    peer.camera.mode = "black"
+    with pytest.raises(hardware.LightError, match="frames are black now"):
+        sensor.read(timeout_ms=700)
+    peer.camera.mode = "live"
+    assert all(judged(peer, shot) for shot in _both(sensor.read()))
+
+
+def test_repeated_frames_are_not_returned_as_new(peer):
+    given = config(peer.url, frozen_after_s=30)
+    with hardware.STS(camera=given, leds=peer.path, settling=SETTLING).connect(0.2) as sensor:
+        pair = sensor.read()
+        peer.camera.mode = "repeat"
+        with pytest.raises(hardware.LightError):
+            sensor.read(timeout_ms=700)
+        peer.camera.mode = "live"
+        assert sensor.read().visual.sequence > pair.tactile.sequence
+
+
+def test_frames_that_are_held_back_do_not_pass_as_those_of_another_light(peer, sensor):
+    for _ in range(3):
+        sensor.read()
+        peer.camera.mode = "held"
+        threading.Timer(0.4, lambda: setattr(peer.camera, "mode", "live")).start()
+        assert all(judged(peer, shot) for _ in range(2) for shot in _both(sensor.read()))
+
+
+def test_no_contrast_with_given_settling_times_is_named(peer):
+    peer.camera.blind = True
+    with pytest.raises(hardware.NoContrastError, match="wiring and levels"):
+        hardware.STS(camera=config(peer.url), leds=peer.path, settling=SETTLING).connect(0.1)
+
+
 def test_no_contrast_at_connection_is_named_and_devices_are_closed(peer):
     peer.camera.blind = True
     sensor = hardware.STS(camera=config(peer.url), leds=peer.path)
