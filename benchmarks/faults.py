@@ -2,7 +2,7 @@
 
     python -m benchmarks.faults                                                 # 300 faults, about a quarter of an hour
     python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
-    python -m benchmarks.faults --number 32 --only reset unplugged              # two kinds of faults
+    python -m benchmarks.faults --number 20 --only black                        # one kind of fault
 
 A controller on a pseudo-terminal and a camera on loopback stand for the devices (`instruments/sensor_peer.py`). The
 camera sees the lights of the controller, with a lag and an exposure time that are drawn at random. Before each fault

@@ -29,7 +29,7 @@ def check(counts, number):
 
 
 def test_ten_short_faults():
-    counts = faults.measure(faults.Args(number=10, seed=3, long=0.0, only=SHORT))
+    counts = faults.measure(faults.Args(number=10, seed=4, long=0.0, only=SHORT))  # this seed has a short lag
     check(counts, 10)
     assert faults.report(counts).splitlines()[-1].split()[:2] == ["all", "10"]
 
