@@ -1,6 +1,6 @@
 """Faults of a sensor's devices while a program reads pairs of images, and the behaviour of `hardware.STS`.
 
-    python -m benchmarks.faults                                                 # 300 faults, about a quarter of an hour
+    python -m benchmarks.faults                                                 # 312 faults, about a quarter of an hour
     python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
     python -m benchmarks.faults --number 20 --only black                        # one kind of fault
 
@@ -16,6 +16,7 @@ In the last kind, the program that reads is a process of its own, and is killed 
 
 import contextlib
 import dataclasses
+import multiprocessing
 import os
 import random
 import signal
@@ -47,6 +48,7 @@ GRACE_S = 0.5  # for threads that a busy machine does not run in time, and 0.2 s
 READ_S = 2 * TIMEOUT_S + REQUEST_S + GRACE_S  # longest time of a read without a reconnection
 RECONNECTED_S = READ_S + RECONNECT_S + 2 * (HANDSHAKE_S + 2 * ANSWER_S)  # with one, which tries at most two ports
 DARK_S = 0.1  # by which lights may go off later than the watchdog's period, for the same reason
+PART = 40  # faults of one sensor
 RETURN_S = 12.0  # longest time of the camera's backoff after a fault of at most 7 s, and of one read
 
 
@@ -58,9 +60,10 @@ class Args:
         ValueError: `number` or `long` is out of range, or a kind is unknown.
     """
 
-    number: int = 300  # faults
+    number: int = 312  # faults
     seed: int = 0  # of their order, times and lengths
     long: float = 0.15  # share of the faults that can last for any time and that last longer than a read may, 0 to 1
+    jobs: int = 1  # sensors that are read at the same time, in processes of their own
     only: tuple[str, ...] = ()  # kinds of faults (default: all)
     out: Path | None = None  # file of the table
 
@@ -88,6 +91,16 @@ class Count:
     recovered: int = 0
     recovery_s: float = 0.0  # longest time from the end of a fault to the next pair
     lit_s: float = 0.0  # longest time for which a light was on after the program was killed
+
+    def add(self, other: "Count") -> None:
+        """Add the findings of other faults."""
+        for name in ("injected", "images", "wrong", "old", "unnamed", "recovered"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name, number in other.errors.items():
+            self.errors[name] = self.errors.get(name, 0) + number
+        for name in ("longest_s", "recovery_s", "lit_s"):
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
+        self.limit_s = other.limit_s
 
 
 class Bench:
@@ -175,8 +188,12 @@ def _reset(bench: Bench) -> None:
 
 
 def _unplugged(bench: Bench) -> None:
+    _unplugged_for(bench, _length_s(bench, 0.1, 1.5))
+
+
+def _unplugged_for(bench: Bench, seconds: float) -> None:
     bench.peer.unplug()
-    time.sleep(_length_s(bench, 0.1, 1.5))
+    time.sleep(seconds)
     bench.plug_in(Path(bench.ports[0].device).name)
 
 
@@ -212,6 +229,15 @@ def _held_reset(bench: Bench) -> None:
     bench.peer.camera.mode = "live"
 
 
+def _held_unplugged(bench: Bench) -> None:
+    """The network holds frames back, and the controller is unplugged and plugged in again meanwhile."""
+    bench.peer.camera.mode = "held"
+    time.sleep(bench.draw.uniform(0.0, 0.1))
+    _unplugged_for(bench, bench.draw.uniform(0.02, 0.1))
+    time.sleep(bench.draw.uniform(0.2, 0.6))
+    bench.peer.camera.mode = "live"
+
+
 KINDS: dict[str, Callable[[Bench], None]] = {
     **{f"answer {word}": _answers(word) for word in ("late", "lost", "doubled", "garbled", "cut", "joined")},
     "noise on the line": _answers("noise"),
@@ -226,6 +252,7 @@ KINDS: dict[str, Callable[[Bench], None]] = {
     "camera stalls": _camera("stall", 0.05, 2.0),
     "frames held back": _camera("held", 0.05, 0.8),
     "held back, restart": _held_reset,
+    "held back, unplugged": _held_unplugged,
     "frames repeated": _camera("repeat", 0.05, 1.5),
     "other size": _camera("small"),
     "black": _camera("black"),
@@ -240,6 +267,7 @@ RECONNECTING = (
     "port vanishes",
     "port returns renamed",
     "held back, restart",
+    "held back, unplugged",
 )
 
 
@@ -337,29 +365,37 @@ def _until(condition: Callable[[], bool], limit_s: float) -> None:
 
 def measure(args: Args) -> dict[str, Count]:
     """Inject the faults in random order, all kinds equally often."""
-    draw = random.Random(args.seed)
     kinds = list(args.only) or [*KINDS, KILLED]
     order = [kinds[i % len(kinds)] for i in range(args.number)]
-    draw.shuffle(order)
+    random.Random(args.seed).shuffle(order)
+    parts = [order[i : i + PART] for i in range(0, args.number, PART)]
+    tasks = [(part, args.seed + number, args.long) for number, part in enumerate(parts)]
+    if args.jobs == 1:
+        found = [measure_part(*task) for task in tasks]
+    else:
+        with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
+            found = pool.starmap(measure_part, tasks, chunksize=1)
     counts = {kind: Count() for kind in kinds}
-    todo = [kind for kind in order if kind != KILLED]
+    for part in found:
+        for kind, count in part.items():
+            counts[kind].add(count)
+    return counts
+
+
+def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
+    """Inject some faults into one sensor, whose lag and exposure time are drawn at random."""
+    counts = {kind: Count() for kind in order}
     with tempfile.TemporaryDirectory() as folder:
-        while todo:  # one bench for each 40 faults, so several lags are drawn
-            bench = Bench(Path(folder), draw, args.long)
-            try:
-                with bench.connected() as sensor:
-                    for kind in todo[:40]:
+        bench = Bench(Path(folder), random.Random(seed), long)
+        try:
+            with bench.connected() as sensor:
+                for kind in order:
+                    if kind != KILLED:
                         inject(bench, sensor, kind, counts[kind])
-            finally:
-                bench.peer.stop()
-            todo = todo[40:]
-        if killed := order.count(KILLED):
-            bench = Bench(Path(folder), draw, args.long)
-            try:
-                for _ in range(killed):
-                    kill(bench, counts[KILLED])
-            finally:
-                bench.peer.stop()
+            for _ in range(order.count(KILLED)):
+                kill(bench, counts[KILLED])
+        finally:
+            bench.peer.stop()
     return counts
 
 
@@ -402,8 +438,8 @@ def main(args: Args) -> str:
     text = report(counts)
     load = os.getloadavg()[2] if hasattr(os, "getloadavg") else float("nan")
     text += (
-        f"\nseed {args.seed}, {time.monotonic() - begun_s:.0f} s, {os.cpu_count()} CPU cores with a load of {load:.1f} "
-        "processes on average over the last 15 minutes\n"
+        f"\nseed {args.seed}, {time.monotonic() - begun_s:.0f} s, {args.jobs} sensor(s) at a time, {os.cpu_count()} "
+        f"CPU cores with a load of {load:.1f} processes on average over the last 15 minutes\n"
     )
     if args.out is not None:
         args.out.parent.mkdir(parents=True, exist_ok=True)

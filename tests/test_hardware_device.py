@@ -1,7 +1,9 @@
 """`STS`: which light was on is judged by the peer's log of each frame, never by the host's label."""
 
 import dataclasses
+import itertools
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -171,6 +173,54 @@ def test_frames_that_are_held_back_do_not_pass_as_those_of_another_light(peer, s
         peer.camera.mode = "held"
         threading.Timer(0.4, lambda: setattr(peer.camera, "mode", "live")).start()
         assert all(judged(peer, shot) for _ in range(2) for shot in _both(sensor.read()))
+
+
+@pytest.mark.parametrize("first", ["visual", "tactile"])
+def test_the_watchdog_is_not_mistaken_for_a_switch(peer, sensor, monkeypatch, first):
+    """The lights go off just before the request that is to turn them off or on."""
+    sensor.read()
+    while sensor._stream != first:
+        next(sensor.stream(first == "tactile"))
+    proof, boots = sensor._proof, []
+
+    def disturbed(before, then):
+        if not boots:
+            boots.append(before)
+            peer.leds.fire_watchdog()
+        return proof(before, then)
+
+    monkeypatch.setattr(sensor, "_proof", disturbed)
+    pair = sensor.read()
+    assert (getattr(pair, first).before.counter > boots[0].counter) == (first == "tactile")
+    assert all(judged(peer, shot) for shot in _both(pair))
+
+
+def test_late_frames_of_two_switches_are_not_mixed_up(peer, sensor, monkeypatch):
+    """The watchdog fires, the lights are set again, and only then the frames around the watchdog's switch arrive."""
+    last = sensor.read().tactile
+    sequence, late, fired = itertools.count(last.sequence + 1000), [], []
+    proof = sensor._proof
+
+    def disturbed(before, then):
+        if not fired:
+            fired.append(before)
+            peer.leds.fire_watchdog()
+            late.extend([0.0, 0.7, 1.0])
+        return proof(before, then)
+
+    def async_read(timeout_ms):
+        time.sleep(2 * SETTLING.tactile_s if len(late) == 3 else 0.02)
+        light = late.pop() if late else peer.leds.controller.levels != (0, 0, 0, 0)
+        image = np.full((SIZE[1], SIZE[0], 3), round(DARK + light * (LIT - DARK)), np.uint8)
+        return hardware.Captured(image, time.monotonic(), next(sequence), last.epoch, 0, 0, False)
+
+    monkeypatch.setattr(sensor, "_proof", disturbed)
+    monkeypatch.setattr(sensor.camera, "async_read", async_read)
+    pair = sensor.read()
+    assert fired[0].levels == (255, 255, 255, 255)
+    assert not late
+    assert (pair.visual.image == DARK).all()
+    assert (pair.tactile.image == LIT).all()
 
 
 def test_no_contrast_with_given_settling_times_is_named(peer):

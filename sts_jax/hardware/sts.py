@@ -397,8 +397,13 @@ class STS:
 
         With `then`, the lights are switched to that stream afterwards, and the answer to this switch is the proof.
         """
+        lost = False
         while True:
             try:
+                if lost and (stream == "tactile" or self._stream != stream):
+                    # The lights went off and on, so late frames may show the former light and then a mixed one. After
+                    # a frame of the other light, all frames that still come are of a single switch.
+                    self._frame("visual" if stream == "tactile" else "tactile", deadline, 0.0)
                 before, frame = self._frame(stream, deadline, after_s)
                 until_s = self._proof(before, then)
             except (DisconnectedError, LedTimeoutError):
@@ -406,11 +411,13 @@ class STS:
                 self._lit = None
                 self.leds.reconnect(limit_s=self._reconnect_s)
                 deadline += time.monotonic() - lost_s
+                lost = True
                 continue
             if until_s is not None:
                 self._looks[stream] = thumbnail(frame.image)
                 return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
             self.discarded += 1
+            lost = True
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
         """A frame that arrives when the light has settled, and the answer of the controller before it."""
@@ -481,14 +488,20 @@ class STS:
 
     def _proof(self, before: Lit, then: Stream | None) -> float | None:
         """The time until which the lights are proven to be unchanged, or None if they changed. May switch them."""
-        if then is None or then == self._stream:
+        if then == self._stream:
+            then = None
+        # The watchdog turns the lights off as a switch to the visual stream does, and the counter of changes would not
+        # tell one from the other.
+        if then is None or self._stream == "tactile":
             after = self.leds.ping()
-            if after.unchanged_since(before):
-                return after.sent_s
-            self._lit = None
-            return None
+            if not after.unchanged_since(before):
+                self._lit = None
+                return None
+            if then is not None:
+                self._set(then)
+            return after.sent_s
         after = self._set(then)
-        # The levels differ, so a single change is that of this request.
+        # Nothing but a request turns the lights on, so a single change is that of this request.
         return after.sent_s if (after.boot, after.counter) == (before.boot, before.counter + 1) else None
 
     def _watched(self, stream: Stream, watch_s: float) -> Switch:
