@@ -334,15 +334,16 @@ def kill(bench: Bench, count: Count) -> None:
     count.injected += 1
     count.limit_s = WATCHDOG_MS / 1000 + DARK_S
     size = bench.peer.camera.size
-    program = (
-        f"from benchmarks import faults; faults.host({bench.peer.path!r}, {bench.peer.url!r}, {size[0]}, {size[1]})"
-    )
+    port = bench.ports[0].device
+    program = f"from benchmarks import faults; faults.host({port!r}, {bench.peer.url!r}, {size[0]}, {size[1]})"
     lights = bench.peer.lights
     process = subprocess.Popen([sys.executable, "-c", program])
     try:
         _until(lambda: lights.off_after(0.0) is None or process.poll() is not None, 60)
         wait_s = time.monotonic() + bench.draw.uniform(0, 3)
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
+        if process.poll() is not None or lights.off_after(0.0) is not None:
+            raise RuntimeError(f"the program that is to be killed ended with {process.poll()} or set no light")
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed_s = time.monotonic()
