@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from camera_server import SIZE, MotionJpeg, draw, number_of
 
+from benchmarks.instruments.camera_server import SIZE, MotionJpeg, draw, number_of
 from sts_jax.hardware import (
     Camera,
     CameraBusyError,

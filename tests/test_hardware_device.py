@@ -1,13 +1,15 @@
 """`STS`: which light was on is judged by the peer's log of each frame, never by the host's label."""
 
 import dataclasses
+import itertools
 import threading
+import time
 
 import numpy as np
 import pytest
-from camera_server import SIZE, number_of
-from sensor_peer import CORNER, DARK, LIT, SensorPeer
 
+from benchmarks.instruments.camera_server import SIZE
+from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from sts_jax import hardware
 from sts_jax.hardware.settling import Settling, Switch, settling
 
@@ -34,8 +36,7 @@ def sensor(peer):
 
 def judged(peer, shot):
     """Whether the frame that an image shows had its stream's light during all of its exposure."""
-    shares = peer.camera.shown[number_of(shot.image[:CORNER, :CORNER])]
-    return shares == [1.0 if shot.stream == "tactile" else 0.0]
+    return peer.judged(shot.image, lit=shot.stream == "tactile")
 
 
 def test_pairs_are_of_the_right_light(peer, sensor):
@@ -100,8 +101,7 @@ def test_lights_that_go_off_in_between_are_noticed(peer, sensor):
 
     def disturb():
         while not stopped.wait(0.35):
-            peer.leds.controller._apply((0, 0, 0, 0))
-            peer.leds.controller.counter += 1
+            peer.leds.fire_watchdog()
 
     thread = threading.Thread(target=disturb)
     thread.start()
@@ -131,6 +131,103 @@ def test_leds_that_do_not_light_up_are_named(peer, sensor):
     sensor.read()
 
 
+def test_lights_that_go_off_during_a_read_are_set_again(peer, sensor):
+    sensor.read()
+    threading.Timer(0.05, peer.leds.fire_watchdog).start()
+    assert all(judged(peer, shot) for _ in range(4) for shot in _both(sensor.read(timeout_ms=3000)))
+
+
+def test_a_lost_camera_is_named(peer, sensor):
+    sensor.read()
+    peer.camera.stop()
+    with pytest.raises(hardware.CameraLostError, match="was lost"):
+        sensor.read(timeout_ms=700)
+    peer.camera.start()
+    assert all(judged(peer, shot) for shot in _both(sensor.read()))
+
+
+def test_black_images_of_a_broken_camera_are_no_visual_images(peer, sensor):
+    sensor.read()
+    peer.camera.mode = "black"
+    with pytest.raises(hardware.LightError, match="frames are black now"):
+        sensor.read(timeout_ms=700)
+    peer.camera.mode = "live"
+    assert all(judged(peer, shot) for shot in _both(sensor.read()))
+
+
+def test_repeated_frames_are_not_returned_as_new(peer):
+    given = config(peer.url, frozen_after_s=30)
+    with hardware.STS(camera=given, leds=peer.path, settling=SETTLING).connect(0.2) as sensor:
+        pair = sensor.read()
+        peer.camera.mode = "repeat"
+        with pytest.raises(hardware.LightError):
+            sensor.read(timeout_ms=700)
+        peer.camera.mode = "live"
+        assert sensor.read().visual.sequence > pair.tactile.sequence
+
+
+def test_frames_that_are_held_back_do_not_pass_as_those_of_another_light(peer, sensor):
+    for _ in range(3):
+        sensor.read()
+        peer.camera.mode = "held"
+        threading.Timer(0.4, lambda: setattr(peer.camera, "mode", "live")).start()
+        assert all(judged(peer, shot) for _ in range(2) for shot in _both(sensor.read()))
+
+
+@pytest.mark.parametrize("first", ["visual", "tactile"])
+def test_the_watchdog_is_not_mistaken_for_a_switch(peer, sensor, monkeypatch, first):
+    """The lights go off just before the request that is to turn them off or on."""
+    sensor.read()
+    while sensor._stream != first:
+        next(sensor.stream(first == "tactile"))
+    proof, boots = sensor._proof, []
+
+    def disturbed(before, then):
+        if not boots:
+            boots.append(before)
+            peer.leds.fire_watchdog()
+        return proof(before, then)
+
+    monkeypatch.setattr(sensor, "_proof", disturbed)
+    pair = sensor.read()
+    assert (getattr(pair, first).before.counter > boots[0].counter) == (first == "tactile")
+    assert all(judged(peer, shot) for shot in _both(pair))
+
+
+def test_late_frames_of_two_switches_are_not_mixed_up(peer, sensor, monkeypatch):
+    """The watchdog fires, the lights are set again, and only then the frames around the watchdog's switch arrive."""
+    last = sensor.read().tactile
+    sequence, late, fired = itertools.count(last.sequence + 1000), [], []
+    proof = sensor._proof
+
+    def disturbed(before, then):
+        if not fired:
+            fired.append(before)
+            peer.leds.fire_watchdog()
+            late.extend([0.0, 0.7, 1.0])
+        return proof(before, then)
+
+    def async_read(timeout_ms):
+        time.sleep(2 * SETTLING.tactile_s if len(late) == 3 else 0.02)
+        light = late.pop() if late else peer.leds.controller.levels != (0, 0, 0, 0)
+        image = np.full((SIZE[1], SIZE[0], 3), round(DARK + light * (LIT - DARK)), np.uint8)
+        return hardware.Captured(image, time.monotonic(), next(sequence), last.epoch, 0, 0, False)
+
+    monkeypatch.setattr(sensor, "_proof", disturbed)
+    monkeypatch.setattr(sensor.camera, "async_read", async_read)
+    pair = sensor.read()
+    assert fired[0].levels == (255, 255, 255, 255)
+    assert not late
+    assert (pair.visual.image == DARK).all()
+    assert (pair.tactile.image == LIT).all()
+
+
+def test_no_contrast_with_given_settling_times_is_named(peer):
+    peer.camera.blind = True
+    with pytest.raises(hardware.NoContrastError, match="wiring and levels"):
+        hardware.STS(camera=config(peer.url), leds=peer.path, settling=SETTLING).connect(0.1)
+
+
 def test_no_contrast_at_connection_is_named_and_devices_are_closed(peer):
     peer.camera.blind = True
     sensor = hardware.STS(camera=config(peer.url), leds=peer.path)
@@ -141,25 +238,11 @@ def test_no_contrast_at_connection_is_named_and_devices_are_closed(peer):
         sensor.read()
 
 
-def test_a_controller_that_returns_is_found_again(tmp_path):
-    peer = SensorPeer(tmp_path / "leds")
-    try:
-        with hardware.STS(camera=config(peer.url), leds=peer.path, settling=SETTLING).connect(0.1) as sensor:
-            sensor.read()
-            peer.leds.vanish()
-            again = []
-
-            def plug():
-                again.append(SensorPeer(tmp_path / "leds"))
-                peer.camera.lights = again[0].camera.lights
-
-            threading.Timer(0.5, plug).start()
-            shots = _both(sensor.read())
-            assert all(judged(peer, shot) for shot in shots)
-    finally:
-        peer.camera.stop()
-        for other in again:
-            other.stop()
+def test_a_controller_that_returns_is_found_again(tmp_path, peer, sensor):
+    sensor.read()
+    peer.unplug()
+    threading.Timer(0.5, lambda: peer.plug_in(tmp_path / "leds")).start()
+    assert all(judged(peer, shot) for shot in _both(sensor.read()))
 
 
 def test_async_read_and_read_latest(peer, sensor):

@@ -16,9 +16,10 @@ from pathlib import Path
 
 import pytest
 import serial
-from led_peer import Peer, Simulated, until
+from led_simulator import Simulated, until
 from serial.tools import list_ports_common
 
+from benchmarks.instruments.led_peer import Peer
 from sts_jax import hardware
 from sts_jax.hardware import emulation, protocol
 

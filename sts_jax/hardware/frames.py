@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-_BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
+BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
 _INTERVALS = 61  # recent intervals between frames, of which the median is the period
 _FEWEST = 8  # intervals from which a period is measured
 _MADE_UP = 4  # frames after late ones that may still be early. More would add up the error of the period
@@ -48,7 +48,7 @@ class CameraStatistics:
 
 def is_black(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     """Whether no value of an image exceeds 8 of 255. The lights may be off, so this is no error."""
-    return bool(image.max(initial=0) <= _BLACK)
+    return bool(image.max(initial=0) <= BLACK)
 
 
 class _Gap(NamedTuple):

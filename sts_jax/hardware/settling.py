@@ -50,6 +50,23 @@ def difference(first: Thumbnail, second: Thumbnail) -> float:
     return float(np.abs(first - second).mean())
 
 
+def check_contrast(contrast: float) -> None:
+    """Raise an error if the lights do not change the image.
+
+    Args:
+        contrast: Difference of the images without and with the lights, of 255.
+
+    Raises:
+        NoContrastError: The difference is too small.
+    """
+    if contrast < _LEAST_CONTRAST:
+        raise NoContrastError(
+            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, and at least "
+            f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and whether the camera adapts its "
+            "exposure."
+        )
+
+
 def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
     """The share of the light in an image, by least squares between images without (0) and with the light (1).
 
@@ -77,12 +94,7 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
     dark = np.mean([switch.thumbnails[-1] for switch in off], axis=0)
     lit = np.mean([switch.thumbnails[-1] for switch in on], axis=0)
     contrast = difference(dark, lit)
-    if contrast < _LEAST_CONTRAST:
-        raise NoContrastError(
-            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, and at least "
-            f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and whether the camera adapts its "
-            "exposure."
-        )
+    check_contrast(contrast)
     last_off, last_on = (max(last_mixed(switch, dark, lit) for switch in switches) for switches in (off, on))
     return Settling(last_off + period_s, last_on + period_s)
 

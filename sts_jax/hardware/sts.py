@@ -21,7 +21,7 @@ from sts_jax.hardware.frames import Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
 from sts_jax.hardware.sensor_file import Device
-from sts_jax.hardware.settling import Settling, Switch, Thumbnail, difference, settling, thumbnail
+from sts_jax.hardware.settling import Settling, Switch, Thumbnail, check_contrast, difference, settling, thumbnail
 
 Stream = Literal["visual", "tactile"]
 
@@ -29,11 +29,10 @@ _DEPARTED = 0.5  # of the contrast, by which a frame must differ from the last o
 _AGAIN_S = 1.0  # s, after which a switch that does not show is repeated
 _SWITCHES = 8  # of each direction, to measure the settling
 _PHASE = 0.618  # of a period, by which the phase of the measured switches advances
+_CHECK_S = 0.1  # s, least time between two questions to the controller while frames show another light
 _GRACE_S = 0.2  # s, by which a wait for the camera may exceed a limit, so that the cause of a delay is the one reported
 _STILL = 6.0  # of 255, change of a thumbnail's pixel that always counts as still
-_NOISE = (
-    8.0  # times the median change of all pixels, which counts as still too. The noise's largest one is 5 times that
-)
+_NOISE = 8.0  # times the median change of all pixels, which counts as still too. Noise has changes of 5 times that
 
 
 class LightError(RuntimeError):
@@ -92,7 +91,8 @@ class STS:
     A frame counts as of one light if it arrives later than the settling time after the controller's acknowledgement, if
     two frames in a row have shown since the switch that the image has changed, and if the controller's next answer
     proves that its lights have not changed in between. All other frames are discarded, also those of a stalled stream
-    that arrive late.
+    that arrive late, those that repeat the frame before them (unless the camera's `frozen_after_s` is None), and black
+    ones of a stream that was not black.
 
     One thread may use a sensor at a time.
     """
@@ -144,6 +144,7 @@ class STS:
         self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
         self._stream: Stream = "visual"
         self._contrast: float | None = None  # of images without and with the light, of 255
+        self._black: dict[Stream, bool] = {}  # whether the last image of a stream was black
         self._previous: Captured | None = None  # the last frame of the camera
         self._reference: Thumbnail | None = None  # of the last frame before the switch
         self._departed = 0  # successive frames since the switch that show the new light, 2 and more: all are of it
@@ -237,7 +238,7 @@ class STS:
         return self._settling
 
     def connect(self, warmup_s: float = 1.0) -> "STS":
-        """Open both devices, turn the lights off, and measure the settling times unless they were given.
+        """Open both devices, switch the lights on and off, and measure the settling times unless they were given.
 
         Args:
             warmup_s: Time for the camera's automatic controls to settle (s).
@@ -263,6 +264,8 @@ class STS:
                 self._camera.connect(warmup_s)
             if self._settling is None:
                 self._settling = self.measure_settling()
+            else:
+                self._see_both(self._settling)
         except BaseException:
             self.disconnect()
             raise
@@ -284,7 +287,8 @@ class STS:
         successive pairs need one switch each.
 
         Args:
-            timeout_ms: Longest time (ms), None: two times `timeout_s`. A reconnection comes on top.
+            timeout_ms: Longest time (ms), None: two times `timeout_s`. A reconnection comes on top, and so does the
+                last request to the controller, whose time `Leds` states.
 
         Raises:
             LightError: No frame could be proven to be of the wanted light in time.
@@ -416,6 +420,13 @@ class STS:
         self._contrast = difference(off[-1].thumbnails[-1], on[-1].thumbnails[-1])
         return found
 
+    def _see_both(self, settling: Settling) -> None:
+        """Take an image of each light, with which the first frames are compared."""
+        lit = self._watched("tactile", 2 * settling.tactile_s).thumbnails[-1]
+        dark = self._watched("visual", 2 * settling.visual_s).thumbnails[-1]
+        self._contrast = difference(dark, lit)
+        check_contrast(self._contrast)
+
     def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
         found = settling(on, off, period_s)
         slowest_s = max(found.visual_s, found.tactile_s)
@@ -458,8 +469,13 @@ class STS:
 
         With `then`, the lights are switched to that stream afterwards, and the answer to this switch is the proof.
         """
+        lost = False
         while True:
             try:
+                if lost and (stream == "tactile" or self._stream != stream):
+                    # The lights went off and on, so late frames may show the former light and then a mixed one. After
+                    # a frame of the other light, all frames that still come are of a single switch.
+                    self._frame("visual" if stream == "tactile" else "tactile", deadline, 0.0)
                 before, frame = self._frame(stream, deadline, after_s)
                 until_s = self._proof(before, then)
             except (DisconnectedError, LedTimeoutError):
@@ -467,44 +483,64 @@ class STS:
                 self._lit = None
                 self.leds.reconnect(limit_s=self._reconnect_s)
                 deadline += time.monotonic() - lost_s
+                lost = True
                 continue
             if until_s is not None:
+                self._black[stream] = frame.black
                 return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
             self.discarded += 1
+            lost = True
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
         """A frame that arrives when the light has settled, and the answer of the controller before it."""
-        lit = self._switched(stream)
+        lit, checked_s = self._switched(stream), 0.0
         settled_s = self.settling.visual_s if stream == "visual" else self.settling.tactile_s
         while not self._stopping:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
-                raise LightError(
-                    f"no frame could be proven to be of the {stream} stream in time ({self.discarded} frames were "
-                    "discarded so far): check that the LEDs light up, that the camera's exposure is locked, and its "
-                    "rate."
-                )
+                raise self._light_error(stream)
             try:
                 frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
             except CameraLostError:
+                if time.monotonic() >= deadline:
+                    raise
                 continue
-            if self._departed < 2:
+            spoilt = self._repeats(frame) or (frame.black and self._black.get(stream) is False)
+            if self._departed < 2 and not spoilt:
                 self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame)
             self._previous = frame
-            if self._departed >= 2 and frame.time_s >= max(lit.acknowledged_s + settled_s, after_s):
+            late_s = frame.time_s - max(lit.acknowledged_s + settled_s, after_s)
+            if self._departed >= 2 and late_s >= 0 and not spoilt:
                 return lit, frame
             self.discarded += 1
-            if self._departed == 0 and frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
-                # The scene may have changed at the switch. It is repeated, and compared with a newer frame.
-                self._watched("tactile" if stream == "visual" else "visual", settled_s)
-                lit = self._set(stream)
+            if self._departed == 0 and late_s >= 0 and time.monotonic() >= checked_s + _CHECK_S:
+                if not self.leds.ping().unchanged_since(lit):  # the controller has turned its lights off
+                    lit = self._set(stream)
+                elif frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
+                    # The scene may have changed at the switch. It is repeated, and compared with a newer frame.
+                    self._watched("tactile" if stream == "visual" else "visual", settled_s)
+                    lit = self._set(stream)
+                checked_s = time.monotonic()
         raise LightError("the thread that takes pairs was stopped.")
+
+    def _light_error(self, stream: Stream) -> LightError:
+        cause = "check that the LEDs light up, that the camera's exposure is locked, and its rate"
+        if self._previous is not None and self._previous.black:
+            cause = "its frames are black now, so check the camera, or connect again if the scene has become dark"
+        return LightError(
+            f"no frame of {self._camera.config.name} could be proven to be of the {stream} stream in time "
+            f"({self.discarded} frames were discarded so far): {cause}."
+        )
 
     def _shows(self, frame: Captured) -> bool:
         """Whether the image has changed since the switch by at least half as much as it does with the light."""
         if self._reference is None or self._contrast is None:
             return True
         return difference(thumbnail(frame.image), self._reference) > _DEPARTED * self._contrast
+
+    def _repeats(self, frame: Captured) -> bool:
+        """Whether a frame is the one before once more, in a scene that is not free of noise."""
+        return frame.repeats > 0 and self._camera.config.frozen_after_s is not None
 
     def _in_order(self, frame: Captured) -> bool:
         """Whether a frame is the next one after the last."""
@@ -537,14 +573,20 @@ class STS:
 
     def _proof(self, before: Lit, then: Stream | None) -> float | None:
         """The time until which the lights are proven to be unchanged, or None if they changed. May switch them."""
-        if then is None or then == self._stream:
+        if then == self._stream:
+            then = None
+        # The watchdog turns the lights off as a switch to the visual stream does, and the counter of changes would not
+        # tell one from the other.
+        if then is None or self._stream == "tactile":
             after = self.leds.ping()
-            if after.unchanged_since(before):
-                return after.sent_s
-            self._lit = None
-            return None
+            if not after.unchanged_since(before):
+                self._lit = None
+                return None
+            if then is not None:
+                self._set(then)
+            return after.sent_s
         after = self._set(then)
-        # The levels differ, so a single change is that of this request.
+        # Nothing but a request turns the lights on, so a single change is that of this request.
         return after.sent_s if (after.boot, after.counter) == (before.boot, before.counter + 1) else None
 
     def _watched(self, stream: Stream, watch_s: float) -> Switch:

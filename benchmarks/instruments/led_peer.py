@@ -1,44 +1,58 @@
-"""A LED controller on a pseudo-terminal that injects faults, and the real firmware in the simulator of its chip."""
+"""A LED controller on a pseudo-terminal that injects faults."""
 
 import contextlib
 import os
-import queue
 import select
-import subprocess
 import threading
 import time
 import tty
+from collections.abc import Callable
 from pathlib import Path
 
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 
-WAIT_S = 60.0  # longest wait for an event that must come
-
-
-def until(condition):
-    """Wait for a condition, and fail if it does not come true."""
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline, "the condition did not come true"
-        time.sleep(0.005)
+TICK_S = 0.01  # longest wait between two looks at the watchdog
 
 
 class Peer:
     """An emulated controller behind `path`, a link to a pseudo-terminal.
 
     `faults` has one word for each of the next requests, and requests are answered without faults after the last one.
-    The emulated controller's clock runs at a hundredth of the speed, so that its watchdog does not interfere.
+    By default the emulated controller's clock runs at a hundredth of the speed, so that its watchdog does not
+    interfere.
     """
 
-    def __init__(self, path: Path, *, serial_number: str = "EMULATED", talk: bytes | None = None):
+    def __init__(
+        self,
+        path: Path,
+        *,
+        serial_number: str = "EMULATED",
+        talk: bytes | None = None,
+        clock: Callable[[], float] = lambda: time.monotonic() / 100,
+        make: Callable[..., EmulatedController] = EmulatedController,
+    ):
+        """Begin to listen.
+
+        Args:
+            path: The link that is made.
+            serial_number: Of the controller.
+            talk: Bytes that another device sends, asked or not, instead of any answer.
+            clock: The controller's clock (s).
+            make: Makes the controller, after each boot.
+        """
         self.path = path
-        self.controller = EmulatedController(serial_number=serial_number, now_s=self._now_s())
+        self.clock = clock
+        self._make = make
+        self._serial_number = serial_number
+        self.controller = make(serial_number=serial_number, now_s=clock())
         self.faults: list[str] = []
         self.requests: list[bytes] = []
-        self.talk = talk  # what another device sends, asked or not, instead of any answer
+        self.talk = talk
         self._held = b""
         self._pending = b""
+        self._deaf_until_s = 0.0  # on `time.monotonic`, while a controller boots
+        self._lock = threading.Lock()  # guards the controller against faults of other threads
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -48,7 +62,7 @@ class Peer:
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    def vanish(self):
+    def vanish(self) -> None:
         """Unplug the controller."""
         self._stop.set()
         self._thread.join()
@@ -57,31 +71,49 @@ class Peer:
                 os.close(descriptor)
         self.path.unlink(missing_ok=True)
 
-    def send(self, data: bytes):
-        with contextlib.suppress(BlockingIOError):  # the host reads nothing
+    def send(self, data: bytes) -> None:
+        """Send bytes, unless the host reads none or the controller has vanished."""
+        with contextlib.suppress(OSError):
             os.write(self._master, data)
 
-    def _now_s(self):
-        return time.monotonic() / 100
+    def restart(self, boot_s: float = 0.0) -> None:
+        """Restart the controller, which turns the lights off and answers nothing for a time (s)."""
+        with self._lock:
+            boot = self.controller.boot + 1
+            self.controller = self._make(serial_number=self._serial_number, now_s=self.clock(), boot=boot)
+            self._pending = self._held = b""
+            self._deaf_until_s = time.monotonic() + boot_s
 
-    def _serve(self):
+    def fire_watchdog(self) -> None:
+        """Turn the lights off as the watchdog does, although requests have come."""
+        with self._lock:
+            self.controller._valid_s = -float("inf")
+            sent = self.controller.tick(self.clock())
+            self.controller._valid_s = self.clock()
+        self.send(sent)
+
+    def _serve(self) -> None:
         while not self._stop.is_set():
-            if not select.select([self._master], [], [], 0.01)[0]:
-                self.send(self.talk or b"")
+            if not select.select([self._master], [], [], TICK_S)[0]:
+                with self._lock:
+                    sent = self.controller.tick(self.clock())
+                self.send(self.talk or sent)
                 continue
             *lines, self._pending = (self._pending + os.read(self._master, 4096)).split(b"\n")
             for line in lines:
                 self.requests.append(line + b"\n")
-                answer = self._answer(line + b"\n") if self.talk is None else self.talk
-                self.send(answer)
+                self.send(self._answer(line + b"\n") if self.talk is None else self.talk)
 
     def _answer(self, line: bytes) -> bytes:
+        if time.monotonic() < self._deaf_until_s:
+            return b""
         fault = self.faults.pop(0) if self.faults else "none"
         if fault == "deaf":  # the request is lost
             return b""
         if fault == "damaged":  # the request is damaged
             line = line.replace(b" ", b"!", 1)
-        reply = self.controller.receive(line, self._now_s())
+        with self._lock:
+            reply = self.controller.receive(line, self.clock())
         held, self._held = self._held, b""
         match fault:
             case "lost":
@@ -107,37 +139,6 @@ class Peer:
                 self._stop.set()
                 os.close(self._slave)
                 os.close(self._master)
-                self.send = lambda data: None
+                self._master = self._slave = -1  # the numbers may belong to other files soon
                 return b""
         return held + reply
-
-
-class Simulated:
-    """The firmware in the simulator. `levels` are the duty cycles that the registers of its timers give."""
-
-    def __init__(self, program: Path, firmware: Path):
-        self._process = subprocess.Popen([program, firmware], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.path = self._process.stdout.readline().strip()
-        self.levels = None
-        self.seen: queue.Queue = queue.Queue()
-        threading.Thread(target=self._follow, daemon=True).start()
-
-    def command(self, letter: str):
-        self._process.stdin.write(letter)
-        self._process.stdin.flush()
-
-    def stop(self):
-        self._process.stdin.close()
-        self._process.wait(WAIT_S)
-        self._process.stdout.close()
-
-    def wait_for(self, levels: protocol.Levels):
-        """Wait until the registers have these levels."""
-        while self.levels != levels:
-            self.levels = self.seen.get(timeout=WAIT_S)
-
-    def _follow(self):
-        with contextlib.suppress(ValueError):  # the output was closed
-            for line in self._process.stdout:
-                if line.startswith("levels "):
-                    self.seen.put(tuple(int(word) for word in line.split()[1:]))

@@ -7,25 +7,29 @@ import time
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 
 SIZE = (160, 120)  # pixels, width and height
 _BITS, _COLUMNS = 16, 4
 
+Image = UInt8[np.ndarray, "height width 3"]
 
-def draw(number, size=SIZE):
+
+def draw(number: int, size: tuple[int, int] = SIZE) -> Image:
     """A BGR image that shows a number as 4 x 4 blocks, dark for 0 and light for 1."""
     bits = np.array([255 if number >> bit & 1 else 60 for bit in range(_BITS)], np.uint8).reshape(-1, _COLUMNS)
-    return cv2.resize(np.repeat(bits[..., None], 3, 2), size, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.resize(np.repeat(bits[..., None], 3, 2), size, interpolation=cv2.INTER_NEAREST))
 
 
-def number_of(image):
+def number_of(image: Image) -> int:
     """The number that `draw` has drawn."""
     height, width = image.shape[0] // 4, image.shape[1] // 4
     centres = image[height // 2 :: height, width // 2 :: width].mean(-1)[:4, :4].ravel()
     return sum(1 << bit for bit, value in enumerate(centres) if value > 157)
 
 
-def jpeg(image):
+def jpeg(image: Image) -> bytes:
+    """The file of a BGR image."""
     return cv2.imencode(".jpg", image)[1].tobytes()
 
 
@@ -33,30 +37,35 @@ class MotionJpeg:
     """The server. `mode` is read before each frame.
 
     live: numbered frames. skip: numbered frames, without those in `skipped`. repeat: the last frame again. black,
-    small: black or smaller frames. damaged: incomplete frames. stall: none. close: the connection is closed.
-    hang, missing, text: requests get no answer, status 404, or a text.
+    small: black or smaller frames. damaged: incomplete frames. stall: none. held: frames are taken, but sent all at
+    once as soon as the mode changes. close: the connection is closed. hang, missing, text: requests get no answer,
+    status 404, or a text.
     """
 
-    def __init__(self, fps=50, colour=None):
-        self.fps, self.colour = fps, colour
-        self.mode, self.skipped, self.served = "live", set(), {}
+    def __init__(self, fps: float = 50, colour: tuple[int, int, int] | None = None, size: tuple[int, int] = SIZE):
+        self.fps, self.colour, self.size = fps, colour, size
+        self.mode = "live"
+        self.skipped: set[int] = set()
+        self.served: dict[int, float] = {}
         self.number = 0
         self.port = 0
+        self._last = b""
         self.start()
 
     @property
-    def url(self):
+    def url(self) -> str:
+        """The address of the stream."""
         return f"http://127.0.0.1:{self.port}/video"
 
-    def start(self):
+    def start(self) -> None:
         """Listen, at the port of the last time if there is one."""
         server = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
-            def log_message(self, *args):
+            def log_message(self, *args: object) -> None:
                 pass
 
-            def do_GET(self):
+            def do_GET(self) -> None:
                 with contextlib.suppress(OSError):
                     server.answer(self)
 
@@ -66,14 +75,15 @@ class MotionJpeg:
         self.thread = threading.Thread(target=self.http.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         self.thread.start()
 
-    def stop(self):
+    def stop(self) -> None:
         """Close all connections and refuse new ones."""
         self.running = False
         self.http.shutdown()
         self.http.server_close()
         self.thread.join()
 
-    def answer(self, request):
+    def answer(self, request: http.server.BaseHTTPRequestHandler) -> None:
+        """Answer a request for the stream."""
         if self.mode == "hang":
             self._pause("hang")
             return
@@ -88,6 +98,7 @@ class MotionJpeg:
             request.wfile.write(b"<html>no video</html>")
             return
         due = time.monotonic()
+        held = b""
         while self.running and self.mode != "close":
             if self.mode == "stall":
                 self._pause("stall")
@@ -98,26 +109,31 @@ class MotionJpeg:
                 self.number += 1
             if self.mode == "skip" and self.number in self.skipped:
                 continue
-            data = self._frame()
+            if self.mode != "repeat" or not self._last:
+                self._last = self._frame()
             self.served.setdefault(self.number, time.monotonic())
-            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n".encode()
-            request.wfile.write(head + data + b"\r\n")
+            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(self._last)}\r\n\r\n".encode()
+            held += head + self._last + b"\r\n"
+            if self.mode != "held":
+                request.wfile.write(held)
+                held = b""
 
-    def _pause(self, mode):
+    def _pause(self, mode: str) -> None:
         while self.running and self.mode == mode:
             time.sleep(0.01)
 
-    def _frame(self):
+    def _frame(self) -> bytes:
+        width, height = self.size
         if self.colour is not None:  # with a corner that changes
-            image = np.full((SIZE[1], SIZE[0], 3), self.colour, np.uint8)
+            image = np.full((height, width, 3), self.colour, np.uint8)
             image[:16, :16] = 60 + self.number % 2 * 100
             return jpeg(image)
         match self.mode:
             case "black":
-                return jpeg(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+                return jpeg(np.zeros((height, width, 3), np.uint8))
             case "small":
-                return jpeg(draw(self.number, (SIZE[0] // 2, SIZE[1] // 2)))
+                return jpeg(draw(self.number, (width // 2, height // 2)))
             case "damaged":
-                data = jpeg(draw(self.number))
+                data = jpeg(draw(self.number, self.size))
                 return data[: len(data) // 2]
-        return jpeg(draw(self.number))
+        return jpeg(draw(self.number, self.size))

@@ -1,0 +1,452 @@
+"""Faults of a sensor's devices while a program reads pairs of images, and the behaviour of `hardware.STS`.
+
+    python -m benchmarks.faults                                                 # 312 faults, about a quarter of an hour
+    python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
+    python -m benchmarks.faults --number 20 --only black                        # one kind of fault
+
+A controller on a pseudo-terminal and a camera on loopback stand for the devices (`instruments/sensor_peer.py`). The
+camera sees the lights of the controller, with a lag and an exposure time that are drawn at random. Before each fault
+the program reads a pair, then the fault begins at a random moment of a read, reads continue while it lasts, and a last
+read follows. The camera's log of each frame decides which light an image shows, never the host's label. An image is
+also counted as wrong if the camera has not taken it, and as old if its exposure began before the read by more than the
+settling time.
+
+In the last kind, the program that reads is a process of its own, and is killed while the light is on.
+"""
+
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import unittest.mock
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import tyro
+from serial.tools import list_ports_common
+
+from benchmarks.instruments.sensor_peer import SensorPeer
+from sts_jax import hardware
+
+FPS = 60.0
+TIMEOUT_S = 2.0  # of one image
+ANSWER_S = 0.6  # of a request to the controller
+HANDSHAKE_S = 1.0
+RECONNECT_S = 4.0
+CAMERA_S = 1.0  # of one frame
+FROZEN_S = 0.4
+WATCHDOG_MS = 500
+REQUEST_S = 2 * (ANSWER_S + 0.3)  # longest time of a request, after a restart of the controller (`hardware.Leds`)
+GRACE_S = 0.5  # for threads that a busy machine does not run in time, and 0.2 s of `STS`
+READ_S = 2 * TIMEOUT_S + REQUEST_S + GRACE_S  # longest time of a read without a reconnection
+RECONNECTED_S = READ_S + RECONNECT_S + 2 * (HANDSHAKE_S + 2 * ANSWER_S)  # with one, which tries at most two ports
+DARK_S = 0.1  # by which lights may go off later than the watchdog's period, for the same reason
+PART = 40  # faults of one sensor
+RETURN_S = 12.0  # longest time of the camera's backoff after a fault of at most 7 s, and of one read
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line.
+
+    Raises:
+        ValueError: `number` or `long` is out of range, or a kind is unknown.
+    """
+
+    number: int = 312  # faults
+    seed: int = 0  # of their order, times and lengths
+    long: float = 0.15  # share of the faults that can last for any time and that last longer than a read may, 0 to 1
+    jobs: int = 1  # sensors that are read at the same time, in processes of their own
+    only: tuple[str, ...] = ()  # kinds of faults (default: all)
+    out: Path | None = None  # file of the table
+
+    def __post_init__(self) -> None:
+        if self.number < 1:
+            raise ValueError(f"--number must be at least 1, got {self.number}")
+        if not 0 <= self.long <= 1:
+            raise ValueError(f"--long must be in [0, 1], got {self.long}")
+        if unknown := set(self.only) - set(KINDS) - {KILLED}:
+            raise ValueError(f"--only has unknown kinds {sorted(unknown)}, known are: {', '.join([*KINDS, KILLED])}")
+
+
+@dataclasses.dataclass
+class Count:
+    """The findings of one kind of fault."""
+
+    injected: int = 0
+    images: int = 0
+    wrong: int = 0  # of a wrong or mixed light, or not taken by the camera
+    old: int = 0
+    errors: dict[str, int] = dataclasses.field(default_factory=dict)  # reads that raised an error, by its name
+    unnamed: int = 0  # reads that raised another error than those of the sensor
+    longest_s: float = 0.0
+    limit_s: float = READ_S
+    recovered: int = 0
+    recovery_s: float = 0.0  # longest time from the end of a fault to the next pair
+    lit_s: float = 0.0  # longest time for which a light was on after the program was killed
+
+    def add(self, other: "Count") -> None:
+        """Add the findings of other faults."""
+        for name in ("injected", "images", "wrong", "old", "unnamed", "recovered"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name, number in other.errors.items():
+            self.errors[name] = self.errors.get(name, 0) + number
+        for name in ("longest_s", "recovery_s", "lit_s"):
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
+        self.limit_s = other.limit_s
+
+
+class Bench:
+    """The devices, and a sensor that reads them."""
+
+    def __init__(self, folder: Path, draw: random.Random, long: float):
+        self.folder, self.draw, self.long = folder, draw, long
+        self.peer = SensorPeer(
+            folder / "leds", fps=FPS, lag_s=draw.uniform(0.015, 0.12), exposure_s=draw.uniform(0.004, 0.016)
+        )
+        self.ports = [_usb_port(self.peer.path)]
+
+    @contextlib.contextmanager
+    def connected(self) -> Iterator[hardware.STS]:
+        """The sensor with its settling times measured."""
+        with unittest.mock.patch("serial.tools.list_ports.comports", side_effect=lambda: self.ports):
+            leds = hardware.Leds.connect(
+                self.peer.path, timeout_s=HANDSHAKE_S, answer_s=ANSWER_S, watchdog_ms=WATCHDOG_MS
+            )
+            made = hardware.STS(camera=self.camera(), leds=leds, timeout_s=TIMEOUT_S, reconnect_s=RECONNECT_S)
+            with made.connect(warmup_s=0.1) as sensor:
+                yield sensor
+
+    def camera(self) -> hardware.CameraConfig:
+        """The camera's configuration."""
+        return hardware.CameraConfig(
+            self.peer.url,
+            *self.peer.camera.size,
+            lock=False,
+            timeout_s=CAMERA_S,
+            frozen_after_s=FROZEN_S,
+            buffer=8,
+        )
+
+    def plug_in(self, name: str) -> None:
+        """Plug the controller in at a port of a name."""
+        self.peer.plug_in(self.folder / name)
+        self.ports[:] = [_usb_port(str(self.folder / name))]
+
+
+def _usb_port(path: str) -> list_ports_common.ListPortInfo:
+    port = list_ports_common.ListPortInfo(path)
+    port.vid, port.pid, port.serial_number, port.description = 0x2341, 0x43, "55", "Arduino Uno"
+    return port
+
+
+def _length_s(bench: Bench, least_s: float, longest_s: float) -> float:
+    """The length of a fault. A share of the faults last longer than a read may."""
+    return bench.draw.uniform(5, 7) if bench.draw.random() < bench.long else bench.draw.uniform(least_s, longest_s)
+
+
+# Each kind of fault lasts for as long as its function runs, in a thread beside the reads.
+
+
+def _answers(word: str) -> Callable[[Bench], None]:
+    """Some answers of the controller have a fault."""
+
+    def fault(bench: Bench) -> None:
+        bench.peer.leds.faults = [word] * bench.draw.randint(1, 4)
+        deadline = time.monotonic() + 2
+        while bench.peer.leds.faults and time.monotonic() < deadline:
+            time.sleep(0.01)
+        bench.peer.leds.faults = []
+
+    return fault
+
+
+def _silent(bench: Bench) -> None:
+    """The controller answers nothing for longer than a request may take."""
+    bench.peer.leds.faults = ["lost"] * 1000
+    time.sleep(_length_s(bench, 0.5 * ANSWER_S, 2 * ANSWER_S))
+    bench.peer.leds.faults = []
+
+
+def _watchdog(bench: Bench) -> None:
+    for _ in range(bench.draw.randint(1, 3)):
+        bench.peer.leds.fire_watchdog()
+        time.sleep(bench.draw.uniform(0.02, 0.4))
+
+
+def _reset(bench: Bench) -> None:
+    boot_s = bench.draw.uniform(0, 0.9)
+    bench.peer.leds.restart(boot_s)
+    time.sleep(boot_s)
+
+
+def _unplugged(bench: Bench) -> None:
+    _unplugged_for(bench, _length_s(bench, 0.1, 1.5))
+
+
+def _unplugged_for(bench: Bench, seconds: float) -> None:
+    bench.peer.unplug()
+    time.sleep(seconds)
+    bench.plug_in(Path(bench.ports[0].device).name)
+
+
+def _renamed(bench: Bench) -> None:
+    bench.peer.unplug()
+    time.sleep(_length_s(bench, 0.1, 1.5))
+    bench.plug_in(f"leds-{bench.draw.randrange(10**6)}")
+
+
+def _camera(mode: str, least_s: float = 0.1, longest_s: float = 1.5) -> Callable[[Bench], None]:
+    """The camera is in another mode for a while."""
+
+    def fault(bench: Bench) -> None:
+        bench.peer.camera.mode = mode
+        time.sleep(_length_s(bench, least_s, longest_s))
+        bench.peer.camera.mode = "live"
+
+    return fault
+
+
+def _gone(bench: Bench) -> None:
+    bench.peer.camera.stop()
+    time.sleep(_length_s(bench, 0.1, 1.5))
+    bench.peer.camera.start()
+
+
+def _held_reset(bench: Bench) -> None:
+    """The network holds frames back, and the controller restarts meanwhile."""
+    bench.peer.camera.mode = "held"
+    time.sleep(bench.draw.uniform(0.02, 0.3))
+    bench.peer.leds.restart()
+    time.sleep(bench.draw.uniform(0.02, 0.6))
+    bench.peer.camera.mode = "live"
+
+
+def _held_unplugged(bench: Bench) -> None:
+    """The network holds frames back, and the controller is unplugged and plugged in again meanwhile."""
+    bench.peer.camera.mode = "held"
+    time.sleep(bench.draw.uniform(0.0, 0.1))
+    _unplugged_for(bench, bench.draw.uniform(0.02, 0.1))
+    time.sleep(bench.draw.uniform(0.2, 0.6))
+    bench.peer.camera.mode = "live"
+
+
+KINDS: dict[str, Callable[[Bench], None]] = {
+    **{f"answer {word}": _answers(word) for word in ("late", "lost", "doubled", "garbled", "cut", "joined")},
+    "noise on the line": _answers("noise"),
+    "stale answer": _answers("stale"),
+    "request lost": _answers("deaf"),
+    "request damaged": _answers("damaged"),
+    "controller silent": _silent,
+    "watchdog fires": _watchdog,
+    "controller restarts": _reset,
+    "port vanishes": _unplugged,
+    "port returns renamed": _renamed,
+    "camera stalls": _camera("stall", 0.05, 2.0),
+    "frames held back": _camera("held", 0.05, 0.8),
+    "held back, restart": _held_reset,
+    "held back, unplugged": _held_unplugged,
+    "frames repeated": _camera("repeat", 0.05, 1.5),
+    "other size": _camera("small"),
+    "black": _camera("black"),
+    "damaged frames": _camera("damaged"),
+    "stream closed": _camera("close"),
+    "camera's host gone": _gone,
+}
+KILLED = "program killed"
+RECONNECTING = (
+    "controller silent",
+    "controller restarts",
+    "port vanishes",
+    "port returns renamed",
+    "held back, restart",
+    "held back, unplugged",
+)
+
+
+def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
+    """Inject one fault, read pairs until it is over, and read one more."""
+    count.injected += 1
+    count.limit_s = RECONNECTED_S if kind in RECONNECTING or kind.startswith(("answer", "request")) else READ_S
+    _read(bench, sensor, count)
+    begin_s = bench.draw.uniform(0, 0.3)
+
+    def run() -> None:
+        time.sleep(begin_s)
+        KINDS[kind](bench)
+
+    fault = threading.Thread(target=run)
+    fault.start()
+    while fault.is_alive():
+        _read(bench, sensor, count)
+    ended_s = time.monotonic()
+    while time.monotonic() < ended_s + RETURN_S:
+        if _read(bench, sensor, count):
+            count.recovered += 1
+            count.recovery_s = max(count.recovery_s, time.monotonic() - ended_s)
+            return
+
+
+def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
+    """Read a pair and judge it. False if there was an error."""
+    begun_s = time.monotonic()
+    try:
+        pair = sensor.read()
+    except (hardware.CameraError, hardware.LedError, hardware.LightError) as error:
+        name = type(error).__name__
+        count.errors[name] = count.errors.get(name, 0) + 1
+        time.sleep(0.1)
+        return False
+    except Exception as error:
+        count.unnamed += 1
+        print(f"not an error of the sensor: {error!r}", file=sys.stderr)
+        return False
+    finally:
+        count.longest_s = max(count.longest_s, time.monotonic() - begun_s)
+    for shot, lit in ((pair.visual, False), (pair.tactile, True)):
+        count.images += 1
+        count.wrong += not bench.peer.judged(shot.image, lit=lit)
+        taken = bench.peer.camera.exposure_of(shot.image)
+        settled_s = sensor.settling.tactile_s if lit else sensor.settling.visual_s
+        count.old += taken is not None and taken.start_s < begun_s - settled_s
+    return True
+
+
+def host(path: str, url: str, width: int, height: int) -> None:
+    """The program that is killed: read pairs without end."""
+    camera = hardware.CameraConfig(url, width, height, lock=False, buffer=8)
+    settled = hardware.Settling(visual_s=0.15, tactile_s=0.15)
+    leds = hardware.Leds.connect(path, watchdog_ms=WATCHDOG_MS)
+    with hardware.STS(camera=camera, leds=leds, settling=settled) as sensor:
+        while True:
+            sensor.read()
+
+
+def kill(bench: Bench, count: Count) -> None:
+    """Start a program that reads pairs, and kill it at a random moment while a light is on."""
+    count.injected += 1
+    count.limit_s = WATCHDOG_MS / 1000 + DARK_S
+    size = bench.peer.camera.size
+    port = bench.ports[0].device
+    program = f"from benchmarks import faults; faults.host({port!r}, {bench.peer.url!r}, {size[0]}, {size[1]})"
+    lights = bench.peer.lights
+    process = subprocess.Popen([sys.executable, "-c", program])
+    try:
+        _until(lambda: lights.off_after(0.0) is None or process.poll() is not None, 60)
+        wait_s = time.monotonic() + bench.draw.uniform(0, 3)
+        _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
+        if process.poll() is not None or lights.off_after(0.0) is not None:
+            raise RuntimeError(f"the program that is to be killed ended with {process.poll()} or set no light")
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        killed_s = time.monotonic()
+    finally:
+        process.kill()
+        process.wait()
+    _until(lambda: lights.off_after(killed_s) is not None, 10)
+    time.sleep(0.3)
+    off_s = lights.off_after(killed_s)
+    lit_s = float("inf") if off_s is None else off_s - killed_s
+    count.lit_s = max(count.lit_s, lit_s)
+    count.recovered += lit_s <= count.limit_s
+
+
+def _until(condition: Callable[[], bool], limit_s: float) -> None:
+    deadline = time.monotonic() + limit_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.002)
+
+
+def measure(args: Args) -> dict[str, Count]:
+    """Inject the faults in random order, all kinds equally often."""
+    kinds = list(args.only) or [*KINDS, KILLED]
+    order = [kinds[i % len(kinds)] for i in range(args.number)]
+    random.Random(args.seed).shuffle(order)
+    parts = [order[i : i + PART] for i in range(0, args.number, PART)]
+    tasks = [(part, args.seed + number, args.long) for number, part in enumerate(parts)]
+    if args.jobs == 1:
+        found = [measure_part(*task) for task in tasks]
+    else:
+        with multiprocessing.get_context("spawn").Pool(args.jobs) as pool:
+            found = pool.starmap(measure_part, tasks, chunksize=1)
+    counts = {kind: Count() for kind in kinds}
+    for part in found:
+        for kind, count in part.items():
+            counts[kind].add(count)
+    return counts
+
+
+def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
+    """Inject some faults into one sensor, whose lag and exposure time are drawn at random."""
+    counts = {kind: Count() for kind in order}
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder), random.Random(seed), long)
+        try:
+            with bench.connected() as sensor:
+                for kind in order:
+                    if kind != KILLED:
+                        inject(bench, sensor, kind, counts[kind])
+            for _ in range(order.count(KILLED)):
+                kill(bench, counts[KILLED])
+        finally:
+            bench.peer.stop()
+    return counts
+
+
+def report(counts: dict[str, Count]) -> str:
+    """The table."""
+    lines = [
+        "fault                 injected  images  wrong  old  longest read (s)  limit (s)  recovered  after (s)  "
+        "reads with errors"
+    ]
+    for kind, count in counts.items():
+        if kind == KILLED:
+            continue
+        errors = ", ".join(f"{name} {number}" for name, number in sorted(count.errors.items()))
+        if count.unnamed:
+            errors += f" OTHER ERRORS {count.unnamed}"
+        lines.append(
+            f"{kind:20s}  {count.injected:8d}  {count.images:6d}  {count.wrong:5d}  {count.old:3d}  "
+            f"{count.longest_s:16.2f}  {count.limit_s:9.2f}  {count.recovered:9d}  "
+            f"{count.recovery_s:9.2f}  {errors or '-'}"
+        )
+    read = [count for kind, count in counts.items() if kind != KILLED]
+    lines.append(
+        f"{'all':20s}  {sum(c.injected for c in read):8d}  {sum(c.images for c in read):6d}  "
+        f"{sum(c.wrong for c in read):5d}  {sum(c.old for c in read):3d}  {'':16s}  {'':9s}  "
+        f"{sum(c.recovered for c in read):9d}  {'':9s}  {sum(sum(c.errors.values()) for c in read)}"
+    )
+    if KILLED in counts:
+        count = counts[KILLED]
+        lines.append(
+            f"{KILLED} while a light was on: {count.injected} times. The lights went off after at most "
+            f"{count.lit_s:.3f} s, with a watchdog of {WATCHDOG_MS / 1000:g} s."
+        )
+    return "\n".join(lines)
+
+
+def main(args: Args) -> str:
+    """Inject the faults and return the table."""
+    begun_s = time.monotonic()
+    counts = measure(args)
+    text = report(counts)
+    load = os.getloadavg()[2] if hasattr(os, "getloadavg") else float("nan")
+    text += (
+        f"\nseed {args.seed}, {time.monotonic() - begun_s:.0f} s, {args.jobs} sensor(s) at a time, {os.cpu_count()} "
+        f"CPU cores with a load of {load:.1f} processes on average over the last 15 minutes\n"
+    )
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_text(text)
+    return text
+
+
+if __name__ == "__main__":
+    print(main(tyro.cli(Args, description=__doc__)))
