@@ -144,7 +144,8 @@ class STS:
         self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
         self._stream: Stream = "visual"
         self._contrast: float | None = None  # of images without and with the light, of 255
-        self._black: dict[Stream, bool] = {}  # whether the last image of a stream was black
+        self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
+        self._black: dict[Stream, bool] = {}  # whether this image was black
         self._previous: Captured | None = None  # the last frame of the camera
         self._reference: Thumbnail | None = None  # of the last frame before the switch
         self._departed = 0  # successive frames since the switch that show the new light, 2 and more: all are of it
@@ -275,7 +276,7 @@ class STS:
         """Turn the lights off and close both devices. Without a connection, it does nothing."""
         self._stop_background()
         leds, self._leds, self._lit = self._leds, None, None
-        self._contrast = None
+        self._contrast, self._looks = None, {}
         if leds is not None:
             leds.close()
         self._camera.disconnect()
@@ -417,15 +418,20 @@ class STS:
             time.sleep(phase_s)
             off.append(self._watched("visual", shorter_s))
         found = self._settled(on, off, period_s, shorter_s)
-        self._contrast = difference(off[-1].thumbnails[-1], on[-1].thumbnails[-1])
+        self._compare_with(off[-1].thumbnails[-1], on[-1].thumbnails[-1])
         return found
+
+    def _compare_with(self, dark: Thumbnail, lit: Thumbnail) -> None:
+        """Keep images without and with the light, with which later ones are compared."""
+        self._contrast = difference(dark, lit)
+        check_contrast(self._contrast)
+        self._looks = {"visual": dark, "tactile": lit}
 
     def _see_both(self, settling: Settling) -> None:
         """Take an image of each light, with which the first frames are compared."""
         lit = self._watched("tactile", 2 * settling.tactile_s).thumbnails[-1]
         dark = self._watched("visual", 2 * settling.visual_s).thumbnails[-1]
-        self._contrast = difference(dark, lit)
-        check_contrast(self._contrast)
+        self._compare_with(dark, lit)
 
     def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
         found = settling(on, off, period_s)
@@ -486,7 +492,7 @@ class STS:
                 lost = True
                 continue
             if until_s is not None:
-                self._black[stream] = frame.black
+                self._black[stream], self._looks[stream] = frame.black, thumbnail(frame.image)
                 return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
             self.discarded += 1
             lost = True
@@ -507,7 +513,7 @@ class STS:
                 continue
             spoilt = self._repeats(frame) or (frame.black and self._black.get(stream) is False)
             if self._departed < 2 and not spoilt:
-                self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame)
+                self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
             self._previous = frame
             late_s = frame.time_s - max(lit.acknowledged_s + settled_s, after_s)
             if self._departed >= 2 and late_s >= 0 and not spoilt:
@@ -532,11 +538,18 @@ class STS:
             f"({self.discarded} frames were discarded so far): {cause}."
         )
 
-    def _shows(self, frame: Captured) -> bool:
-        """Whether the image has changed since the switch by at least half as much as it does with the light."""
-        if self._reference is None or self._contrast is None:
+    def _shows(self, frame: Captured, stream: Stream) -> bool:
+        """Whether the image has changed since the switch by at least half as much as it does with the light.
+
+        If the light before is unknown, whether the image is nearer to the last one of its stream than to the other.
+        """
+        look = thumbnail(frame.image)
+        if self._reference is not None and self._contrast is not None:
+            return difference(look, self._reference) > _DEPARTED * self._contrast
+        if len(self._looks) < 2:
             return True
-        return difference(thumbnail(frame.image), self._reference) > _DEPARTED * self._contrast
+        other: Stream = "tactile" if stream == "visual" else "visual"
+        return difference(look, self._looks[stream]) < difference(look, self._looks[other])
 
     def _repeats(self, frame: Captured) -> bool:
         """Whether a frame is the one before once more, in a scene that is not free of noise."""
@@ -595,7 +608,7 @@ class STS:
         delays: list[float] = []
         looks: list[Thumbnail] = []
         while not delays or delays[-1] < watch_s:
-            frame = self._previous = self._camera.async_read()
+            frame = self._previous = self._camera.async_read(1000 * self._timeout_s)
             delays.append(frame.time_s - lit.acknowledged_s)
             looks.append(thumbnail(frame.image))
         return Switch(np.array(delays, np.float32), np.array(looks, np.float32))
