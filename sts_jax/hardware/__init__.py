@@ -27,8 +27,10 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
+from sts_jax.hardware.collecting import Action, AutomaticPerson, Person, View, collect
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
+from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage, known_pad
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
 from sts_jax.hardware.ports import (
@@ -43,12 +45,26 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.recordings import (
+    Entry,
+    Images,
+    RecordedTrajectory,
+    Recordings,
+    confirm_recording,
+    discard_recording,
+    list_recordings,
+    load_recordings,
+    restore_recording,
+)
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
+from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
 from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
 
 __all__ = [
     "STS",
+    "Action",
+    "AutomaticPerson",
     "Background",
     "Board",
     "Calibration",
@@ -67,12 +83,16 @@ __all__ = [
     "Captured",
     "Device",
     "DisconnectedError",
+    "EmptyPad",
     "EndOfVideoError",
+    "Entry",
     "FoundCamera",
     "FoundCorners",
     "FoundSensors",
     "FrameSizeError",
     "FrozenCameraError",
+    "GuideConfig",
+    "Images",
     "LedError",
     "LedTimeoutError",
     "Leds",
@@ -82,20 +102,31 @@ __all__ = [
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
+    "Origin",
     "Pair",
+    "Person",
     "Pinhole",
     "Port",
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "RecordedTrajectory",
+    "Recordings",
     "SensorFileError",
+    "Session",
+    "SessionError",
     "Settling",
     "Shot",
+    "Stage",
     "StaleFrameError",
+    "View",
     "WrongDeviceError",
     "WrongVersionError",
     "board_image",
     "calibrate",
+    "collect",
+    "confirm_recording",
+    "discard_recording",
     "distorted",
     "distortion",
     "find_board",
@@ -104,8 +135,12 @@ __all__ = [
     "find_sensors",
     "fit_lens",
     "is_black",
+    "known_pad",
+    "list_recordings",
+    "load_recordings",
     "project",
     "rectification",
     "rectified",
+    "restore_recording",
     "save_board",
 ]
