@@ -12,6 +12,8 @@ import numpy as np
 from camera_server import SIZE, MotionJpeg, draw, jpeg
 from led_peer import Peer
 
+from sts_jax.hardware import Stage
+
 DARK, LIT = 70, 210  # grey values without and with the lights
 CORNER = 32  # pixels, side of the corner with the number
 
@@ -52,6 +54,9 @@ class SeenLights(MotionJpeg):
         self.blind = False  # whether the lights change nothing
         self.numbered = True
         self.moving = False
+        self.spot = None  # column, row and radius of a dark object (pixels)
+        self.noise = 0.0  # standard deviation of each pixel
+        self._random = np.random.default_rng(0)
         super().__init__(fps=fps)
 
     def _frame(self):
@@ -65,7 +70,53 @@ class SeenLights(MotionJpeg):
             image[:CORNER, :CORNER] = 0.3 * draw(self.number, (CORNER, CORNER)) + 110  # faint, the scene is at rest
         if self.moving:
             cv2.circle(image, (20 + 7 * self.number % 100, SIZE[1] // 2), 16, (0, 0, 0), -1)
+        spot = self.spot
+        if spot is not None:
+            cv2.circle(image, spot[:2], spot[2], (30, 30, 30), -1)
+        if self.noise:
+            image = np.clip(image + self._random.normal(0, self.noise, image.shape), 0, 255).astype(np.uint8)
         return jpeg(image)
+
+
+class Player:
+    """Plays the person who places and releases objects in front of a peer, as the instructions ask for.
+
+    Trajectory n starts at `start(n)` and ends at `end(n)`.
+    """
+
+    def __init__(self, peer):
+        self.peer, self.count = peer, 0
+        peer.camera.numbered, peer.camera.noise = False, 1.0
+
+    @staticmethod
+    def start(number):
+        return 50, 40 + 10 * number, 10
+
+    @staticmethod
+    def end(number):
+        return 100, 80 - 10 * number, 10
+
+    def follow(self, stage):
+        """Do what a stage asks for."""
+        camera = self.peer.camera
+        if stage is Stage.CLEAR:
+            camera.spot = None
+        elif stage is Stage.PLACE:
+            camera.spot = self.start(self.count)
+        elif stage is Stage.RELEASE and camera.spot == self.start(self.count):
+            threading.Thread(target=self._move, args=(self.start(self.count), self.end(self.count))).start()
+            self.count += 1
+
+    def _move(self, here, there):
+        for share in np.linspace(0, 1, 8):
+            self.peer.camera.spot = tuple(int(v) for v in np.round(here + share * np.subtract(there, here)))
+            time.sleep(0.03)
+
+    @staticmethod
+    def place_of(image):
+        """Column and row of the object in an image, or None."""
+        dark = (image.mean(-1) < 50).nonzero()
+        return (round(float(dark[1].mean())), round(float(dark[0].mean()))) if len(dark[0]) > 100 else None
 
 
 class SensorPeer:

@@ -275,7 +275,7 @@ def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
         OSError: The file cannot be written.
     """
     path = trajectory_folder(folder, number)
-    sums = {end: _pair_sum(path, end) for end in _ENDS}
+    sums: dict[str, str] = {end: _pair_sum(path, end) for end in _ENDS}
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds")
     content = {"format": FORMAT, "number": number, "confirmed": now, "note": note, **sums}
     _files.write_json(path / CONFIRMED, {**content, "checksum": _files.digest(content)})
