@@ -19,6 +19,8 @@ _PAGE = Path(__file__).with_name("page.html")
 _WIDEST = 820  # pixels, to which images are reduced
 _QUALITY = 80  # of JPEG
 _INTERVAL_S = 0.1  # between two images of a stream
+_OPEN_S = 2.0  # s since the last question of a page after which it counts as closed
+_LAST_S = 0.4  # s for open pages to ask once more at the end
 _LARGEST = 1000  # bytes of a request
 
 
@@ -46,6 +48,7 @@ class Page:
         self._number = 0  # of the view
         self._action: Action | None = None
         self._ended = False
+        self._asked_s = -float("inf")  # when a page last asked for the view
         page = self
 
         class Handler(_Handler):
@@ -91,7 +94,8 @@ class Page:
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-        time.sleep(0.4)  # for the pages to ask once more
+        if time.monotonic() - self._asked_s < _OPEN_S:
+            time.sleep(_LAST_S)
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -114,6 +118,7 @@ class Page:
         """The current view without its images, as JSON."""
         with self._changed:
             view, ended = self._view, self._ended
+            self._asked_s = time.monotonic()
         if view is None:
             return {
                 **{"stage": "", "instruction": "Connecting", "number": None, "confirmed": 0, "waiting": 0},
