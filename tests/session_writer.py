@@ -1,5 +1,6 @@
-"""A process that collects random pairs into a session and prints the numbers that are confirmed on disk."""
+"""Processes that collect random pairs into a session and print the numbers that are confirmed on disk."""
 
+import os
 import sys
 import time
 
@@ -25,9 +26,10 @@ def pair(number, end, size=SIZE):
     return Pair(shot("visual", (0, 0, 0, 0)), shot("tactile", (255, 255, 255, 255)))
 
 
-def main(folder):
+def write(folder):
+    """Collect until killed."""
     with Session.open(folder, ORIGIN) as session:
-        print("ready", flush=True)
+        print("ready", os.getpid(), flush=True)
         while True:
             number = session.begin()
             before = session.confirmed
@@ -38,6 +40,16 @@ def main(folder):
                 time.sleep(0.0005)
             assert session.confirmed == before + 1
             print(number, flush=True)
+
+
+def main(folder):
+    """For each line of the standard input, start a writer and wait until it is killed."""
+    for _ in sys.stdin:
+        writer = os.fork()  # without the imports of a new process
+        if writer == 0:
+            write(folder)
+        os.waitpid(writer, 0)
+        print("killed", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,15 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from camera_server import SIZE
 from led_peer import WAIT_S
-from sensor_peer import Player, SensorPeer
+from sensor_peer import DARK, LIT, Player, SensorPeer
 from session_writer import ORIGIN, pair
 from test_hardware_collecting import check
 
+import sts_jax as sts
 from experiments import real
 from experiments.shared.page import Page
 from experiments.shared.terminal import Terminal
@@ -38,7 +40,7 @@ def peer(tmp_path):
 def running(peer, workdir, *options):
     """The command `collect` in a process of its own, and the queue of its lines."""
     command = [sys.executable, "-m", "experiments.real", "collect", "--workdir", str(workdir), "--camera", peer.url]
-    command += ["--leds", peer.path, "--size", *(str(n) for n in SIZE), "--no-lock", *QUICK, *options]
+    command += ["--leds", peer.path, "--no-lock", *QUICK, *options]
     root = str(Path(__file__).parents[1])
     path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
     lines = queue.Queue()
@@ -83,7 +85,8 @@ def follow(lines, player, until_line=None):
 
 def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     player = Player(peer)
-    with running(peer, tmp_path, "--headless", "--automatic", "--count", "3") as (process, lines):
+    common = "--headless", "--automatic", "--count", "3"
+    with running(peer, tmp_path, *common, "--size", *(str(n) for n in SIZE)) as (process, lines):
         follow(lines, player, "[1 of 3]")
         process.kill()
     peer.leds.controller._apply((0, 0, 0, 0))  # the watchdog
@@ -92,7 +95,8 @@ def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     assert kept == (0,)
     player.peer.camera.spot = None
     player.count = hardware.list_recordings(dataset)[-1].number + 1
-    with running(peer, tmp_path, "--headless", "--automatic", "--count", "3", "--note", "box") as (process, lines):
+    file = sensor_file(peer, tmp_path / "sensor.json")
+    with running(peer, tmp_path, *common, "--sensor", str(file), "--note", "box") as (process, lines):
         seen = follow(lines, player)
         assert process.wait(WAIT_S) == 0, seen
     assert any("1 trajectories in" in line for line in seen)
@@ -103,10 +107,38 @@ def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     assert [trajectory.note for trajectory in read] == ["", "box", "box"]
 
 
+def sensor_file(peer, path):
+    """The file of the peer's sensor, with its backgrounds and settling."""
+    device = hardware.Device(
+        camera=peer.url,
+        fps=60.0,
+        leds=peer.leds.controller._serial_number,
+        lens=hardware.Lens.ideal(*SIZE),
+        settle_on_s=0.1,
+        settle_off_s=0.1,
+        levels=(255, 255, 255, 255),
+        commissioned="2026-05-31",
+    )
+    images = (np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (DARK, LIT))
+    device.save(path, sts.Sensor().constants(), visual=next(images), tactile=next(images))
+    return path
+
+
+def test_a_file_of_another_sensor_is_refused(peer, tmp_path):
+    peer.leds.controller._serial_number = "OTHER"
+    file = sensor_file(peer, tmp_path / "sensor.json")
+    peer.leds.controller._serial_number = "EMULATED"
+    options = real.Collect(tmp_path, leds=peer.path, sensor=file, lock=False, headless=True, automatic=True)
+    with pytest.raises(SystemExit, match="LED controller OTHER, but the connected device has LED controller EMULATED"):
+        real.main(options)
+
+
 def ask(page, method, path, body=None, **headers):
     connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
     try:
-        connection.request(method, path, None if body is None else json.dumps(body), {"Host": f"127.0.0.1:{page.port}", **headers})
+        connection.request(
+            method, path, None if body is None else json.dumps(body), {"Host": f"127.0.0.1:{page.port}", **headers}
+        )
         answer = connection.getresponse()
         return answer.status, answer.read()
     finally:

@@ -5,6 +5,7 @@ import errno
 import json
 import os
 import random
+import signal
 import subprocess
 import sys
 import time
@@ -267,17 +268,24 @@ def test_a_disk_that_is_really_full(small_disk):
 def killed(folder, kills, seed):
     """Kill a writer at random moments. The numbers that it reported, and how many folders a kill left half-written."""
     moments, reported, partial = random.Random(seed), set(), 0
-    for _ in range(kills):
-        command = [sys.executable, session_writer.__file__, str(folder)]
-        path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
-        ) as run:
-            assert run.stdout.readline() == "ready\n"
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    with subprocess.Popen(
+        [sys.executable, session_writer.__file__, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as run:
+        for _ in range(kills):
+            run.stdin.write("start\n")
+            run.stdin.flush()
+            word, writer = run.stdout.readline().split()
+            assert word == "ready"
             time.sleep(moments.uniform(0, 0.08))
-            run.kill()
-            reported |= {int(line) for line in run.stdout.read().split("\n") if line}
-        partial += len(list(folder.glob("trajectories/*/.*.partial")))
+            os.kill(int(writer), signal.SIGKILL)
+            while (line := run.stdout.readline()) != "killed\n":
+                reported.add(int(line))
+            partial += len(list(folder.glob("trajectories/*/.*.partial")))
     return reported, partial
 
 
@@ -289,7 +297,7 @@ def check_killed(folder, reported):
             found, made = getattr(trajectory, end), pair(trajectory.number, end)
             np.testing.assert_array_equal(found.visual.image, made.visual.image)
             np.testing.assert_array_equal(found.tactile.image, made.tactile.image)
-    for folder_of_pair in folder.glob("trajectories/*/*l"):  # initial and final: no half pair, confirmed or not
+    for folder_of_pair in folder.glob("trajectories/*/[if]*l"):  # initial and final: no half pair, confirmed or not
         recordings.read_pair(folder_of_pair, 0)
     Session.open(folder, ORIGIN).close()
     assert not list(folder.glob("trajectories/*/.*.partial"))
