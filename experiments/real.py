@@ -277,6 +277,8 @@ def main(config: Collect | Review) -> None:
             if config.debug:
                 raise
             raise SystemExit(f"error: {error}") from None
+        except KeyboardInterrupt:
+            raise SystemExit("stopped") from None
 
 
 def _terminated(*_: object) -> None:

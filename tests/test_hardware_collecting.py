@@ -107,6 +107,19 @@ def test_stopping_in_the_middle_keeps_the_initial_pair(peer, sensor, tmp_path):
     assert (entry.number, entry.standing) == (0, "incomplete")
 
 
+def test_an_interruption_by_the_keyboard_keeps_what_was_confirmed(peer, sensor, tmp_path):
+    person = Playing(Player(peer))
+    person.stop_after = lambda view: len({view.number for view in person.views}) > 1 and view.number is None and _stop()
+
+    def _stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(sensor, tmp_path / "session", person, None)
+    (trajectory,) = hardware.load_recordings(tmp_path / "session")
+    check(trajectory, 0)
+
+
 def test_a_full_disk_is_shown_before_the_next_trajectory(peer, sensor, tmp_path, monkeypatch):
     write, full = _files.write_folder, threading.Event()
 
