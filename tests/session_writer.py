@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+import warnings
 
 import numpy as np
 
@@ -44,6 +45,8 @@ def write(folder):
 
 def main(folder):
     """For each line of the standard input, start a writer and wait until it is killed."""
+    # JAX warns of its threads, but starts them with its first computation only.
+    warnings.filterwarnings("ignore", message="os.fork")
     for _ in sys.stdin:
         writer = os.fork()  # without the imports of a new process
         if writer == 0:
