@@ -89,7 +89,7 @@ def device(config: Collect) -> tuple[hardware.STS, hardware.Device | None, Empty
         raise ValueError(
             f"{'--camera' if source is None else '--leds'} is missing. Cameras found: "
             f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
-            f"{', '.join(str(port) for port in ports) or 'none'}"
+            f"{', '.join(port.device for port in ports) or 'none'}"
         )
     if config.count is not None and config.count < 1:
         raise ValueError(f"count must be >= 1, got {config.count}")

@@ -279,10 +279,11 @@ def killed(folder, kills, seed):
         for _ in range(kills):
             run.stdin.write("start\n")
             run.stdin.flush()
-            word, writer = run.stdout.readline().split()
-            assert word == "ready"
+            first = run.stdout.readline()
+            assert first.startswith("ready "), f"{first!r} instead of ready. Exit code {run.poll()}"
+            writer = int(first.split()[1])
             time.sleep(moments.uniform(0, 0.08))
-            os.kill(int(writer), signal.SIGKILL)
+            os.kill(writer, signal.SIGKILL)
             while (line := run.stdout.readline()) != "killed\n":
                 reported.add(int(line))
             partial += len(list(folder.glob("trajectories/*/.*.partial")))
