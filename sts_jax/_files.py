@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import platform
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -177,3 +178,38 @@ def lock(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):  # the folder may have been deleted meanwhile
             owner.unlink(missing_ok=True)
         held.release()
+
+
+def flush_folder(folder: Path) -> None:
+    """Flush a folder's entries to disk, so that files which were created or renamed in it survive a loss of power."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_folder(path: Path, files: dict[str, bytes]) -> None:
+    """Create a folder with files. All of it is on disk afterwards, and an interruption leaves no folder of this name.
+
+    Raises:
+        OSError: a file cannot be written, or `path` exists and is not empty. The message names the folder and the
+            remedy.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        for name, data in files.items():
+            with (temporary / name).open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        flush_folder(temporary)
+        temporary.rename(path)
+        flush_folder(path.parent)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write {path}: {error}. {remedy(error)}.") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

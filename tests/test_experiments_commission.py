@@ -9,11 +9,11 @@ import calibration_images
 import cv2
 import numpy as np
 import pytest
-from led_peer import Peer
 from PIL import Image
-from sensor_peer import DARK, LIT, Lights, SeenLights
 
 import sts_jax as sts
+from benchmarks.instruments.led_peer import Peer
+from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenLights
 from experiments import commission
 from experiments.shared import boards
 from sts_jax import hardware

@@ -68,6 +68,18 @@ def test_an_error_of_the_writer_passes_unchanged(tmp_path):
         _files.write_whole(tmp_path / "x", wrong)
 
 
+def test_a_folder_is_written_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
+    _files.write_folder(tmp_path / "deep" / "a", {"one": b"1", "two": b"2"})
+    assert {path.name: path.read_bytes() for path in (tmp_path / "deep/a").iterdir()} == {"one": b"1", "two": b"2"}
+    with pytest.raises(OSError, match=r"cannot write .*a: .*Remove the file or folder that is in the way"):
+        _files.write_folder(tmp_path / "deep" / "a", {"one": b"3"})
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(OSError, match=r"cannot write .*b: .*No space left.*Free some disk space\."):
+        _files.write_folder(tmp_path / "deep" / "b", {"one": b"1"})
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["a"]
+    assert (tmp_path / "deep/a/one").read_bytes() == b"1"
+
+
 def test_reading_inverts_writing(tmp_path):
     content = {"seed": 0, "sizes": [1, 2.5], "name": None}
     _files.write_json(tmp_path / "a.json", content)

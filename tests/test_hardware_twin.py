@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import serial
 import tyro
-from led_peer import until
+from led_simulator import until
 
 import sts_jax as sts
 from experiments import twin as command

@@ -87,6 +87,9 @@ class SeenLights(MotionJpeg):
         self.blind = False  # whether the lights change nothing
         self.numbered = True
         self.moving = False
+        self.spot: tuple[int, int, int] | None = None  # column, row and radius of a dark object (pixels)
+        self.noise = 0.0  # standard deviation of each pixel
+        self._random = np.random.default_rng(0)
         super().__init__(fps=fps, size=size)
 
     def _frame(self) -> bytes:
@@ -101,6 +104,11 @@ class SeenLights(MotionJpeg):
             image[:CORNER, :CORNER] = 0.3 * draw(self.number, (CORNER, CORNER)) + 110  # faint, the scene is at rest
         if self.moving:
             cv2.circle(image, (20 + 7 * self.number % 100, height // 2), 16, (0, 0, 0), -1)
+        spot = self.spot
+        if spot is not None:
+            cv2.circle(image, spot[:2], spot[2], (30, 30, 30), -1)
+        if self.noise:
+            image = np.clip(image + self._random.normal(0, self.noise, image.shape), 0, 255).astype(np.uint8)
         return jpeg(image)
 
     def exposure_of(self, image: Image) -> Exposure | None:

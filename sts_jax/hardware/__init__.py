@@ -27,10 +27,12 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
+from sts_jax.hardware.collecting import Action, AutomaticPerson, Person, View, collect
 from sts_jax.hardware.coverage import check_view, covered, view_angle
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.exposure import Exposed, brightness, choose_exposure
 from sts_jax.hardware.frames import CameraStatistics, Captured, is_black
+from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage, known_pad
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.lens import Lens, Pinhole, distorted, distortion, project, rectification, rectified
 from sts_jax.hardware.ports import (
@@ -45,12 +47,26 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.recordings import (
+    Entry,
+    Images,
+    RecordedTrajectory,
+    Recordings,
+    confirm_recording,
+    discard_recording,
+    list_recordings,
+    load_recordings,
+    restore_recording,
+)
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
+from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
 from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
 
 __all__ = [
     "STS",
+    "Action",
+    "AutomaticPerson",
     "Background",
     "Board",
     "Calibration",
@@ -69,13 +85,17 @@ __all__ = [
     "Captured",
     "Device",
     "DisconnectedError",
+    "EmptyPad",
     "EndOfVideoError",
+    "Entry",
     "Exposed",
     "FoundCamera",
     "FoundCorners",
     "FoundSensors",
     "FrameSizeError",
     "FrozenCameraError",
+    "GuideConfig",
+    "Images",
     "LedError",
     "LedTimeoutError",
     "Leds",
@@ -85,16 +105,24 @@ __all__ = [
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
+    "Origin",
     "Pair",
+    "Person",
     "Pinhole",
     "Port",
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "RecordedTrajectory",
+    "Recordings",
     "SensorFileError",
+    "Session",
+    "SessionError",
     "Settling",
     "Shot",
+    "Stage",
     "StaleFrameError",
+    "View",
     "WrongDeviceError",
     "WrongVersionError",
     "board_image",
@@ -102,7 +130,10 @@ __all__ = [
     "calibrate",
     "check_view",
     "choose_exposure",
+    "collect",
+    "confirm_recording",
     "covered",
+    "discard_recording",
     "distorted",
     "distortion",
     "find_board",
@@ -111,9 +142,13 @@ __all__ = [
     "find_sensors",
     "fit_lens",
     "is_black",
+    "known_pad",
+    "list_recordings",
+    "load_recordings",
     "project",
     "rectification",
     "rectified",
+    "restore_recording",
     "save_board",
     "view_angle",
 ]

@@ -228,6 +228,11 @@ class STS:
         return self._leds
 
     @property
+    def levels(self) -> protocol.Levels:
+        """Duty cycles of the channels in the tactile stream, 0 to 255."""
+        return self._levels
+
+    @property
     def settling(self) -> Settling:
         """The settling times that are in use.
 

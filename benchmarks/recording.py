@@ -1,0 +1,74 @@
+"""Time and size of a pair of images of the real sensor on disk.
+
+    python -m benchmarks.recording                  # a few seconds
+    python -m benchmarks.recording --folder /mnt    # on another disk
+
+Writes pairs as `hardware.Session` does: each image as PNG, then the folder with its checksums, flushed to the disk. The
+images are smooth, with noise of a standard deviation of 1.5 of 255, and without it. Prints the median and the longest
+time of a pair. The files are deleted afterwards.
+"""
+
+import dataclasses
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+
+from sts_jax import _files
+from sts_jax.hardware import Lit, Pair, Shot, recordings
+
+SIZES = ((640, 480), (1640, 1232))
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options."""
+
+    folder: Path | None = None  # on the disk to measure (default: that of temporary files)
+    pairs: int = 20  # of each size
+    seed: int = 0
+
+
+def pair(random: np.random.Generator, width: int, height: int, noise: float) -> Pair:
+    """A pair of smooth images with noise."""
+
+    def shot(stream: recordings.Stream, level: int) -> Shot:
+        smooth = cv2.GaussianBlur(random.uniform(0, 1, (height, width, 3)).astype(np.float32), (0, 0), width / 50)
+        smooth = (smooth - smooth.min()) / (smooth.max() - smooth.min())
+        image = np.clip(level + 120 * smooth + random.normal(0, noise, smooth.shape), 0, 255).astype(np.uint8)
+        now = time.monotonic()
+        return Shot(image, stream, now, 0, 0, Lit((0, 0, 0, 0), 1, 1, now, now), now)
+
+    return Pair(shot("visual", 20), shot("tactile", 100))
+
+
+def main(args: Args) -> None:
+    """Print a table."""
+    random = np.random.default_rng(args.seed)
+    print("size         noise   MB a pair   ms to encode   ms to write   longest of both")
+    for width, height in SIZES:
+        for noise in (0.0, 1.5):
+            taken = pair(random, width, height, noise)
+            encoding, writing, size = [], [], 0
+            with tempfile.TemporaryDirectory(dir=args.folder) as folder:
+                for number in range(args.pairs):
+                    start = time.perf_counter()
+                    files = recordings.encoded_pair(taken, None)
+                    middle = time.perf_counter()
+                    _files.write_folder(Path(folder) / str(number), files)
+                    encoding.append(1e3 * (middle - start))
+                    writing.append(1e3 * (time.perf_counter() - middle))
+                    size = sum(map(len, files.values()))
+            longest = max(a + b for a, b in zip(encoding, writing, strict=True))
+            print(
+                f"{width:4d} x {height:4d}  {noise:5.1f}  {size / 1e6:10.1f}  {statistics.median(encoding):13.0f}"
+                f"  {statistics.median(writing):12.0f}  {longest:16.0f}"
+            )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))

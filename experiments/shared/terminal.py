@@ -1,0 +1,86 @@
+"""A terminal without a browser: prints the instruction when it changes, and reads keys."""
+
+import contextlib
+import os
+import select
+import sys
+from collections.abc import Iterator
+
+from experiments.shared.progress import say
+from sts_jax.hardware import Action, Stage, View
+
+KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Action.STOP}
+
+
+class Terminal:
+    """A `Person` at a terminal: Enter confirms, d discards, q stops. So does each line of another standard input.
+
+    The end of the input stops.
+    """
+
+    def __init__(self, count: int | None = None, *, keys: bool = True):
+        """Print the keys.
+
+        Args:
+            count: Number of trajectories that is shown as the goal.
+            keys: Whether keys are read.
+        """
+        self._goal = "" if count is None else f" of {count}"
+        self._shown: object = None
+        self._stages: tuple[Stage | None, Stage | None] = (None, None)  # of the last two views
+        if keys:
+            say("Enter confirms, d discards, q stops")
+
+    def show(self, view: View) -> None:
+        """Print a view if it differs from the last one."""
+        self._stages = self._stages[1], view.stage
+        shown = view.instruction, view.problem, view.number
+        if shown != self._shown:
+            self._shown = shown
+            number = "" if view.number is None else f" trajectory {view.number}:"
+            say(f"[{view.confirmed}{self._goal}]{number} {view.problem or view.instruction}")
+
+    def action(self) -> Action | None:
+        """The action of the next key, or None.
+
+        Unknown keys are ignored, and so is a key that was pressed before the person saw the current stage.
+        """
+        while select.select([sys.stdin], [], [], 0)[0]:
+            data = os.read(sys.stdin.fileno(), 1)
+            if not data:
+                say("the standard input has ended")
+                return Action.STOP
+            if (action := KEYS.get(data.decode(errors="replace").lower())) is not None:
+                if action is not Action.CONFIRM and not sys.stdin.isatty():
+                    self._rest_of_line()
+                if action is Action.STOP or self._stages[0] is self._stages[1]:
+                    return action
+        return None
+
+    def _rest_of_line(self) -> None:
+        """Skip to the end of a line, whose line feed is no confirmation."""
+        while os.read(sys.stdin.fileno(), 1) not in (b"\n", b""):
+            pass
+
+
+@contextlib.contextmanager
+def single_keys() -> Iterator[None]:
+    """Let the terminal pass on each key at once.
+
+    Raises:
+        ValueError: The standard input cannot be read key by key.
+    """
+    if not sys.stdin.isatty():
+        yield
+        return
+    try:
+        import termios
+        import tty
+    except ImportError as error:
+        raise ValueError("this system's terminal passes no single keys: leave out --headless") from error
+    before = termios.tcgetattr(sys.stdin)
+    try:
+        tty.setcbreak(sys.stdin)
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

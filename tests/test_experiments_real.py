@@ -1,0 +1,314 @@
+"""The commands `real collect` and `real review`, against a sensor's devices without a sensor."""
+
+import contextlib
+import http.client
+import json
+import os
+import pty
+import queue
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from player import Player
+from session_writer import ORIGIN, pair
+from test_hardware_collecting import check
+
+import sts_jax as sts
+from benchmarks.instruments.camera_server import SIZE
+from benchmarks.instruments.led_peer import WAIT_S
+from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
+from experiments import real
+from experiments.shared.page import Page
+from experiments.shared.terminal import Terminal
+from sts_jax import hardware
+from sts_jax.hardware import Action, Stage
+
+QUICK = ["--guide.empty-s", "0.2", "--guide.hold-s", "0.2", "--guide.rest-s", "0.4"]
+
+
+@pytest.fixture
+def peer(tmp_path):
+    made = SensorPeer(tmp_path / "leds")
+    yield made
+    made.stop()
+
+
+@contextlib.contextmanager
+def running(peer, workdir, *options):
+    """The command `collect` in a process of its own, and the queue of its lines."""
+    command = [sys.executable, "-m", "experiments.real", "collect", "--workdir", str(workdir), "--camera", peer.url]
+    command += ["--leds", peer.path, "--no-lock", *QUICK, *options]
+    root = str(Path(__file__).parents[1])
+    path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
+    lines = queue.Queue()
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+
+    def read():
+        for line in process.stderr:
+            lines.put(line.rstrip())
+        lines.put(None)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    try:
+        yield process, lines
+    finally:
+        process.kill()
+        process.wait()
+        thread.join()
+        process.stderr.close()
+
+
+def follow(lines, player, until_line=None):
+    """Play what the printed lines ask for, until the process ends or prints something. All lines."""
+    words = {"Take everything off": Stage.CLEAR, "Place the": Stage.PLACE, "Release the": Stage.RELEASE}
+    seen = []
+    while (line := lines.get(timeout=WAIT_S)) is not None:
+        seen.append(line)
+        for text, stage in words.items():
+            if text in line:
+                player.follow(stage)
+        if until_line is not None and until_line in line:
+            break
+    return seen
+
+
+def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
+    player = Player(peer)
+    common = "--headless", "--automatic", "--count", "3"
+    with running(peer, tmp_path, *common, "--size", *(str(n) for n in SIZE)) as (process, lines):
+        follow(lines, player, "[1 of 3]")
+        process.kill()
+    peer.leds.controller._apply((0, 0, 0, 0))  # the watchdog
+    dataset = tmp_path / "dataset"
+    kept = hardware.load_recordings(dataset).numbers
+    assert kept == (0,)
+    player.peer.camera.spot = None
+    player.count = hardware.list_recordings(dataset)[-1].number + 1
+    file = sensor_file(peer, tmp_path / "sensor.json")
+    with running(peer, tmp_path, *common, "--sensor", str(file), "--note", "box") as (process, lines):
+        seen = follow(lines, player)
+        assert process.wait(WAIT_S) == 0, seen
+    assert any("1 trajectories in" in line for line in seen)
+    read = hardware.load_recordings(dataset)
+    assert len(read) == 3
+    for trajectory in read:
+        check(trajectory, trajectory.number)
+    assert [trajectory.note for trajectory in read] == ["", "box", "box"]
+
+
+def sensor_file(peer, path):
+    """The file of the peer's sensor, with its backgrounds and settling."""
+    device = hardware.Device(
+        camera=peer.url,
+        fps=60.0,
+        leds=peer.leds.controller._serial_number,
+        lens=hardware.Lens.ideal(*SIZE),
+        settle_on_s=0.1,
+        settle_off_s=0.1,
+        levels=(255, 255, 255, 255),
+        commissioned="2026-05-31",
+    )
+    images = (np.full((SIZE[1], SIZE[0], 3), level, np.uint8) for level in (DARK, LIT))
+    device.save(path, sts.Sensor().constants(), visual=next(images), tactile=next(images))
+    return path
+
+
+def test_a_file_of_another_sensor_is_refused(peer, tmp_path):
+    peer.leds.controller._serial_number = "OTHER"
+    file = sensor_file(peer, tmp_path / "sensor.json")
+    peer.leds.controller._serial_number = "EMULATED"
+    options = real.Collect(tmp_path, leds=peer.path, sensor=file, lock=False, headless=True, automatic=True)
+    with pytest.raises(SystemExit, match="LED controller OTHER, but the connected device has LED controller EMULATED"):
+        real.main(options)
+
+
+def ask(page, method, path, body=None, **headers):
+    connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
+    try:
+        connection.request(
+            method, path, None if body is None else json.dumps(body), {"Host": f"127.0.0.1:{page.port}", **headers}
+        )
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def view(stage=Stage.REVIEW, number=0, **changes):
+    taken = pair(0, "initial")
+    values = {
+        **{"pair": taken, "stage": stage, "instruction": "Do.", "contact": True, "still": True, "number": number},
+        **{"confirmed": 4, "waiting": 1, "problem": None, "initial": taken, "final": None},
+    }
+    return hardware.View(**{**values, **changes})
+
+
+@pytest.fixture
+def page():
+    made = Page("127.0.0.1", 0, count=5)
+    yield made
+    made.close()
+
+
+def test_the_page_shows_a_view(page):
+    assert b"<title>Collect trajectories</title>" in ask(page, "GET", "/")[1]
+    assert json.loads(ask(page, "GET", "/view")[1])["instruction"] == "Connecting"
+    assert ask(page, "GET", "/end/initial/visual.jpg")[0] == 404
+    page.show(view())
+    facts = json.loads(ask(page, "GET", "/view")[1])
+    assert facts["age_s"] >= 0
+    expected = {"stage": "review", "number": 0, "confirmed": 4, "waiting": 1, "count": 5, "ends": ["initial"]}
+    assert {name: facts[name] for name in expected} == expected
+    assert ask(page, "GET", "/end/initial/tactile.jpg")[1].startswith(b"\xff\xd8")
+    for path in ("/end/final/tactile.jpg", "/end/initial/pair.json", "/end/__class__/visual.jpg", "/../real.py"):
+        assert ask(page, "GET", path)[0] == 404
+
+
+def test_the_page_streams_each_pair_once(page):
+    connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
+    connection.request("GET", "/tactile.mjpg")
+    answer = connection.getresponse()
+    images = []
+    for _ in range(3):
+        page.show(view())
+        assert answer.readline() == b"--frame\r\n"
+        answer.readline()
+        size = int(answer.readline().split(b":")[1])
+        answer.readline()
+        images.append(answer.read(size))
+        assert answer.readline() == b"\r\n"
+    assert all(image.startswith(b"\xff\xd8") and image.endswith(b"\xff\xd9") for image in images)
+    connection.close()
+
+
+def test_buttons_count_only_for_the_stage_that_was_shown(page):
+    page.show(view())
+    good = {"action": "confirm", "stage": "review", "number": 0}
+    for body in ({**good, "stage": "release"}, {**good, "number": 1}, {**good, "action": "delete"}, {}, [1]):
+        assert ask(page, "POST", "/action", body, **{"X-Collect": "1"})[0] == 409
+    assert page.action() is None
+    assert ask(page, "POST", "/action", good, **{"X-Collect": "1"})[0] == 204
+    assert page.action() is Action.CONFIRM
+    assert page.action() is None
+    stop = {"action": "stop", "stage": "hold", "number": None}
+    assert ask(page, "POST", "/action", stop, **{"X-Collect": "1"})[0] == 204
+    assert page.action() is Action.STOP
+
+
+def test_other_sites_can_neither_see_nor_press(page):
+    page.show(view())
+    good = {"action": "confirm", "stage": "review", "number": 0}
+    assert ask(page, "POST", "/action", good)[0] == 403  # a form of another site has no such header
+    assert ask(page, "GET", "/view", Host="evil.example")[0] == 403
+    assert ask(page, "POST", "/action", good, **{"X-Collect": "1", "Host": "evil.example"})[0] == 403
+    assert ask(page, "GET", "/view", Host=f"localhost:{page.port}")[0] == 200
+    assert page.action() is None
+
+
+def test_an_address_in_use_is_named(page):
+    with pytest.raises(OSError, match=rf"cannot be served at 127.0.0.1:{page.port} .*give another --host or --port"):
+        Page("127.0.0.1", page.port)
+
+
+def test_the_page_states_where_it_listens(capsys):
+    for host, text in (("127.0.0.1", "only this computer can open it"), ("0.0.0.0", "EVERY computer")):
+        with real.person(real.Collect(host=host, port=0)):
+            pass
+        assert f"listens on {host}, so {text}" in capsys.readouterr().err
+
+
+def test_keys_of_a_terminal(monkeypatch, capsys):
+    master, slave = pty.openpty()
+    with os.fdopen(slave) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        keys = Terminal(7)
+        with real.single_keys():
+            keys.show(view(Stage.HOLD))
+            os.write(master, b"\n")
+            keys.show(view(Stage.RELEASE))
+            assert keys.action() is None  # it was pressed in another stage
+            keys.show(view(Stage.RELEASE))
+            for key, expected in ((b"x\n", Action.CONFIRM), (b"D", Action.DISCARD), (b"q", Action.STOP)):
+                os.write(master, key)
+                assert keys.action() is expected
+            assert keys.action() is None
+    os.close(master)
+    assert "[4 of 7] trajectory 0: Do." in capsys.readouterr().err
+
+
+def test_the_end_of_the_input_stops(monkeypatch):
+    with open(os.devnull) as nothing:
+        monkeypatch.setattr(sys, "stdin", nothing)
+        keys = Terminal()
+        keys.show(view())
+        assert keys.action() is Action.STOP
+
+
+@pytest.fixture
+def workdir(tmp_path):
+    with hardware.Session.open(tmp_path / "dataset", ORIGIN) as session:
+        for number in range(3):
+            for end in ("initial", "final"):
+                session.save(number, end, pair(number, end))
+            if number < 2:
+                session.confirm(number, f"note {number}")
+            session.flush()
+    return tmp_path
+
+
+def test_reviewing(workdir, capsys):
+    real.main(real.Review(workdir))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:2] == ["0", "confirmed"]
+    assert lines[0].endswith("note 0")
+    assert lines[3].startswith("2 confirmed of 3 in ")
+    real.main(real.Review(workdir, discard=(0,), confirm=(2,), note="late"))
+    assert hardware.load_recordings(workdir / "dataset").numbers == (1, 2)
+    real.main(real.Review(workdir, restore=(0,), sheet=workdir / "sheet.png"))
+    assert (workdir / "sheet.png").stat().st_size > 10_000
+    real.main(real.Review(workdir, check=True))
+    assert "3 of 3 confirmed trajectories are undamaged" in capsys.readouterr().out
+    (workdir / "dataset/trajectories/00001/final/visual.png").write_bytes(b"")
+    with pytest.raises(SystemExit):
+        real.main(real.Review(workdir, check=True))
+    caught = capsys.readouterr()
+    assert "discard trajectory 1" in caught.err
+    assert "2 of 3 confirmed" in caught.out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "--camera is missing. Cameras found: .* Serial ports found: "),
+        ({"camera": "http://127.0.0.1:1/video"}, "--leds is missing"),
+        ({"camera": "a", "leds": "b", "count": 0}, "count must be >= 1, got 0"),
+        ({"camera": "a", "leds": "b", "levels": (0, 0, 0, 0)}, "at least one above 0"),
+        ({"sensor": Path("none.json")}, "none.json"),
+        ({"camera": "http://127.0.0.1:1/video", "leds": "/dev/none"}, "/dev/none"),
+    ],
+)
+def test_bad_options_are_named(tmp_path, options, message):
+    with pytest.raises(SystemExit, match=message):
+        real.main(real.Collect(tmp_path, headless=True, automatic=True, **options))
+
+
+def test_unknown_trajectories_and_folders_are_named(workdir, tmp_path):
+    for review, message in (
+        (real.Review(workdir, discard=(9,)), "00009 does not exist"),
+        (real.Review(workdir, sheet=workdir / "a.png", numbers=(2,)), r"no confirmed trajectories \[2\]"),
+        (real.Review(tmp_path / "none"), "holds no session"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            real.main(review)

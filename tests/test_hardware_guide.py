@@ -1,0 +1,226 @@
+"""The guide on scripted images: what is placed, held, released and left, under noise, drift and flicker."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sts_jax.hardware import guide
+from sts_jax.hardware.guide import GuideConfig, Stage
+
+CONFIG = GuideConfig()
+STEP_S = 0.15  # between pairs
+SIZE = (120, 160)
+
+
+class Scene:
+    """Images of a pad with a dark spot, with noise of single pixels, and a guide that sees them."""
+
+    def __init__(self, *, noise=2.0, seed=0, state=None, config=CONFIG):
+        self.random = np.random.default_rng(seed)
+        self.noise, self.drift, self.spot, self.hand = noise, 0.0, None, None
+        self.config, self.time_s, self.ends = config, 0.0, []
+        self.state = state or guide.start(trusted=True)
+
+    def image(self, level, spots):
+        values = np.full((*SIZE, 3), level + self.drift)
+        for column, row, radius in filter(None, spots):
+            y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+            values[(x - column) ** 2 + (y - row) ** 2 < radius**2] -= 50
+        values += self.random.normal(0, self.noise, values.shape)
+        return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+    def see(self):
+        self.time_s += STEP_S
+        # The hand is visible through the skin, but does not touch it.
+        visual, tactile = self.image(80, [self.spot, self.hand]), self.image(200, [self.spot])
+        self.state, end = guide.step(self.config, self.state, guide.observe(self.time_s, visual, tactile))
+        if end is not None:
+            self.ends.append(end)
+        return self.state.stage
+
+    def until(self, stage, limit=40):
+        for count in range(limit):
+            if self.see() is stage:
+                return count
+        raise AssertionError(f"the stage stays {self.state.stage}")
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 12.0])
+def test_a_whole_trajectory(noise):
+    scene = Scene(noise=noise)
+    scene.until(Stage.PLACE)
+    assert all(scene.see() is Stage.PLACE for _ in range(100))  # noise is no contact
+    scene.spot = scene.hand = (60, 60, 12)
+    scene.until(Stage.RELEASE)
+    assert all(scene.see() is Stage.RELEASE for _ in range(100))  # noise is no movement
+    scene.hand = None
+    for column in range(60, 100, 8):
+        scene.spot = (column, 60, 12)
+        assert scene.see() is Stage.STILL
+    scene.until(Stage.REVIEW)
+    assert scene.ends == ["initial", "final"]
+    scene.state = guide.confirm(scene.state)
+    assert all(scene.see() is Stage.CLEAR for _ in range(20))  # the object is still there
+    scene.spot = None
+    scene.until(Stage.PLACE)
+
+
+def test_no_pair_is_taken_while_something_moves():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    for count in range(60):
+        scene.spot = (40 + count, 60, 12)
+        scene.see()
+    assert scene.state.stage is Stage.HOLD
+    assert scene.ends == []
+    assert scene.until(Stage.RELEASE) >= CONFIG.hold_s / STEP_S - 1
+    scene.spot = (50, 60, 12)
+    for count in range(60):
+        scene.spot = (40 + count, 60, 12)
+        assert scene.see() is Stage.STILL
+    assert scene.until(Stage.REVIEW) >= CONFIG.rest_s / STEP_S - 1
+
+
+def test_slow_creep_is_movement():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    scene.spot = (40, 60, 12)
+    scene.until(Stage.RELEASE)
+    scene.state = guide.confirm(scene.state)
+    for count in range(60):
+        scene.spot = (40 + 0.5 * count, 60, 12)  # half a pixel between two pairs
+        assert scene.see() is Stage.STILL
+
+
+def test_a_moving_hand_delays_the_final_pair_unless_only_touch_is_watched():
+    for config, expected in ((CONFIG, Stage.STILL), (dataclasses.replace(CONFIG, watched="tactile"), Stage.REVIEW)):
+        scene = Scene(config=config)
+        scene.until(Stage.PLACE)
+        scene.spot = (60, 60, 12)
+        scene.until(Stage.RELEASE)
+        scene.spot = (90, 60, 12)
+        for count in range(30):
+            scene.hand = (30 + 3 * count, 30, 10)
+            scene.see()
+        assert scene.state.stage is expected
+
+
+def test_an_object_that_is_taken_away_again_is_placed_again():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    scene.spot = (60, 60, 12)
+    scene.until(Stage.HOLD)
+    scene.spot = None
+    scene.until(Stage.PLACE)
+    assert scene.ends == []
+
+
+def test_an_object_that_falls_off_ends_the_trajectory():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    scene.spot = (60, 60, 12)
+    scene.until(Stage.RELEASE)
+    scene.spot = None
+    scene.until(Stage.REVIEW)
+    assert scene.ends == ["initial", "final"]
+
+
+def test_an_object_that_stays_needs_a_confirmation():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    scene.spot = (60, 60, 12)
+    scene.until(Stage.RELEASE)
+    assert "confirm" not in guide.instruction(CONFIG, scene.state)
+    for _ in range(80):
+        scene.see()
+    assert "If the object stays where it was, confirm" in guide.instruction(CONFIG, scene.state)
+    scene.state = guide.confirm(scene.state)
+    scene.until(Stage.REVIEW)
+
+
+def test_slow_drift_of_the_light_is_followed_between_trajectories_and_is_no_contact():
+    scene = Scene()
+    for _ in range(5):
+        scene.until(Stage.PLACE)
+        for _ in range(10):
+            scene.drift += 0.4
+            assert scene.see() is Stage.PLACE
+        scene.spot = (60, 60, 12)
+        scene.until(Stage.RELEASE)
+        scene.spot = (80, 60, 12)
+        scene.until(Stage.REVIEW)
+        scene.state, scene.spot = guide.confirm(scene.state), None
+
+
+def test_a_speck_is_no_contact():
+    scene = Scene(noise=0.5)
+    scene.until(Stage.PLACE)
+    scene.spot = (62, 62, 1.5)  # within one block
+    assert all(scene.see() is Stage.PLACE for _ in range(20))
+
+
+def test_an_unknown_pad_waits_for_the_person():
+    scene = Scene(state=guide.start())
+    scene.spot = (60, 60, 12)
+    assert all(scene.see() is Stage.CLEAR for _ in range(20))
+    assert guide.instruction(CONFIG, scene.state).endswith("Then confirm.")
+    scene.spot, scene.state = None, guide.confirm(scene.state)
+    scene.until(Stage.PLACE)
+    assert not scene.state.trusted
+
+
+def test_a_background_shows_an_object_that_was_left():
+    scene = Scene()
+    empty = guide.known_pad(scene.image(80, []), scene.image(200, []))
+    scene = Scene(seed=1, state=guide.start(empty))
+    scene.spot = (60, 60, 12)
+    assert all(scene.see() is Stage.CLEAR for _ in range(20))
+    scene.spot = None
+    scene.until(Stage.PLACE)
+
+
+def test_noise_is_measured():
+    random = np.random.default_rng(0)
+    looks = random.normal(100, 2, (200, 2, 24, 32, 3)).astype(np.float32)
+    measured = guide.empty_pad([guide.Observation(float(i), *look) for i, look in enumerate(looks)])
+    np.testing.assert_allclose(measured.visual_noise.mean(), 2, rtol=0.05)
+    np.testing.assert_allclose(measured.tactile, 100, atol=1)
+    with pytest.raises(ValueError, match="at least 2 observations"):
+        guide.empty_pad([])
+
+
+def test_an_interruption_starts_the_rest_anew():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    scene.spot = (60, 60, 12)
+    scene.until(Stage.HOLD)
+    for _ in range(30):
+        scene.see()
+        scene.state = guide.interrupted(scene.state)
+    assert scene.state.stage is Stage.HOLD
+
+
+def test_discarding_returns_to_the_beginning():
+    scene = Scene()
+    scene.until(Stage.PLACE)
+    assert guide.discard(scene.state) is scene.state
+    scene.spot = (60, 60, 12)
+    scene.until(Stage.RELEASE)
+    scene.state = guide.discard(scene.state)
+    assert scene.state.stage is Stage.CLEAR
+    assert scene.state.initial is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hold_s": 0.0}, "hold_s must be > 0 and finite, got 0.0"),
+        ({"rest_s": float("nan")}, "rest_s must be > 0"),
+        ({"pairs": 2}, "pairs must be >= 3, got 2"),
+        ({"largest_threshold": 1.0}, "largest_threshold must be at least smallest_change"),
+    ],
+)
+def test_bad_settings_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        GuideConfig(**changes)

@@ -1,0 +1,317 @@
+"""Sessions on disk: nothing that was confirmed is lost, and nothing half-written counts."""
+
+import dataclasses
+import errno
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import session_writer
+from led_simulator import until
+from session_writer import ORIGIN, pair
+
+from sts_jax import _files, hardware
+from sts_jax.hardware import recordings
+from sts_jax.hardware.session import Session, SessionError
+from sts_jax.hardware.settling import Settling
+
+
+def add(session, *, confirm=True, final=True):
+    session.check_ready()
+    number = session.begin()
+    session.save(number, "initial", pair(number, "initial"))
+    if final:
+        session.save(number, "final", pair(number, "final"))
+    if confirm:
+        session.confirm(number, f"note {number}")
+    session.flush()
+    return number
+
+
+def assert_equal(first, second):
+    for one, two in ((first.visual, second.visual), (first.tactile, second.tactile)):
+        np.testing.assert_array_equal(one.image, two.image)
+        assert one.image.dtype == np.uint8
+        for field in dataclasses.fields(one):
+            if field.name != "image":
+                assert getattr(one, field.name) == getattr(two, field.name)
+
+
+def standings(folder):
+    return {entry.number: entry.standing for entry in hardware.list_recordings(folder)}
+
+
+def test_reading_returns_what_was_saved(tmp_path):
+    saved = {end: pair(0, end) for end in ("initial", "final")}
+    settling = Settling(0.1, 0.2, 30.0)
+    with Session.open(tmp_path, ORIGIN, settling=settling) as session:
+        assert session.begin() == 0
+        for end, taken in saved.items():
+            session.save(0, end, taken)
+        session.confirm(0, "on its edge")
+        session.flush()
+        assert (session.confirmed, session.waiting, session.problem) == (1, 0, None)
+        read = hardware.load_recordings(tmp_path)  # while another part of the program collects
+    (trajectory,) = read
+    assert_equal(trajectory.initial, saved["initial"])
+    assert_equal(trajectory.final, saved["final"])
+    assert (trajectory.number, trajectory.note, len(read)) == (0, "on its edge", 1)
+    images = read.images(lambda image: image[::2])
+    np.testing.assert_array_equal(images.final_tactile[0], saved["final"].tactile.image[::2])
+    np.testing.assert_array_equal(images.initial_visual[0], saved["initial"].visual.image[::2])
+    content = json.loads((tmp_path / "trajectories/00000/initial/pair.json").read_text())
+    assert content["settling"] == dataclasses.asdict(settling)
+    assert content["visual"]["taken"].endswith("+00:00")
+
+
+def test_resuming_continues_with_the_next_number(tmp_path):
+    for expected in range(3):
+        with Session.open(tmp_path, ORIGIN) as session:
+            assert session.confirmed == expected
+            assert add(session) == expected
+    with Session.open(tmp_path, ORIGIN) as session:
+        session.discard(2)
+        session.flush()
+        assert session.confirmed == 2
+    with Session.open(tmp_path, ORIGIN) as session:
+        assert add(session) == 3  # numbers of discarded trajectories are not used again
+    assert standings(tmp_path) == {0: "confirmed", 1: "confirmed", 2: "discarded", 3: "confirmed"}
+
+
+def test_discarding_and_restoring(tmp_path):
+    with Session.open(tmp_path, ORIGIN) as session:
+        numbers = [add(session), add(session, confirm=False), add(session, confirm=False, final=False)]
+        session.discard(session.begin())  # nothing of it was saved
+    hardware.discard_recording(tmp_path, 0)
+    assert standings(tmp_path) == {0: "discarded", 1: "unconfirmed", 2: "incomplete"}
+    assert hardware.load_recordings(tmp_path).numbers == ()
+    with pytest.raises(ValueError, match="no confirmed trajectory"):
+        hardware.load_recordings(tmp_path).images()
+    hardware.restore_recording(tmp_path, 0)
+    hardware.confirm_recording(tmp_path, 1, "later")
+    with pytest.raises(FileNotFoundError, match="has no final pair"):
+        hardware.confirm_recording(tmp_path, 2)
+    with pytest.raises(FileNotFoundError, match="list the trajectories"):
+        hardware.restore_recording(tmp_path, 7)
+    read = hardware.load_recordings(tmp_path)
+    assert [trajectory.note for trajectory in read] == ["note 0", "later"]
+    assert read[-1].number == 1
+    assert numbers == [0, 1, 2]
+
+
+def test_reviewing_waits_for_the_end_of_collecting(tmp_path):
+    with Session.open(tmp_path, ORIGIN) as session:
+        add(session)
+        with pytest.raises(_files.LockedError, match="is in use by"):
+            hardware.discard_recording(tmp_path, 0)
+        with pytest.raises(_files.LockedError, match="is in use by"):
+            Session.open(tmp_path, ORIGIN)
+
+
+def test_a_session_of_another_sensor_is_refused(tmp_path):
+    Session.open(tmp_path, ORIGIN).close()
+    with pytest.raises(ValueError, match=r"leds = '0123', but the current settings have '0124'"):
+        Session.open(tmp_path, dataclasses.replace(ORIGIN, leds="0124"))
+    Session.open(tmp_path, ORIGIN).close()  # the lock was released
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("initial/visual.png", lambda data: data[:-20]),
+        ("final/tactile.png", lambda data: data[:100] + bytes([data[100] ^ 1]) + data[101:]),
+        ("final/pair.json", lambda data: data.replace(b"0.2", b"0.3") + b" "),
+        ("confirmed.json", lambda data: data.replace(b"note 0", b"note 1")),
+        ("confirmed.json", lambda data: data[:30]),
+        ("confirmed.json", lambda data: b"[]"),
+        ("initial/tactile.png", None),
+        ("initial/pair.json", None),
+    ],
+)
+def test_damage_is_named_with_the_remedy(tmp_path, name, damage):
+    with Session.open(tmp_path, ORIGIN) as session:
+        add(session)
+        add(session)
+    path = tmp_path / "trajectories/00000" / name
+    if damage is None:
+        path.unlink()
+    else:
+        path.write_bytes(damage(path.read_bytes()))
+    read = hardware.load_recordings(tmp_path)
+    with pytest.raises(_files.TornFileError, match=rf"{path.name}.*discard trajectory 0"):
+        read[0]
+    assert read[1].number == 1
+    hardware.discard_recording(tmp_path, 0)
+    assert len(list(hardware.load_recordings(tmp_path))) == 1
+
+
+def test_folders_that_are_no_session_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no session"):
+        hardware.load_recordings(tmp_path)
+    (tmp_path / "session.json").write_text('{"format": 9}')
+    with pytest.raises(ValueError, match="has format 9, but this version of sts_jax reads format 1"):
+        hardware.list_recordings(tmp_path)
+
+
+def test_a_full_disk_loses_nothing_and_is_reported_before_the_next_trajectory(tmp_path, monkeypatch):
+    write, full = _files.write_folder, []
+
+    def write_folder(path, files):
+        if full:
+            (path.parent / ".x.partial").mkdir(parents=True, exist_ok=True)
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, files)
+
+    monkeypatch.setattr(_files, "write_folder", write_folder)
+    with Session.open(tmp_path, ORIGIN) as session:
+        add(session)
+        full.append(True)
+        number = session.begin()
+        for end in ("initial", "final"):
+            session.save(number, end, pair(number, end))
+        session.confirm(number)
+        until(lambda: session.problem is not None)
+        assert session.confirmed == 1
+        with pytest.raises(SessionError, match=r"3 changes are not on disk yet.*No space left"):
+            session.check_ready()
+        with pytest.raises(SessionError, match=r"not on disk after 0\.1 s: the initial pair of trajectory 1"):
+            session.flush(0.1)
+        full.clear()
+        session.flush()
+        session.check_ready()
+        assert session.confirmed == 2
+    read = hardware.load_recordings(tmp_path)
+    assert_equal(read[1].final, dataclasses.replace(read[1].final))
+    np.testing.assert_array_equal(read[1].final.visual.image, pair(1, "final").visual.image)
+
+
+def test_closing_with_a_full_disk_names_what_is_lost(tmp_path, monkeypatch):
+    def full(path, files):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    session = Session.open(tmp_path, ORIGIN)
+    add(session)
+    monkeypatch.setattr(_files, "write_folder", full)
+    session.save(1, "initial", pair(1, "initial"))
+    with pytest.raises(SessionError, match=r"the initial pair of trajectory 1\. Cause: .*No space left"):
+        session.close(0.1)
+    assert len(list(hardware.load_recordings(tmp_path))) == 1
+    with pytest.raises(SessionError, match="open it again"):
+        session.save(2, "initial", pair(2, "initial"))
+    monkeypatch.undo()
+    Session.open(tmp_path, ORIGIN).close()
+
+
+def test_too_many_waiting_pairs_are_refused_and_too_little_space_is_named(tmp_path, monkeypatch):
+    release = []
+
+    def slow(path, files):
+        until(lambda: release)
+
+    monkeypatch.setattr(_files, "write_folder", slow)
+    monkeypatch.setattr(_files, "flush_folder", lambda path: None)
+    with Session.open(tmp_path, ORIGIN) as session:
+        for number in range(6):
+            session.save(number, "initial", pair(number, "initial"))
+        with pytest.raises(SessionError, match="the disk is too slow: 6 changes"):
+            session.check_ready()
+        with pytest.raises(SessionError, match="the initial pair of trajectory 6 was not accepted"):
+            session.save(6, "initial", pair(6, "initial"))
+        release.append(True)
+        session.flush()
+        monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 1000}))
+        with pytest.raises(SessionError, match="only 0 MB are free"):
+            session.check_ready()
+        with pytest.raises(ValueError, match=r"cannot be confirmed before save\(\) of its final pair"):
+            session.confirm(0)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 300 kB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(folder)]
+    if not sys.platform.startswith("linux") or os.geteuid() != 0 or subprocess.run(command, check=False).returncode:
+        pytest.skip("mounting a small file system needs root")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def test_a_disk_that_is_really_full(small_disk):
+    ballast = small_disk / "ballast"
+    with Session.open(small_disk / "session", ORIGIN) as session:
+        add(session)
+        ballast.write_bytes(bytes(os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize - 16384))
+        number = session.begin()
+        for end in ("initial", "final"):
+            session.save(number, end, pair(number, end))
+        session.confirm(number)
+        until(lambda: session.problem is not None)
+        assert session.confirmed == 1
+        assert standings(small_disk / "session") == {0: "confirmed", 1: "incomplete"}
+        with pytest.raises(SessionError, match="No space left on device"):
+            session.check_ready()
+        ballast.unlink()
+        session.flush()
+        assert session.confirmed == 2
+    assert len([t.final for t in hardware.load_recordings(small_disk / "session")]) == 2
+
+
+def killed(folder, kills, seed):
+    """Kill a writer at random moments. The numbers that it reported, and how many folders a kill left half-written."""
+    moments, reported, partial = random.Random(seed), set(), 0
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    with subprocess.Popen(
+        [sys.executable, session_writer.__file__, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    ) as run:
+        for _ in range(kills):
+            run.stdin.write("start\n")
+            run.stdin.flush()
+            first = run.stdout.readline()
+            assert first.startswith("ready "), f"{first!r} instead of ready. Exit code {run.poll()}"
+            writer = int(first.split()[1])
+            time.sleep(moments.uniform(0, 0.08))
+            os.kill(writer, signal.SIGKILL)
+            while (line := run.stdout.readline()) != "killed\n":
+                reported.add(int(line))
+            partial += len(list(folder.glob("trajectories/*/.*.partial")))
+    return reported, partial
+
+
+def check_killed(folder, reported):
+    read = hardware.load_recordings(folder)
+    assert reported <= set(read.numbers)  # nothing that was confirmed is lost
+    for trajectory in read:
+        for end in ("initial", "final"):
+            found, made = getattr(trajectory, end), pair(trajectory.number, end)
+            np.testing.assert_array_equal(found.visual.image, made.visual.image)
+            np.testing.assert_array_equal(found.tactile.image, made.tactile.image)
+    for folder_of_pair in folder.glob("trajectories/*/[if]*l"):  # initial and final: no half pair, confirmed or not
+        recordings.read_pair(folder_of_pair, 0)
+    Session.open(folder, ORIGIN).close()
+    assert not list(folder.glob("trajectories/*/.*.partial"))
+
+
+def test_killing_the_writer_loses_no_confirmed_pair(tmp_path):
+    reported, _ = killed(tmp_path, 3, 0)
+    check_killed(tmp_path, reported)
+
+
+@pytest.mark.slow
+def test_killing_the_writer_many_times(tmp_path):
+    reported, partial = killed(tmp_path, 40, 1)
+    assert reported
+    assert partial > 0  # some kills came in the middle of a pair
+    check_killed(tmp_path, reported)
