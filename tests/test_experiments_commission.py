@@ -13,7 +13,7 @@ from PIL import Image
 
 import sts_jax as sts
 from benchmarks.instruments.led_peer import Peer
-from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenLights
+from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenController, SeenLights
 from experiments import commission
 from experiments.shared import boards
 from sts_jax import hardware
@@ -49,18 +49,17 @@ class SeenBoards(SeenLights):
     def __init__(self, lights, pictures):
         rng = np.random.default_rng(0)
         self.board, self.pictures = None, pictures
-        self.noise = [rng.integers(0, 5, (HEIGHT, WIDTH, 3), np.uint8) for _ in range(3)]
-        super().__init__(lights, fps=30, lag_s=0.01, exposure_s=0.01)
+        self.noises = [rng.integers(0, 5, (HEIGHT, WIDTH, 3), np.uint8) for _ in range(3)]
+        super().__init__(lights, fps=30, lag_s=0.01, exposure_s=0.01, size=(WIDTH, HEIGHT))
 
     def _frame(self):
         end_s = time.monotonic() - self.lag_s
-        shares, mean = self.lights.shares(end_s - self.exposure_s, end_s)
-        self.shown[self.number] = shares
+        _, mean = self.lights.shares(end_s - self.exposure_s, end_s)
         if self.board is None:
             image = np.full((HEIGHT, WIDTH, 3), DARK + mean * (LIT - DARK), np.uint8)
         else:
             image = self.pictures[self.board]
-        noisy = cv2.add(image, self.noise[self.number % 3])
+        noisy = cv2.add(image, self.noises[self.number % 3])
         return cv2.imencode(".jpg", noisy, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
 
 
@@ -68,10 +67,9 @@ class BoardPeer:
     """Both devices. `url` and `path` are what a host connects to."""
 
     def __init__(self, path, pictures):
-        self.leds = Peer(path)
-        self.leds._now_s = time.monotonic  # the watchdog's clock is real
-        self.leds.controller = type(self.leds.controller)(now_s=time.monotonic())
-        self.camera = SeenBoards(Lights(self.leds.controller), pictures)
+        lights = Lights()
+        self.leds = Peer(path, clock=time.monotonic, make=functools.partial(SeenController, lights))
+        self.camera = SeenBoards(lights, pictures)
         self.path, self.url = str(path), self.camera.url
 
     def stop(self):

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from led_simulator import WAIT_S
 from player import Player
 from session_writer import ORIGIN, pair
 from test_hardware_collecting import check
 
 import sts_jax as sts
 from benchmarks.instruments.camera_server import SIZE
-from benchmarks.instruments.led_peer import WAIT_S
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from experiments import real
 from experiments.shared.page import Page

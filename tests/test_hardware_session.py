@@ -50,7 +50,7 @@ def standings(folder):
 
 def test_reading_returns_what_was_saved(tmp_path):
     saved = {end: pair(0, end) for end in ("initial", "final")}
-    settling = Settling(0.1, 0.2, 30.0)
+    settling = Settling(0.1, 0.2)
     with Session.open(tmp_path, ORIGIN, settling=settling) as session:
         assert session.begin() == 0
         for end, taken in saved.items():
