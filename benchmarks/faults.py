@@ -89,7 +89,7 @@ class Count:
     longest_s: float = 0.0
     limit_s: float = READ_S
     recovered: int = 0
-    recovery_s: float = 0.0  # longest time from the end of a fault to the next pair
+    recovery_s: float = 0.0  # longest time to the next pair, from the end of the read that the fault had hit
     lit_s: float = 0.0  # longest time for which a light was on after the program was killed
 
     def add(self, other: "Count") -> None:
