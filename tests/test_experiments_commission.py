@@ -139,6 +139,7 @@ def hands(peer, monkeypatch, *, stop_at=None):
     return asked
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer, config, monkeypatch, capsys):
     config = dataclasses.replace(config, camera=peer.url)
     peer.folder = config.out / "board"
@@ -373,6 +374,7 @@ class Video:
         pass
 
 
+@pytest.mark.slow
 def test_each_stream_of_a_device_has_its_exposure(peer, config, monkeypatch, capsys):
     device = Video(peer.leds.controller)
     monkeypatch.setattr(capture, "check_source", lambda config: None)

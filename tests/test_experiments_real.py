@@ -84,6 +84,7 @@ def follow(lines, player, until_line=None):
     return seen
 
 
+@pytest.mark.slow
 def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     player = Player(peer)
     common = "--headless", "--automatic", "--count", "3"

@@ -150,6 +150,7 @@ def test_a_full_disk_is_shown_before_the_next_trajectory(peer, sensor, tmp_path,
         check(trajectory, trajectory.number)
 
 
+@pytest.mark.slow
 def test_a_camera_that_returns_interrupts_nothing_confirmed(peer, sensor, tmp_path):
     person = Playing(Player(peer))
     problems = []

@@ -53,6 +53,7 @@ def test_pairs_are_of_the_right_light(peer, sensor):
     assert len(set(numbers)) == len(numbers)  # no frame is returned twice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lag_s", "exposure_s"), [(0.015, 0.002), (0.12, 0.016)])
 def test_measured_settling_covers_lag_and_exposure(tmp_path, lag_s, exposure_s):
     peer = SensorPeer(tmp_path / "leds", lag_s=lag_s, exposure_s=exposure_s)
