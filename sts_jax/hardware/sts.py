@@ -1,5 +1,6 @@
 """`STS`: camera and lights as one sensor. Every image is proven to be of one light."""
 
+import contextlib
 import dataclasses
 import os
 import threading
@@ -27,6 +28,7 @@ Stream = Literal["visual", "tactile"]
 
 _DEPARTED = 0.5  # of the contrast, by which a frame must differ from the last one before the switch
 _AGAIN_S = 1.0  # s, after which a switch that does not show is repeated
+_ATTEMPTS = 3  # to measure the settling
 _SWITCHES = 8  # of each direction, to measure the settling
 _PHASE = 0.618  # of a period, by which the phase of the measured switches advances
 _CHECK_S = 0.1  # s, least time between two questions to the controller while frames show another light
@@ -149,6 +151,7 @@ class STS:
         self._previous: Captured | None = None  # the last frame of the camera
         self._reference: Thumbnail | None = None  # of the last frame before the switch
         self._departed = 0  # successive frames since the switch that show the new light, 2 and more: all are of it
+        self._doubtful = False  # whether the lights may have switched without an answer, so late frames may show it
         self._background: _Background | None = None
         self._stopping = False  # whether the thread in the background is to end
         self.discarded = 0  # frames that could not be proven to be of one light
@@ -408,8 +411,15 @@ class STS:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image still changes at the end of a watch.
+            LightError: The image still changes at the end of a watch, three times in a row.
         """
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(LightError):
+                return self._measured(switches, watch_s)
+        return self._measured(switches, watch_s)
+
+    def _measured(self, switches: int, watch_s: float) -> Settling:
+        """One attempt of `measure_settling`, which a movement or a delay of the computer can spoil."""
         self._lit = None
         period_s = self._period_s()
         self._watched("visual", watch_s)
@@ -480,27 +490,26 @@ class STS:
 
         With `then`, the lights are switched to that stream afterwards, and the answer to this switch is the proof.
         """
-        lost = False
         while True:
             try:
-                if lost and (stream == "tactile" or self._stream != stream):
-                    # The lights went off and on, so late frames may show the former light and then a mixed one. After
-                    # a frame of the other light, all frames that still come are of a single switch.
+                if self._doubtful:
+                    # Late frames may show the former light and then a mixed one. After a frame of the other light, all
+                    # frames that still come are of a single switch.
                     self._frame("visual" if stream == "tactile" else "tactile", deadline, 0.0)
+                    self._doubtful = False
                 before, frame = self._frame(stream, deadline, after_s)
                 until_s = self._proof(before, then)
             except (DisconnectedError, LedTimeoutError):
                 lost_s = time.monotonic()
-                self._lit = None
+                self._lit, self._doubtful = None, True
                 self.leds.reconnect(limit_s=self._reconnect_s)
                 deadline += time.monotonic() - lost_s
-                lost = True
                 continue
             if until_s is not None:
                 self._black[stream], self._looks[stream] = frame.black, thumbnail(frame.image)
                 return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
             self.discarded += 1
-            lost = True
+            self._doubtful = True
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
         """A frame that arrives when the light has settled, and the answer of the controller before it."""
