@@ -1,5 +1,6 @@
 """Figures of predictions, training and simulation, each written to one file."""
 
+from sts_jax.evaluation.figures.comparison import side_by_side
 from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves
 from sts_jax.evaluation.figures.held_out import SAMPLES, calibration, ends, predictions
 from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
@@ -13,6 +14,7 @@ __all__ = [
     "ends",
     "predictions",
     "scaling",
+    "side_by_side",
     "strip",
     "training_curves",
 ]
