@@ -112,9 +112,9 @@ def structural_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 def features(images: np.ndarray) -> np.ndarray:
     """Colours and oriented gradients of images in a grid of 4 x 4 cells, without anything that was learned.
 
-    Each cell has the mean of each colour, and at each of three scales the mean absolute difference of neighbours in four
-    directions (across, down, both diagonals) of the grey image. Brightness, vignetting and colour change the former,
-    noise, blur, edges and texture the latter.
+    Each cell has the mean of each colour, and at each of three scales the mean absolute difference of neighbours of the
+    grey image in four directions: across, down, both diagonals. Brightness, vignetting and colour change the means.
+    Noise, blur, edges and texture change the differences.
 
     Args:
         images: `uint8 (n, height, width, 3)`, at least `LEAST_SIDE` pixels high and wide.
@@ -179,10 +179,7 @@ def energy_distance(
     value, rng = statistic(is_real), np.random.default_rng(seed)
     above = 0
     for _ in range(PERMUTATIONS):
-        if matched:
-            permuted = is_real ^ (rng.random(len(names)) < 0.5)[member]
-        else:
-            permuted = rng.permutation(first)[member]
+        permuted = is_real ^ (rng.random(len(names)) < 0.5)[member] if matched else rng.permutation(first)[member]
         above += statistic(permuted) >= value - 1e-12
     return Distance(value, (1 + above) / (1 + PERMUTATIONS))
 
