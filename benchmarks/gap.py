@@ -10,7 +10,7 @@ for the simulation. Both run on a virtual clock with equal seeds, and their logs
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 
 The table adds one imperfection at a time to the images of the clean session and compares them with the images
-themselves. Two rows have no difference: the two halves of the clean session, and two draws of the device's noise.
+themselves. Two rows have no difference: the two halves of the clean session, and two draws of the twin's noise.
 """
 
 import contextlib
@@ -190,8 +190,9 @@ def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, i
     for visual, tactile in zip(clean.visual, clean.tactile, strict=True):
         ends = blender.ends(visual / np.float32(255), tactile / np.float32(255))
         for light, stream in enumerate(streams):
-            quality = difference.imperfections.jpeg_quality
-            image = photometry.decode(photometry.encode(blender.frame(ends, light), quality))
+            image = blender.frame(ends, light)
+            if (quality := difference.imperfections.jpeg_quality) < CLEAN.jpeg_quality:
+                image = photometry.decode(photometry.encode(image, quality))
             if difference.lens and difference.rectified:
                 stream.append(hardware.rectified(lens, sensor.camera, image, resolution))
             else:
@@ -231,7 +232,7 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
     )
     columns = f"{'MAE':>6s} {'energy':>7s} ({'p':^5s})  accuracy [95 %]  "
     yield f"{'':36s}   {'visual':39s}{'tactile'}"
-    yield f"{'difference':36s}   {columns}   {columns}".rstrip()
+    yield f"{'difference':36s}   {columns} {columns}".rstrip()
     middle = np.unique(clean.group)[len(np.unique(clean.group)) // 2]
     halves = [gap.Streams(*(leaf[part] for leaf in shown)) for part in (clean.group < middle, clean.group >= middle)]
     yield row("none: two halves of the clean session", halves[0], halves[1], matched=False)

@@ -3,10 +3,10 @@
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/twin/dataset
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
-A side is a session of `experiments.real collect`, or a dataset of an experiment on the side of the simulation. Raw
+A side is a session of `experiments.real collect`. The simulated side may also be the dataset of an experiment. Raw
 images are rectified with the lens of the sensor file. Prints differences per pixel, a distance of both distributions in
-a feature space, and the accuracy of a classifier that tells both sides apart. Writes the same text and a figure of pairs
-side by side to `--out`. Takes about a minute for 60 trajectories.
+a feature space, and the accuracy of a classifier that tells both sides apart. Writes the same text and a figure of both
+sides to `--out`. Takes about a minute for 40 trajectories. The classifier needs scikit-learn (`sts_jax[bench]`).
 """
 
 import dataclasses
@@ -39,6 +39,7 @@ class Config:
     match: Literal["number", "none"] = "number"
     # height and width at which images are compared, pixels (default: those of the dataset, or 240 x 320)
     resolution: tuple[int, int] | None = None
+    names: tuple[str, str] = ("real", "simulated")  # of the two sides in the figure
     rows: int = 4  # trajectories in the figure, two rows each
     out: Folder = Path("runs/gap")  # folder for gap.txt and gap.png
     debug: bool = False  # show the traceback of every error
@@ -197,8 +198,9 @@ def written(estimate: gap.Estimate, digits: int) -> str:
     return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 
-def draw(path: Path, real: Side, simulated: Side, *, rows: int, matched: bool) -> None:
+def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
     """Draw the first trajectories."""
+    rows = config.rows
     numbers = np.unique(real.images.group)[:rows]
     others = numbers if matched else np.unique(simulated.images.group)[:rows]
     shown = min(len(numbers), len(others))
@@ -209,7 +211,8 @@ def draw(path: Path, real: Side, simulated: Side, *, rows: int, matched: bool) -
         for end in ("held", "at rest")
     ]
     title = "the same object in the same poses" if matched else "the same object in other poses"
-    figures.side_by_side(path, first, second, labels, matched=matched, title=title)
+    path = config.out / "gap.png"
+    figures.side_by_side(path, first, second, labels, matched=matched, title=title, names=config.names)
 
 
 def main(config: Config) -> None:
@@ -227,7 +230,7 @@ def main(config: Config) -> None:
     text = report(real, simulated, matched=matched)
     print(text)
     _files.write_bytes(config.out / "gap.txt", f"{text}\n".encode())
-    draw(config.out / "gap.png", real, simulated, rows=config.rows, matched=matched)
+    draw(config, real, simulated, matched=matched)
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ def side_by_side(
     """
     rows, kinds = len(labels), 3 if matched else 2
     figure, grid = plt.subplots(
-        rows, 2 * kinds, figsize=(1.75 * 2 * kinds + 1.2, 1.42 * rows + 1.1), squeeze=False, layout="constrained"
+        rows, 2 * kinds, figsize=(1.75 * 2 * kinds + 0.4, 1.36 * rows + 1.3), squeeze=False, layout="constrained"
     )
     for place, stream in enumerate(("visual", "tactile")):
         axes = grid[:, place * kinds : (place + 1) * kinds]
@@ -52,9 +52,9 @@ def side_by_side(
                 axes[row, 2].set_xticks([])
                 axes[row, 2].set_yticks([])
         for axis, name in zip(axes[0], (*names, "difference"), strict=False):
-            axis.set_title(f"{stream}\n{name}", fontsize=10)
+            axis.set_title(f"{stream}:\n{name}", fontsize=10)
         if matched:
-            bar = figure.colorbar(drawn, ax=axes[:, 2], location="bottom", shrink=0.95, aspect=14)
+            bar = figure.colorbar(drawn, ax=axes[:, 2], location="bottom", shrink=0.95, aspect=14, pad=0.02)
             bar.set_label("grey levels of 255", fontsize=8)
             bar.ax.tick_params(labelsize=8)
     for axis, label in zip(grid[:, 0], labels, strict=True):
