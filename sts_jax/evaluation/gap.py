@@ -85,7 +85,7 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
     return PixelErrors(*(_estimate(value, column) for value, column in zip(values, draws.T, strict=True)))
 
 
-def structural_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def structural_similarity(first: np.ndarray, second: np.ndarray) -> float:
     """Structural similarity of two images in a Gaussian window of 11 x 11 pixels, averaged over pixels and channels.
 
     `(2 mx my + c1) (2 sxy + c2) / ((mx^2 + my^2 + c1) (sxx + syy + c2))` with means m, variances and covariance s,
@@ -106,7 +106,7 @@ def structural_similarity(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     sxx, syy, sxy = smooth(x * x) - mx**2, smooth(y * y) - my**2, smooth(x * y) - mx * my
     c1, c2 = _CONSTANTS
     ratio = (2 * mx * my + c1) * (2 * sxy + c2) / ((mx**2 + my**2 + c1) * (sxx + syy + c2))
-    return ratio.mean()
+    return float(ratio.mean())
 
 
 def features(images: np.ndarray) -> np.ndarray:
@@ -224,9 +224,10 @@ def told_apart(
             model = make_pipeline(StandardScaler(), regression).fit(x[fitted], is_real[fitted])
             right[judged] += (model.predict(x[judged]) == is_real[judged]) / REPEATS
 
-    def accuracy(weight: np.ndarray) -> np.ndarray:
+    def accuracy(weight: np.ndarray) -> np.ndarray:  # the mean over both sides
         sides = [weight * is_real, weight * ~is_real]
-        return np.mean([(side * right).sum() / side.sum() if side.sum() else np.nan for side in sides])
+        shares = [(side * right).sum() / side.sum() if side.sum() else np.nan for side in sides]
+        return np.asarray(np.mean(shares))
 
     return _estimate(float(accuracy(np.ones(len(x)))), metrics.bootstrap(group, accuracy))
 
@@ -237,7 +238,7 @@ def _differences(real: np.ndarray, simulated: np.ndarray) -> tuple[float, float,
     return (
         np.abs(difference).mean(),
         (difference**2).mean(),
-        float(structural_similarity(real / 255, simulated / 255)),
+        structural_similarity(real / 255, simulated / 255),
     )
 
 
