@@ -152,7 +152,7 @@ def side_view() -> str:
         f'<rect x="{cx - half:g}" y="{plate:g}" width="{2 * half:g}" height="14" fill="#f6f6f6" stroke="#888" '
         'stroke-dasharray="4 3"/>'
     )
-    parts.append(text(cx - half + 8, plate + 32, "clear stiff plate (thickness not published)", size=13))
+    parts.append(text(cx - half + 8, plate + 32, "clear stiff plate (not described in the paper)", size=13))
     parts.append(text(cx - half + 8, face - 10, "semi-transparent reflective paint", size=13))
     object_box = (
         f"{cx + 60:g},{face - 4:g} {cx + 150:g},{face - 30:g} {cx + 166:g},{face - 78:g} {cx + 76:g},{face - 52:g}"
