@@ -49,7 +49,7 @@ class Args:
     """Options of the command line."""
 
     workdir: Folder = Path("runs/gap-twin")  # for both sessions
-    trajectories: int = 60
+    trajectories: int = 40
     resolution: tuple[int, int] = (240, 320)  # height and width at which images are compared, pixels
     seed: int = 0  # of the object, the trajectories and the noise
     out: Path | None = None  # text file for the table

@@ -1,4 +1,4 @@
-"""The page for builders: its pins are those of the firmware, its arithmetic holds, its drawings are those of the script."""
+"""The page for builders: pins as in the firmware, arithmetic that holds, drawings as the script makes them."""
 
 import importlib.util
 import re
