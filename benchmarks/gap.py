@@ -19,6 +19,7 @@ import datetime
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, Literal
 
 import cv2
 import jax
@@ -67,20 +68,24 @@ def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | Non
 
 def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
     """Both streams of an object at rest, and its pose from the twin's log."""
-    shots, poses = {}, []
-    for stream, levels, light in (("visual", OFF, 0.0), ("tactile", ON, 1.0)):
+    shots, poses = [], []
+    streams: tuple[tuple[Literal["visual", "tactile"], tuple[int, ...], float], ...] = (
+        ("visual", OFF, 0.0),
+        ("tactile", ON, 1.0),
+    )
+    for stream, levels, light in streams:
         before = device.set(levels)
         device.step(SETTLE_S)
         truth, image = device.capture()
         if not truth.lowest == truth.highest == light:
             raise AssertionError(f"the {stream} frame has the light {truth.lowest} to {truth.highest}")
         after = device.ping()
-        shots[stream] = hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s)
+        shots.append(hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s))
         assert truth.pose is not None
         poses.append(truth.pose)
     device.set(OFF)
     assert poses[0] == poses[1], "the object has moved between both streams"
-    return hardware.Pair(shots["visual"], shots["tactile"]), poses[0]
+    return hardware.Pair(*shots), poses[0]
 
 
 def release(device: twin.Twin) -> None:
@@ -159,7 +164,7 @@ class Difference:
     rectified: bool = True  # undo the lens again
 
 
-def levels(field: str, values: tuple[float, ...]) -> list[Difference]:
+def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
     """One imperfection with growing values."""
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 
@@ -227,9 +232,8 @@ def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
         clean: Images of the clean session at the size of the camera.
         resolution: At which images are compared.
     """
-    shown = gap.Streams(
-        *(np.stack([reduced(image, resolution) for image in images]) for images in clean[:2]), clean.group
-    )
+    visual, tactile = (np.stack([reduced(image, resolution) for image in images]) for images in clean[:2])
+    shown = gap.Streams(visual, tactile, clean.group)
     columns = f"{'MAE':>6s} {'energy':>7s} ({'p':^5s})  accuracy [95 %]  "
     yield f"{'':36s}   {'visual':39s}{'tactile'}"
     yield f"{'difference':36s}   {columns} {columns}".rstrip()

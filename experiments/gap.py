@@ -109,8 +109,8 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
 
 def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> Side:
     """A side from images `(n, 2, height, width, 3)` of both ends."""
-    flat = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
-    return Side(gap.Streams(*flat, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
+    visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
+    return Side(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
 
 
 def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
