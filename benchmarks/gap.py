@@ -254,7 +254,9 @@ def main(args: Args) -> None:
         ValueError: An option is out of range.
     """
     if args.trajectories < 2 * gap.FOLDS:
-        raise ValueError(f"trajectories must be >= {2 * gap.FOLDS}, so that both halves can be compared")
+        raise ValueError(
+            f"trajectories must be >= {2 * gap.FOLDS}, so that both halves can be compared, got {args.trajectories}"
+        )
     height, width = args.resolution
     if min(args.resolution) < gap.LEAST_SIDE or not math.isclose(width / height, SIZE[1] / SIZE[0]):
         raise ValueError(f"resolution must be of the aspect {SIZE} and >= {gap.LEAST_SIDE}, got {args.resolution}")
