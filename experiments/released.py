@@ -1,9 +1,9 @@
 """A small camera, held in an unstable pose and let go: from the first moment to the images and the pose at rest.
 
-    python -m experiments.released                    # 15 to 20 minutes on two CPU cores
-    python -m experiments.released --preset long      # at most 150 minutes, can be stopped and started again
+    python -m experiments.released                    # not run to its end yet, as large as experiments.perturbed
+    python -m experiments.released --preset long      # likewise, can be stopped and started again
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
-    python -m experiments.released --preset smoke     # about two minutes, for tests
+    python -m experiments.released --preset smoke     # a few minutes, for tests
     python -m experiments.released --preset paper     # the paper's counts and schedule: hours, a GPU helps
     python -m experiments.released --plan             # seconds per stage, measured on a little of each
 
@@ -43,7 +43,7 @@ LONG = dataclasses.replace(
     state_training=dataclasses.replace(config.STATE_TRAINING, steps=8000),
 )
 SMOKE = config.smoke(DEFAULT)
-PAPER = config.paper(COLLECTION, num_objects=100, num_per_object=5)  # 500 trajectories, as many as the real ones
+PAPER = config.paper(COLLECTION, num_objects=500, num_per_object=1)  # 500 trajectories, as many as the real ones
 PRESETS = {"smoke": SMOKE, "default": DEFAULT, "long": LONG, "paper": PAPER}
 
 if __name__ == "__main__":
