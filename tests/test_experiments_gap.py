@@ -8,7 +8,7 @@ from session_writer import pair
 
 import sts_jax as sts
 from experiments import gap as command
-from sts_jax import hardware
+from sts_jax import dataset, hardware, physics
 
 SIZE = (96, 128)
 
@@ -100,3 +100,21 @@ def test_bad_options_are_refused(folder, tmp_path):
     (tmp_path / "sensor.json").write_text("{}")
     with pytest.raises(hardware.SensorFileError, match="describes no device"):
         command.load(config(folder, folder, tmp_path, sensor=tmp_path))
+
+
+@pytest.mark.slow
+def test_a_dataset_is_compared_without_a_match_at_its_own_resolution(folder, tmp_path, capsys):
+    collection = dataset.Collection(
+        physics.Released(frames=6), categories=("camera",), num_objects=5, num_per_object=1, symmetries=False
+    )
+    dataset.collect(collection, sts.Sensor(), tmp_path / "made")
+    options = command.Config(folder, tmp_path / "made", match="none", out=tmp_path / "out")
+    real, simulated = command.load(options)
+    assert real.images.visual.shape == (14, 64, 64, 3)
+    pairs = dataset.load(tmp_path / "made").pairs(np.array([2]))
+    np.testing.assert_array_equal(simulated.images.visual[4:6], pairs.visual[0])
+    np.testing.assert_array_equal(simulated.images.tactile[4:6], pairs.tactile[0])
+    command.main(options)
+    assert "a dataset of 64 x 64, 5 trajectories" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"resolution is \(96, 128\), but the images of .* have \(64, 64\)"):
+        command.load(dataclasses.replace(options, resolution=SIZE))
