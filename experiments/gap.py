@@ -208,9 +208,9 @@ def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
     labels = [
         f"{'#' + str(number) if matched else 'draw'}\n{end}"
         for number in numbers[:shown]
-        for end in ("held", "at rest")
+        for end in ("initial", "final")
     ]
-    title = "the same object in the same poses" if matched else "the same object in other poses"
+    title = "the same object in the same poses" if matched else "draws of both sides, in other poses"
     path = config.out / "gap.png"
     figures.side_by_side(path, first, second, labels, matched=matched, title=title, names=config.names)
 
