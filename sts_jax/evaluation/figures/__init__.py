@@ -1,9 +1,9 @@
 """Figures of predictions, training and simulation, each written to one file."""
 
-from sts_jax.evaluation.figures.comparison import side_by_side
 from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves
 from sts_jax.evaluation.figures.held_out import SAMPLES, calibration, ends, predictions
 from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
+from sts_jax.evaluation.figures.sides import side_by_side
 
 __all__ = [
     "SAMPLES",
