@@ -1,6 +1,6 @@
 """Evaluation of predictions: metrics per item, tables with intervals, ceilings and figures."""
 
-from sts_jax.evaluation import figures, metrics
+from sts_jax.evaluation import figures, gap, metrics
 from sts_jax.evaluation.catalogue import COLUMNS, METRICS
 from sts_jax.evaluation.outcomes import emptiness, frequency, outcome_of_image, outcome_of_pose, shares
 from sts_jax.evaluation.predictions import TRUE_STATE, Forecaster, Predicted, first, joined, predict, subsets
@@ -35,6 +35,7 @@ __all__ = [
     "frequency",
     "full_table",
     "gain",
+    "gap",
     "joined",
     "metrics",
     "outcome_of_image",

@@ -3,6 +3,7 @@
 from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves
 from sts_jax.evaluation.figures.held_out import SAMPLES, calibration, ends, predictions
 from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
+from sts_jax.evaluation.figures.sides import side_by_side
 
 __all__ = [
     "SAMPLES",
@@ -13,6 +14,7 @@ __all__ = [
     "ends",
     "predictions",
     "scaling",
+    "side_by_side",
     "strip",
     "training_curves",
 ]
