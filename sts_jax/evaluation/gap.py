@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
 from sts_jax.evaluation import metrics
 
@@ -21,9 +20,6 @@ PERMUTATIONS = 999
 FOLDS = 5
 REPEATS = 5  # cross-validations with other folds, which are averaged
 PENALTY = 10.0  # of the classifier's squared weights, for features of unit variance
-_SIGMA = 1.5  # pixels, of the window of the structural similarity
-_RADIUS = 5  # pixels, of the same window
-_CONSTANTS = (0.01**2, 0.03**2)  # of the structural similarity, for values in [0, 1]
 
 
 class Streams(NamedTuple):
@@ -48,7 +44,7 @@ class PixelErrors(NamedTuple):
     mae: Estimate  # mean absolute error
     rmse: Estimate  # root of the mean squared error
     psnr: Estimate  # dB, 20 log10(255 / rmse), infinite for equal images
-    ssim: Estimate  # structural similarity, 1 for equal images
+    ssim: Estimate  # structural similarity (Wang et al. 2004) as OpenCV computes it, 1 for equal images
 
 
 class Distance(NamedTuple):
@@ -83,30 +79,6 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
     draws = metrics.bootstrap(group, summary)
     values = summary(np.ones(len(group)))
     return PixelErrors(*(_estimate(value, column) for value, column in zip(values, draws.T, strict=True)))
-
-
-def structural_similarity(first: np.ndarray, second: np.ndarray) -> float:
-    """Structural similarity of two images in a Gaussian window of 11 x 11 pixels, averaged over pixels and channels.
-
-    `(2 mx my + c1) (2 sxy + c2) / ((mx^2 + my^2 + c1) (sxx + syy + c2))` with means m, variances and covariance s,
-    `c1 = 0.01^2` and `c2 = 0.03^2`. Windows that leave the image are mirrored at its border.
-
-    Args:
-        first: Values in [0, 1], `(height, width, 3)`.
-        second: Same shape.
-
-    Source: Wang et al. (2004), Image quality assessment: from error visibility to structural similarity.
-    """
-
-    def smooth(values: np.ndarray) -> np.ndarray:
-        return ndimage.gaussian_filter(values, (_SIGMA, _SIGMA, 0), radius=(_RADIUS, _RADIUS, 0), mode="mirror")
-
-    x, y = first.astype(np.float64), second.astype(np.float64)
-    mx, my = smooth(x), smooth(y)
-    sxx, syy, sxy = smooth(x * x) - mx**2, smooth(y * y) - my**2, smooth(x * y) - mx * my
-    c1, c2 = _CONSTANTS
-    ratio = (2 * mx * my + c1) * (2 * sxy + c2) / ((mx**2 + my**2 + c1) * (sxx + syy + c2))
-    return float(ratio.mean())
 
 
 def features(images: np.ndarray) -> np.ndarray:
@@ -241,7 +213,7 @@ def _differences(real: np.ndarray, simulated: np.ndarray) -> tuple[float, float,
     return (
         np.abs(difference).mean(),
         (difference**2).mean(),
-        structural_similarity(real / 255, simulated / 255),
+        float(np.mean(cv2.quality.QualitySSIM_compute(real, simulated)[0][:3])),  # type: ignore[attr-defined]
     )
 
 
