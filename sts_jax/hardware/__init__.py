@@ -62,6 +62,7 @@ from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, Wr
 from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
 from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
+from sts_jax.hardware.views import Moments, SensorView, moments, sensor_view
 
 __all__ = [
     "STS",
@@ -102,6 +103,7 @@ __all__ = [
     "Lens",
     "LightError",
     "Lit",
+    "Moments",
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
@@ -116,6 +118,7 @@ __all__ = [
     "RecordedTrajectory",
     "Recordings",
     "SensorFileError",
+    "SensorView",
     "Session",
     "SessionError",
     "Settling",
@@ -145,10 +148,12 @@ __all__ = [
     "known_pad",
     "list_recordings",
     "load_recordings",
+    "moments",
     "project",
     "rectification",
     "rectified",
     "restore_recording",
     "save_board",
+    "sensor_view",
     "view_angle",
 ]

@@ -93,6 +93,12 @@ class Recordings:
     def __len__(self) -> int:
         return len(self.numbers)
 
+    @property
+    def identity(self) -> str:
+        """SHA-256 of the checksums of all confirmed trajectories. It changes if one is added, discarded or replaced."""
+        files = {number: trajectory_folder(self.folder, number) / CONFIRMED for number in self.numbers}
+        return _files.digest({str(number): _files.sha256(file) for number, file in files.items()})
+
     def __getitem__(self, index: int) -> RecordedTrajectory:
         """The trajectory at an index, which is not its number.
 

@@ -1,0 +1,89 @@
+"""Raw images of the real sensor as the views that a `Predictor` and a training take."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from sts_jax.hardware.lens import Lens, Pinhole, rectified
+from sts_jax.hardware.recordings import Recordings
+from sts_jax.hardware.sts import Pair
+
+Progress = Callable[[int, int], None]  # takes the trajectories that were read, and their number
+
+
+class SensorView(NamedTuple):
+    """Both streams of one moment in the view of the sensor's pinhole, as `Predictor` takes them."""
+
+    visual: Float[np.ndarray, "height width 3"]  # RGB, float32 in [0, 1]
+    tactile: Float[np.ndarray, "height width 3"]  # RGB, float32 in [0, 1]
+
+
+class Moments(NamedTuple):
+    """First and last moments of recorded trajectories in the view of the sensor's pinhole."""
+
+    visual: UInt8[np.ndarray, "n 2 height width 3"]  # RGB: initial, final
+    tactile: UInt8[np.ndarray, "n 2 height width 3"]  # RGB: initial, final
+    number: Int[np.ndarray, "n"]  # of the trajectory in its session
+
+
+def sensor_view(lens: Lens, pinhole: Pinhole, pair: Pair, resolution: tuple[int, int] = (64, 64)) -> SensorView:
+    """Rectify a raw pair, so that `predictor(**sensor_view(...)._asdict())` predicts from it.
+
+    Args:
+        lens: the lens of the camera, `Device.lens`.
+        pinhole: the view of the sensor, `Sensor.camera`.
+        pair: raw images, from `STS.read` or a recording.
+        resolution: (height, width) of the view, `Predictor.preprocessing.resolution`. Each pixel is the mean of the raw
+            image over its area.
+
+    Raises:
+        ValueError: an image has another size than the lens, see `rectified`.
+    """
+    images = (rectified(lens, pinhole, shot.image, resolution) for shot in (pair.visual, pair.tactile))
+    return SensorView(*(image.astype(np.float32) / 255 for image in images))
+
+
+def moments(
+    recordings: Recordings,
+    lens: Lens,
+    pinhole: Pinhole,
+    resolution: tuple[int, int] = (64, 64),
+    *,
+    progress: Progress | None = None,
+) -> Moments:
+    """Read and rectify all confirmed trajectories, one at a time.
+
+    Args:
+        recordings: the trajectories, from `load_recordings`.
+        lens: the lens of the camera, `Device.lens`.
+        pinhole: the view of the sensor, `Sensor.camera`.
+        resolution: (height, width) of the views (pixels).
+        progress: called after each trajectory.
+
+    Raises:
+        ValueError: there is no confirmed trajectory, or the images have another size than the lens.
+        TornFileError: a file is missing or damaged.
+    """
+    width, height = recordings.session["width"], recordings.session["height"]
+    if (width, height) != (lens.width, lens.height):
+        raise ValueError(
+            f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
+            f"{lens.width}x{lens.height}: give the sensor file of the device that collected them"
+        )
+    count, done = len(recordings), 0
+
+    def convert(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
+        nonlocal done
+        done += 1
+        if progress is not None and done % 4 == 0:  # images of a trajectory
+            progress(done // 4, count)
+        return rectified(lens, pinhole, image, resolution)
+
+    images = recordings.images(convert)
+    return Moments(
+        np.stack([images.initial_visual, images.final_visual], axis=1),
+        np.stack([images.initial_tactile, images.final_tactile], axis=1),
+        np.array(recordings.numbers),
+    )
