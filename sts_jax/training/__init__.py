@@ -16,6 +16,7 @@ from sts_jax.training.preprocess import (
     save_blank,
     touch_of_noisy_images,
 )
+from sts_jax.training.shifts import shifted
 from sts_jax.training.trajectories import (
     image_moments,
     moments,
@@ -50,6 +51,7 @@ __all__ = [
     "save_blank",
     "save_calibration",
     "seal",
+    "shifted",
     "state_codes",
     "state_model",
     "state_moments",
