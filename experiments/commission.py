@@ -341,8 +341,6 @@ if __name__ == "__main__":
     try:
         with errors.on_one_line():
             main(arguments)
-    except (hardware.CameraError, hardware.LightError, hardware.NoContrastError) as error:
-        raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
         number = len(list((arguments.out / "board").glob("*.png")))
         raise SystemExit(f"interrupted: {number} pictures of the board are kept for the same command") from None
