@@ -1,4 +1,9 @@
-"""Collect trajectories of the real sensor, and review them.
+"""Learn from trajectories of the real sensor, or of its digital twin: the paper's Table 2. Collect and review them.
+
+    python -m experiments.real                    # 100 trajectories of the twin, if there are none: about 15 minutes
+    python -m experiments.real --preset paper     # 500 at 1640x1232 and the paper's schedule. Prints its time first
+    python -m experiments.real --preset smoke     # a little of everything, for tests
+    python -m experiments.real --plan             # seconds per stage, measured on a little of each
 
     python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # opens a page for the browser
     python -m experiments.real collect --sensor runs/commission/sensor.json --leds /dev/ttyACM0 --count 500
@@ -7,30 +12,75 @@
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17
 
+Without a sub-command, it is `train`: VAE visual, VAE tactile and MVAE without pose learn to predict the resting images
+from those of the held object, on the trajectories in `WORKDIR/dataset`. Results go to `WORKDIR/table2`. Trajectories of
+a device are never mixed with those of the twin.
+
 `collect` guides a person through trajectories: place the object in an unstable pose, hold it, release it, wait until it
 rests. The initial and the final pair of images are saved as they happen, raw and uncropped, into `WORKDIR/dataset`. An
 interruption loses nothing that was confirmed. The same command continues with the next number.
 """
 
+import argparse
+import dataclasses
 import signal
+import sys
 import warnings
+from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
 
 from experiments.shared import errors
 from experiments.shared.collecting import Collect, collect
+from experiments.shared.recorded import Config
 from experiments.shared.reviewing import Review, review
+from experiments.shared.table2_command import Train, learn
+from sts_jax.training import TrainConfig
+
+DEFAULT = Config(
+    training=TrainConfig(batch_size=16, learning_rate=1e-3, schedule="cosine"),
+    steps=(600, 600, 600),
+)
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    training=dataclasses.replace(DEFAULT.training, batch_size=4, log_every=1, checkpoint_every=2),
+    steps=(2, 2, 2),
+    count=5,
+    size=(160, 120),
+    shifts=1,
+)
+PAPER = Config(TrainConfig(), count=500, size=(1640, 1232), targets="own", rest=False, shifts=0)
+PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
 
-def main(config: Collect | Review) -> None:
+def parse(words: Sequence[str]) -> Train | Collect | Review:
+    """Read the options. Without a sub-command, they are those of `train`."""
+    if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
+        words = ["train", *words]
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", nargs="?")
+    preset = PRESETS.get(first.parse_known_args(list(words))[0].preset, DEFAULT)  # tyro reports an unknown name
+    return tyro.cli(
+        Annotated[Train, tyro.conf.subcommand("train", default=Train(preset))]
+        | Annotated[Collect, tyro.conf.subcommand("collect")]
+        | Annotated[Review, tyro.conf.subcommand("review")],
+        args=words,
+        description=__doc__,
+    )
+
+
+def main(config: Train | Collect | Review) -> None:
     """Run a sub-command, with errors on one line."""
     with errors.on_one_line(debug=config.debug):
         try:
-            if isinstance(config, Collect):
-                collect(config)
-            else:
-                review(config)
+            match config:
+                case Train():
+                    learn(config)
+                case Collect():
+                    collect(config)
+                case Review():
+                    review(config)
         except KeyboardInterrupt:
             raise SystemExit("stopped") from None
 
@@ -42,9 +92,4 @@ def _terminated(*_: object) -> None:
 if __name__ == "__main__":
     signal.signal(signal.SIGTERM, _terminated)
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
-    main(
-        tyro.cli(
-            Annotated[Collect, tyro.conf.subcommand("collect")] | Annotated[Review, tyro.conf.subcommand("review")],
-            description=__doc__,
-        )
-    )
+    main(parse(sys.argv[1:]))

@@ -1,4 +1,4 @@
-"""Learning from recorded trajectories, the paper's Table 2: reading, training arrays, and the training of its models."""
+"""Learning from recorded trajectories: reading, training arrays, and the training of the models of Table 2."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -23,6 +23,8 @@ class Config:
     """How the models of Table 2 are trained and evaluated."""
 
     training: TrainConfig
+    count: int = 100  # trajectories that the digital twin collects if the work directory has none of a device
+    size: tuple[int, int] = (640, 480)  # width and height of the twin's images, pixels
     steps: tuple[int, int, int] | None = None  # gradient steps of the three models (None: training.epochs decides)
     # a subset of modalities is trained to predict all targets, or its own (paper)
     targets: Literal["all", "own"] = "all"
@@ -43,7 +45,7 @@ class Recorded(NamedTuple):
     validation: hardware.Moments
     empty: dict[str, np.ndarray]  # by stream, uint8 (size, size, 3)
     identity: str  # of the trajectories and the sensor file
-    origin: str  # the camera, in words
+    source: str  # of the images, for titles
 
 
 def check(config: Config) -> None:
@@ -59,6 +61,8 @@ def check(config: Config) -> None:
             f"shifts must be >= 0 and largest_shift in [0, {config.image_size}) pixels, got {config.shifts} and "
             f"{config.largest_shift}"
         )
+    if config.count < LEAST:
+        raise ValueError(f"count must be >= {LEAST}, got {config.count}")
     if config.num_shown < 1:
         raise ValueError(f"num_shown must be >= 1, got {config.num_shown}")
     training.paper_model(("visual",), training.Preprocessing((config.image_size, config.image_size)))  # size fits
@@ -97,7 +101,26 @@ def read(config: Config, workdir: Path) -> Recorded:
     train, validation = (
         hardware.Moments(*(leaf[np.sort(rows)] for leaf in found)) for rows in (order[:cut], order[cut:])
     )
-    return Recorded(train, validation, empty, identity(workdir, recordings), str(recordings.session["camera"]))
+    source = "a digital twin" if is_twin(recordings) else f"the sensor {recordings.session['camera']}"
+    return Recorded(train, validation, empty, identity(workdir, recordings), source)
+
+
+def is_twin(recordings: hardware.Recordings) -> bool:
+    """Whether the trajectories are of a digital twin, whose LED controller has a serial number of its own kind."""
+    return str(recordings.session["leds"]).startswith("TWIN")
+
+
+def missing(config: Config, workdir: Path) -> int:
+    """The number of trajectories that the twin has to collect: none if there are some of a device."""
+    if not (workdir / "dataset" / "session.json").exists():
+        return config.count
+    recordings = hardware.load_recordings(workdir / "dataset")
+    return max(config.count - len(recordings), 0) if is_twin(recordings) else 0
+
+
+def samples(config: Config, count: int) -> int:
+    """The number of training samples of some trajectories."""
+    return round((1 - config.held_out) * count) * (1 + config.shifts) * (2 if config.rest else 1)
 
 
 def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:

@@ -12,15 +12,14 @@ from experiments.shared.config import TITLES
 from experiments.shared.judging import read_log
 from experiments.shared.progress import say
 from experiments.shared.recorded import NAMES, Config, Recorded
-from sts_jax import _files, evaluation, training
+from sts_jax import _files, evaluation
 from sts_jax.evaluation import Predicted
 
-PAPER = {"vae-visual": (3532, None), "vae-tactile": (None, 2872), "mvae-without-pose": (3509, 2819)}  # BCE x 1e-4
 MVAE = "mvae-without-pose"
 FLOOR = "the truth itself (entropy)"
 
 
-def evaluate(config: Config, data: Recorded, folder: Path, source: str) -> str:
+def evaluate(config: Config, data: Recorded, folder: Path) -> str:
     """Judge the models on the validation trajectories and return the table.
 
     Writes `metrics.json`, `table.md` and `figures/`. Nothing is done again while the checksums in `metrics.json` hold.
@@ -29,7 +28,6 @@ def evaluate(config: Config, data: Recorded, folder: Path, source: str) -> str:
         config: The experiment.
         data: The trajectories.
         folder: The folder of the results.
-        source: The origin of the trajectories, for titles.
     """
     done, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
@@ -46,20 +44,18 @@ def evaluate(config: Config, data: Recorded, folder: Path, source: str) -> str:
     )
     logs = {TITLES[name]: read_log(path) for name, path in models.items()}
     figures = [folder / "figures" / name for name in ("predictions.png", "training.png")]
-    draw(config, data, predicted, figures[0], source)
+    draw(config, data, predicted, figures[0])
     evaluation.figures.training_curves(figures[1], logs)
-    text = as_table(config, data, summary, logs, source)
+    text = as_table(config, data, summary, logs)
     _files.write_bytes(table, text.encode())
-    results.write(done, {"source": source, **summary}, inputs, [table, *figures])
+    results.write(done, {"source": data.source, **summary}, inputs, [table, *figures])
     return text
 
 
 def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predicted]:
     """The predictions of each model from all its inputs, and those of the MVAE from each of them, by title."""
     found = {}
-    first = {
-        stream: getattr(data.validation, stream)[:, 0].astype(np.float32) / 255 for stream in evaluation.STREAMS
-    }
+    first = {stream: getattr(data.validation, stream)[:, 0].astype(np.float32) / 255 for stream in evaluation.STREAMS}
     for name, path in models.items():
         predictor = sts.Predictor.load(path)
         for given, subset in evaluation.subsets(predictor.modalities).items():
@@ -69,10 +65,11 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
     return found
 
 
-def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path, source: str) -> None:
+def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path) -> None:
     """Draw the first validation trajectories: both inputs, and each stream's truth beside its predictions."""
     shown = slice(config.num_shown)
     held = data.validation
+    labels = [f"#{number}" for number in held.number[shown]]
     both = predicted[TITLES[MVAE]]
 
     def images(stream: str, moment: int) -> np.ndarray:
@@ -94,13 +91,13 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
     evaluation.figures.comparison(
         path,
         groups,
-        [f"#{number}" for number in held.number[shown]],
-        title=f"{source}: the first {len(held.number[shown])} of {len(held.number)} validation trajectories",
+        labels,
+        title=f"Images of {data.source}: the first {len(labels)} of {len(held.number)} validation trajectories",
         heads=("held, the input", "at rest, visual", "at rest, tactile"),
     )
 
 
-def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]], source: str) -> str:
+def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]]) -> str:
     """The table in Markdown."""
     names = [FLOOR, *dict.fromkeys(name for own in summary.values() for name in own["predictors"])]
     heads = ["predictor"]
@@ -127,7 +124,7 @@ def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, l
     steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
     return "\n".join(
         [
-            f"# Table 2: the resting state predicted from the held one, on images of {source}",
+            f"# Table 2: the resting state predicted from the held one, on images of {data.source}",
             "",
             f"{sum(num)} trajectories, {num[0]} for training and {num[1]} for validation. Whole pad at "
             f"{config.image_size}x{config.image_size}. In brackets: 95 % intervals, bootstrapped over validation "

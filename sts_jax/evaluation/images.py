@@ -1,7 +1,7 @@
 """The images of both streams at rest, judged without poses: for recordings of a real sensor."""
 
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from sts_jax.evaluation.reference import CONSTANT, COPY, NEIGHBOUR
 STREAMS = ("visual", "tactile")
 
 
+@runtime_checkable
 class Streams(Protocol):
     """First and last images of some trajectories, such as `hardware.Moments` or `dataset.Pairs`."""
 
@@ -52,7 +53,7 @@ def image_summary(
         seed: Seed of the draws.
 
     Returns:
-        By stream: `floor`, the smallest possible cross-entropy (the entropy of the true images), and `predictors`. Those
+        By stream: `floor`, the smallest possible cross-entropy (the entropy of the true images), and `predictors`. They
         have by name `bce` (nats per pixel and channel), and the skills `skill` against the mean training image and
         `skill_copy` against the copy of the input. Each is a dictionary of `value`, `low` and `high`.
 

@@ -10,9 +10,9 @@ def shifted(
     """Move trajectories over the pad, which is the same everywhere and lies flat.
 
     The difference from the image of the empty pad moves, and the light of the empty pad, which is not the same
-    everywhere, stays. This is exact for a contact and for the outline on the pad under far lights. A point at the height
-    h above the pad should move by the share d / (d + h) of the shift only, where d is the distance of the camera. An
-    object that the edge of the view cuts off remains cut off where it moves inwards.
+    everywhere, stays. This is exact for points on the pad under far lights. A point at the height h above the pad
+    should move by the share d / (d + h) of the shift only, where d is the distance of the camera. An object that the
+    edge of the view cuts off remains cut off where it moves inwards.
 
     Args:
         images: First and last images of one stream.
