@@ -25,7 +25,7 @@ def drawn(place, colour, noise=None):
 
 def raw(view):
     """The raw image of a camera that sees a view."""
-    return hardware.distorted(LENS, sts.Sensor().camera, view, outside=0.0)
+    return hardware.distorted(LENS, sts.Sensor().camera, view, outside=170.0)
 
 
 def pair(visual, tactile):
