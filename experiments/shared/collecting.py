@@ -151,7 +151,3 @@ class AutomaticPage(AutomaticPerson):
     def action(self) -> hardware.Action | None:
         """The action of a button, or else the automatic one."""
         return self._page.action() or super().action()
-
-
-def collect_twin(workdir: Path, count: int, size: tuple[int, int]) -> None:
-    raise NotImplementedError
