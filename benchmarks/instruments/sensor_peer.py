@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.instruments.camera_server import SIZE, Image, MotionJpeg, draw, jpeg, number_of
 from benchmarks.instruments.led_peer import Peer
+from benchmarks.instruments.shown import Shown
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 
@@ -161,3 +162,15 @@ class SensorPeer:
         """Unplug both devices."""
         self.camera.stop()
         self.leds.vanish()
+
+    def shown(self) -> dict[int, Shown]:
+        """The light of each frame, by `key` of its image."""
+        return {
+            number: Shown(number, min(exposure.shares), max(exposure.shares))
+            for number, exposure in self.camera.log.items()
+        }
+
+
+def key(image: Image) -> int:
+    """The number of the frame that an image shows, from its corner."""
+    return number_of(image[:CORNER, :CORNER])
