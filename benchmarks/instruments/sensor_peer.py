@@ -73,6 +73,7 @@ class Exposure:
     """One frame as the camera took it."""
 
     shares: list[float]  # shares of the light that occurred during it. A frame of one light has one
+    mean: float  # their mean
     start_s: float  # on `time.monotonic`
     end_s: float
 
@@ -98,7 +99,7 @@ class SeenLights(MotionJpeg):
             return super()._frame()
         end_s = time.monotonic() - self.lag_s
         shares, mean = self.lights.shares(end_s - self.exposure_s, end_s)
-        self.log[self.number] = Exposure(shares, end_s - self.exposure_s, end_s)
+        self.log[self.number] = Exposure(shares, mean, end_s - self.exposure_s, end_s)
         width, height = self.size
         image = np.full((height, width, 3), DARK if self.blind else DARK + mean * (LIT - DARK), np.uint8)
         if self.numbered:
@@ -165,10 +166,7 @@ class SensorPeer:
 
     def shown(self) -> dict[int, Shown]:
         """The light of each frame, by `key` of its image."""
-        return {
-            number: Shown(number, min(exposure.shares), max(exposure.shares))
-            for number, exposure in self.camera.log.items()
-        }
+        return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 
 def key(image: Image) -> int:

@@ -55,10 +55,7 @@ class TwinPeer:
         """The light of each frame, by `key` of its image."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
-        return {
-            key(photometry.decode(_START + part)): Shown(frame.index, frame.lowest, frame.highest)
-            for part, frame in frames
-        }
+        return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}
 
 
 def key(image: UInt8[np.ndarray, "height width 3"]) -> int:
