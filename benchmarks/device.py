@@ -7,9 +7,10 @@
 
 A controller on a pseudo-terminal and a camera on loopback, in a process of their own, stand for the devices. Their
 images are flat (`instruments/sensor_peer.py`), or with `--twin` those of the digital twin (`instruments/twin_peer.py`),
-whose object is held or released after every ten pairs. The pairs are shared between several lags, which is the time from the
-end of a frame's exposure to its sending. `hardware.STS` measures the settling times itself. The camera's log of each
-frame decides which light an image shows, never the host's label.
+whose object is held or released after every ten pairs. The pairs are shared between several lags, which is the time
+from the end of a frame's exposure to its sending. `hardware.STS` measures the settling times itself. The camera's log
+of each frame decides which light an image shows, never the host's label. An image is of a wrong or mixed light if the
+mean light of its exposure differs from the wanted one by more than 0.1 %.
 
 The limit of the camera is one pair in two frame periods and the settling time. A pair has one switch, and the two
 directions alternate, so the settling time is the mean of both.

@@ -3,6 +3,7 @@
     python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # opens a page for the browser
     python -m experiments.real collect --sensor runs/commission/sensor.json --leds /dev/ttyACM0 --count 500
     python -m experiments.real collect --camera http://127.0.0.1:8080/video --leds PATH --headless --automatic
+    python -m experiments.real collect --twin --count 100   # the digital twin, on a virtual clock
     python -m experiments.real review                       # lists the trajectories
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17

@@ -113,11 +113,14 @@ class VirtualSensor:
     def _measured(self) -> Settling:
         """The settling times, from frames after switches at several phases of the exposure."""
         period_s = 1 / self._twin.rate
-        on, off = [], []
+        on: list[Switch] = []
+        off: list[Switch] = []
         for number in range(_SWITCHES):
-            for stream, switches in (("tactile", on), ("visual", off)):
-                self._twin.step(period_s * (_PHASE * number % 1))  # a watch ends just after a frame
-                switches.append(self._watched(stream))
+            phase_s = period_s * (_PHASE * number % 1)  # a watch ends just after a frame
+            self._twin.step(phase_s)
+            on.append(self._watched("tactile"))
+            self._twin.step(phase_s)
+            off.append(self._watched("visual"))
         return settling(on, off, period_s)
 
     def _watched(self, stream: Stream) -> Switch:
