@@ -19,6 +19,7 @@ from typing import Annotated
 
 import tyro
 
+import sts_jax as sts
 from experiments.shared import errors
 from experiments.shared.collecting import Collect, collect
 from experiments.shared.reviewing import Review, review
@@ -41,6 +42,7 @@ def _terminated(*_: object) -> None:
 
 
 if __name__ == "__main__":
+    sts.enable_compilation_cache()
     signal.signal(signal.SIGTERM, _terminated)
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
     main(

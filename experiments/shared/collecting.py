@@ -24,9 +24,8 @@ class Collect:
     twin: bool = False  # the digital twin on a virtual clock instead of devices, without a page or a person
     seed: int = 0  # of the twin's object and trajectories
     sensor: Path | None = None  # sensor file of the commissioning, with its camera, levels, settling and backgrounds
-    size: tuple[int, int] | None = (
-        None  # width and height, pixels (default: of the sensor file, of the twin 640 x 480, or 1640 x 1232)
-    )
+    # width and height, pixels (default: of the sensor file, 640 x 480 of the twin, or 1640 x 1232)
+    size: tuple[int, int] | None = None
     fourcc: str | None = None  # pixel format of a device, such as MJPG
     lock: bool = True  # lock exposure and white balance
     levels: tuple[int, int, int, int] | None = None  # of the LED channels (default: of the sensor file, or 255)

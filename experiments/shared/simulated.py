@@ -54,7 +54,7 @@ class Hand(twin.Hand):
     def show(self, view: View) -> None:
         """Act in a new stage, and show the number of confirmed trajectories."""
         super().show(view)
-        self._bar("collect", min(view.confirmed, self._count), self._count)
+        self._bar("collect", view.confirmed, self._count)
 
 
 def collect(config: Simulated) -> None:
@@ -90,6 +90,7 @@ def collect(config: Simulated) -> None:
                 count=config.count,
                 note=config.note,
             )
+            bar("collect", config.count, config.count)
 
 
 def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
