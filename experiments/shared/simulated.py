@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import datetime
 import math
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,11 +51,15 @@ class Hand(twin.Hand):
     def __init__(self, device: twin.Twin, bar: Bar, count: int):
         super().__init__(device)
         self._bar, self._count = bar, count
+        self._problem: str | None = None
 
     def show(self, view: View) -> None:
-        """Act in a new stage, and show the number of confirmed trajectories."""
+        """Act in a new stage, and show the number of confirmed trajectories, or a problem."""
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
+        if view.problem is not None and view.problem != self._problem:
+            say(view.problem)
+        self._problem = view.problem
 
 
 def collect(config: Simulated) -> None:
@@ -80,7 +85,8 @@ def collect(config: Simulated) -> None:
             Bar() as bar,
         ):
             say(f"{session.confirmed} trajectories in {dataset}, which is continued")
-            hardware.collect(
+            begun_s = time.monotonic()
+            number = hardware.collect(
                 sensor,
                 session,
                 Hand(device, bar, config.count),
@@ -91,6 +97,8 @@ def collect(config: Simulated) -> None:
                 note=config.note,
             )
             bar("collect", config.count, config.count)
+        seconds = time.monotonic() - begun_s
+        say(f"{number} trajectories in {seconds:.1f} s, {seconds / number:.2f} s each")
 
 
 def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:

@@ -21,8 +21,8 @@ MOTION_RATE = 10.0  # drawn poses per second of a moving object, up to the size 
 _MOTION_PIXELS = 640 * 480  # a larger view takes longer to render and has proportionally fewer poses, at least 1
 STILL_M = 0.0002  # m, an object whose origin remains within this distance of its last place is still
 STILL_RAD = 0.01  # rad, the same for its orientation
-_BATCH = 4  # trajectories that are simulated at once
-_ATTEMPTS = 8  # batches without a settled trajectory before giving up
+_BATCH = 16  # trajectories that are simulated at once
+_ATTEMPTS = 2  # batches without a settled trajectory before giving up
 _EVENTS = 64  # remembered changes of the scene. Exposures lie at most a few of them back
 _NOWHERE = np.array([0, 0, -1, 1, 0, 0, 0], np.float32)  # pose of an object that is not in view
 
