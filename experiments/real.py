@@ -8,6 +8,7 @@
     python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # opens a page for the browser
     python -m experiments.real collect --sensor runs/commission/sensor.json --leds /dev/ttyACM0 --count 500
     python -m experiments.real collect --camera http://127.0.0.1:8080/video --leds PATH --headless --automatic
+    python -m experiments.real collect --twin --count 100   # the digital twin, on a virtual clock
     python -m experiments.real review                       # lists the trajectories
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17
@@ -31,6 +32,7 @@ from typing import Annotated
 
 import tyro
 
+import sts_jax as sts
 from experiments.shared import errors
 from experiments.shared.collecting import Collect, collect
 from experiments.shared.recorded import Config
@@ -40,7 +42,7 @@ from sts_jax.training import TrainConfig
 
 DEFAULT = Config(
     training=TrainConfig(batch_size=16, learning_rate=1e-3, schedule="cosine"),
-    steps=(600, 600, 600),
+    steps=(300, 300, 300),
 )
 SMOKE = dataclasses.replace(
     DEFAULT,
@@ -90,6 +92,7 @@ def _terminated(*_: object) -> None:
 
 
 if __name__ == "__main__":
+    sts.enable_compilation_cache()
     signal.signal(signal.SIGTERM, _terminated)
     warnings.formatwarning = lambda message, *_, **__: f"note: {message}\n"
     main(parse(sys.argv[1:]))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 import sts_jax as sts
 from sts_jax import geometry, hardware, training
@@ -107,7 +108,7 @@ def test_noise_bright_pixels_and_a_change_of_the_light_are_no_touch_and_a_faint_
 
 
 def test_images_of_another_resolution_and_invalid_fields_are_refused():
-    with pytest.raises(ValueError, match=r"tactile has shape \(2, 32, 32, 3\)"):
+    with pytest.raises((ValueError, TypeCheckError), match="tactile"):
         training.touch_of_noisy_images(training.Preprocessing(), np.zeros((2, 32, 32, 3), np.uint8), BLANK)
     with pytest.raises(ValueError, match="touch_block must divide"):
         training.Preprocessing(touch_block=3)

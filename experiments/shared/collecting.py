@@ -5,11 +5,12 @@ import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
+from experiments.shared import simulated
 from experiments.shared.command import Folder
 from experiments.shared.page import Page
 from experiments.shared.progress import say
 from experiments.shared.terminal import Terminal, single_keys
-from sts_jax import hardware
+from sts_jax import _files, hardware
 from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
 
 
@@ -20,12 +21,15 @@ class Collect:
     workdir: Folder = Path("runs/real")  # the trajectories go to its folder `dataset`
     camera: str | None = None  # device, URL or video file (default: that of the sensor file)
     leds: str | None = None  # its serial port (default: found by the sensor file)
+    twin: bool = False  # the digital twin on a virtual clock instead of devices, without a page or a person
+    seed: int = 0  # of the twin's object and trajectories
     sensor: Path | None = None  # sensor file of the commissioning, with its camera, levels, settling and backgrounds
-    size: tuple[int, int] | None = None  # width and height, pixels (default: of the sensor file, or 1640 x 1232)
+    # width and height, pixels (default: of the sensor file, 640 x 480 of the twin, or 1640 x 1232)
+    size: tuple[int, int] | None = None
     fourcc: str | None = None  # pixel format of a device, such as MJPG
     lock: bool = True  # lock exposure and white balance
     levels: tuple[int, int, int, int] | None = None  # of the LED channels (default: of the sensor file, or 255)
-    count: int | None = None  # stop when the session has as many confirmed trajectories (default: never)
+    count: int | None = None  # stop when the session has as many confirmed trajectories (default: never, twin: 100)
     note: str = ""  # stored with each trajectory, such as the object's name
     headless: bool = False  # in this terminal, without a page
     automatic: bool = False  # confirm every trajectory, and take the pad to be empty at the start
@@ -76,13 +80,18 @@ def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | 
 
 
 def collect(config: Collect) -> None:
-    """Connect, guide, save."""
+    """Connect, guide, save. See `device` and `simulated.collect` for the errors."""
+    if config.twin:
+        simulated.collect(of_twin(config))
+        return
     sensor, empty = device(config)
     with person(config) as someone:
         say("connecting. Keep the pad empty and still")
         with sensor:
             origin = hardware.Origin.of(sensor)
             with hardware.Session.open(config.workdir / "dataset", origin, settling=sensor.settling) as session:
+                if config.sensor is not None:
+                    keep(config.sensor, config.workdir)
                 say(f"{session.confirmed} trajectories in {session.folder}, which is continued")
                 try:
                     hardware.collect(
@@ -103,6 +112,49 @@ def collect(config: Collect) -> None:
             say(
                 f"{counts.frames} frames, of which the computer missed {counts.skipped} and the camera {counts.dropped}"
             )
+
+
+def of_twin(config: Collect) -> simulated.Simulated:
+    """The options that concern the twin.
+
+    Raises:
+        ValueError: An option is out of range, or concerns devices.
+    """
+    devices = {"camera": config.camera, "leds": config.leds, "sensor": config.sensor, "fourcc": config.fourcc}
+    for name, value in devices.items():
+        if value is not None:
+            raise ValueError(f"--{name} is {value}, but --twin has no devices: leave out --{name} or --twin")
+    given = {"count": config.count, "size": config.size, "levels": config.levels}
+    return simulated.Simulated(
+        config.workdir,
+        seed=config.seed,
+        note=config.note,
+        guide=config.guide,
+        **{name: value for name, value in given.items() if value is not None},
+    )
+
+
+def keep(file: Path, workdir: Path) -> None:
+    """Copy a sensor file and its backgrounds into a work directory, or check that those there are the same.
+
+    Raises:
+        ValueError: The work directory has another sensor file.
+        SensorFileError: A sensor file is damaged.
+        OSError: A file cannot be read or written.
+    """
+    file, copy = hardware.sensor_file.sensor_file(file), workdir / hardware.sensor_file.NAME
+    device = hardware.Device.load(file)
+    if copy.exists():
+        if hardware.Device.load(copy) != device:
+            raise ValueError(
+                f"{copy} differs from {file}, so the sensor was commissioned anew: choose another --workdir, because "
+                "all trajectories of a session are rectified with one sensor file"
+            )
+        return
+    for background in (device.background_visual, device.background_tactile):
+        if background is not None:
+            _files.write_bytes(workdir / background.name, file.with_name(background.name).read_bytes())
+    _files.write_bytes(copy, file.read_bytes())
 
 
 @contextlib.contextmanager

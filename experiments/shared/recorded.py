@@ -12,6 +12,7 @@ from experiments.shared import stages
 from experiments.shared.config import MODELS
 from experiments.shared.progress import Bar
 from sts_jax import _files, hardware, training
+from sts_jax.hardware import twin
 from sts_jax.training import TrainConfig
 
 NAMES = ("vae-visual", "vae-tactile", "mvae-without-pose")  # the rows of the paper's Table 2
@@ -111,11 +112,15 @@ def is_twin(recordings: hardware.Recordings) -> bool:
 
 
 def missing(config: Config, workdir: Path) -> int:
-    """The number of trajectories that the twin has to collect: none if there are some of a device."""
-    if not (workdir / "dataset" / "session.json").exists():
+    """The number of trajectories that the twin on its virtual clock has to collect: none if there are some of a device.
+
+    Raises:
+        OSError: `session.json` is damaged.
+    """
+    if not (workdir / "dataset" / hardware.recordings.SESSION).exists():
         return config.count
     recordings = hardware.load_recordings(workdir / "dataset")
-    return max(config.count - len(recordings), 0) if is_twin(recordings) else 0
+    return max(config.count - len(recordings), 0) if recordings.session["camera"] == twin.CAMERA else 0
 
 
 def samples(config: Config, count: int) -> int:

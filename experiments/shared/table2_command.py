@@ -10,12 +10,12 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments.shared import recorded, stages, table2
-from experiments.shared.collecting import collect_twin
+from experiments.shared import recorded, simulated, stages, table2
 from experiments.shared.command import Folder
 from experiments.shared.duration import Line, shown
 from experiments.shared.progress import say
 from experiments.shared.recorded import Config
+from experiments.shared.simulated import Simulated
 from sts_jax import _files
 
 _FEW = 2, recorded.LEAST  # trajectories that are measured: at first, and in all
@@ -75,7 +75,7 @@ def collect(config: Config, workdir: Path) -> None:
     if not count:
         return
     say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
-    collect_twin(workdir, config.count, config.size)
+    simulated.collect(Simulated(workdir, config.count, config.size))
 
 
 def plan(config: Config, missing: int) -> str:
@@ -88,7 +88,7 @@ def plan(config: Config, missing: int) -> str:
     with tempfile.TemporaryDirectory() as name:
         workdir, clock = Path(name), [time.perf_counter()]
         for count in _FEW:
-            collect_twin(workdir, count, config.size)
+            simulated.collect(Simulated(workdir, count, config.size))
             clock.append(time.perf_counter())
         first, rest = np.diff(clock)
         each = rest / (_FEW[1] - _FEW[0])

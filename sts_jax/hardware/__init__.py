@@ -27,7 +27,7 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
-from sts_jax.hardware.collecting import Action, AutomaticPerson, Person, View, collect
+from sts_jax.hardware.collecting import Action, AutomaticPerson, PairReader, Person, View, collect
 from sts_jax.hardware.coverage import check_view, covered, view_angle
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.exposure import Exposed, brightness, choose_exposure
@@ -56,6 +56,7 @@ from sts_jax.hardware.recordings import (
     discard_recording,
     list_recordings,
     load_recordings,
+    next_recording,
     restore_recording,
 )
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
@@ -109,6 +110,7 @@ __all__ = [
     "NotStillError",
     "Origin",
     "Pair",
+    "PairReader",
     "Person",
     "Pinhole",
     "Port",
@@ -149,6 +151,7 @@ __all__ = [
     "list_recordings",
     "load_recordings",
     "moments",
+    "next_recording",
     "project",
     "rectification",
     "rectified",

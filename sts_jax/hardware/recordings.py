@@ -215,9 +215,9 @@ def list_recordings(folder: str | os.PathLike) -> list[Entry]:
     return sorted(entries, key=lambda entry: entry.number)
 
 
-def next_number(folder: Path) -> int:
-    """The number after all that were ever given."""
-    return max((number for _, number, _ in _numbered(folder)), default=-1) + 1
+def next_recording(folder: str | os.PathLike) -> int:
+    """The number of a session's next trajectory, after all that were ever given. 0 if there is no session yet."""
+    return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
 
 
 def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
