@@ -88,7 +88,9 @@ def test_noise_bright_pixels_and_a_change_of_the_light_are_no_touch_and_a_faint_
     random = np.random.default_rng(1)
 
     def taken(change):
-        return np.clip(np.round(BLANK + change + random.normal(0, 4, (40, *BLANK.shape))), 0, 255).astype(np.uint8)
+        return np.clip(np.round(BLANK.astype(float) + change + random.normal(0, 4, (40, *BLANK.shape))), 0, 255).astype(
+            np.uint8
+        )
 
     imprint, bright = np.zeros(BLANK.shape), np.zeros(BLANK.shape)
     imprint[30:36, 10:20] = [-25, 10, 15]

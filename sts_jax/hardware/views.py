@@ -72,18 +72,15 @@ def moments(
             f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
             f"{lens.width}x{lens.height}: give the sensor file of the device that collected them"
         )
-    count, done = len(recordings), 0
-
-    def convert(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-        nonlocal done
-        done += 1
-        if progress is not None and done % 4 == 0:  # images of a trajectory
-            progress(done // 4, count)
-        return rectified(lens, pinhole, image, resolution)
-
-    images = recordings.images(convert)
-    return Moments(
-        np.stack([images.initial_visual, images.final_visual], axis=1),
-        np.stack([images.initial_tactile, images.final_tactile], axis=1),
-        np.array(recordings.numbers),
-    )
+    if not len(recordings):
+        raise ValueError(
+            f"{recordings.folder} has no confirmed trajectory: collect some, or confirm them in the review"
+        )
+    visual, tactile = [], []
+    for done, trajectory in enumerate(recordings, 1):
+        ends = trajectory.initial, trajectory.final
+        visual.append([rectified(lens, pinhole, pair.visual.image, resolution) for pair in ends])
+        tactile.append([rectified(lens, pinhole, pair.tactile.image, resolution) for pair in ends])
+        if progress is not None:
+            progress(done, len(recordings))
+    return Moments(np.array(visual), np.array(tactile), np.array(recordings.numbers))
