@@ -48,6 +48,7 @@ class View:
     final: Pair | None  # of the current trajectory
 
 
+@runtime_checkable
 class PairReader(Protocol):
     """What takes pairs of images: `STS`, or the digital twin's `VirtualSensor`."""
 

@@ -1,7 +1,5 @@
 """`Hand`: the person of a collection whose object is simulated."""
 
-import math
-
 from sts_jax.hardware.collecting import Action, AutomaticPerson, View
 from sts_jax.hardware.guide import Stage
 from sts_jax.hardware.twin.device import Twin
@@ -31,8 +29,8 @@ class Hand(AutomaticPerson):
         super().__init__()
         self._twin = twin
         self._patience_s = patience_s
-        self._since_s = -math.inf  # in the current stage
-        self._now_s = -math.inf
+        self._seen: Stage | None = None  # stage of the last view
+        self._since_s = self._now_s = 0.0  # begin of that stage, and time of the last view
 
     def show(self, view: View) -> None:
         """Send the command of a new stage.
@@ -40,8 +38,8 @@ class Hand(AutomaticPerson):
         Raises:
             ValueError: The guide waits for longer than `patience_s`.
         """
-        entered = view.stage is not self._stage
         super().show(view)
+        entered, self._seen = view.stage is not self._seen, view.stage
         self._now_s = self._twin.now_s
         if entered or view.problem is not None:
             self._since_s = self._now_s
@@ -55,6 +53,6 @@ class Hand(AutomaticPerson):
 
     def action(self) -> Action | None:
         """Confirm in the review, and a release after which nothing moves."""
-        if self._stage is Stage.RELEASE and self._now_s - self._since_s > _UNMOVED_S:
+        if self._seen is Stage.RELEASE and self._now_s - self._since_s > _UNMOVED_S:
             return Action.CONFIRM
         return super().action()
