@@ -61,31 +61,33 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
         for given, subset in evaluation.subsets(predictor.modalities).items():
             out = predictor(**{stream: first[stream] for stream in subset})
             title = TITLES[name] if len(subset) == len(predictor.modalities) else f"{TITLES[name]}, {given} alone"
-            found[title] = Predicted(*(None if x is None else np.asarray(x) for x in (out.visual, out.tactile)))
+            visual, tactile = (None if image is None else np.asarray(image) for image in (out.visual, out.tactile))
+            found[title] = Predicted(visual, tactile)
     return found
 
 
 def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path) -> None:
     """Draw the first validation trajectories: both inputs, and each stream's truth beside its predictions."""
-    shown = slice(config.num_shown)
     held = data.validation
-    labels = [f"#{number}" for number in held.number[shown]]
-    both = predicted[TITLES[MVAE]]
+    labels = [f"#{number}" for number in held.number[: config.num_shown]]
 
-    def images(stream: str, moment: int) -> np.ndarray:
-        return getattr(held, stream)[shown, moment] / 255
+    def truth(stream: str, moment: int) -> np.ndarray:
+        return getattr(held, stream)[: len(labels), moment] / 255
+
+    def guess(name: str, stream: str) -> np.ndarray:
+        return getattr(predicted[TITLES[name]], stream)[: len(labels)]
 
     groups = [
-        {"visual": images("visual", 0), "tactile": images("tactile", 0)},
+        {"visual": truth("visual", 0), "tactile": truth("tactile", 0)},
         {
-            "VAE visual only": predicted[TITLES["vae-visual"]].visual[shown],
-            "MVAE": both.visual[shown],
-            "truth": images("visual", 1),
+            "VAE visual only": guess("vae-visual", "visual"),
+            "MVAE": guess(MVAE, "visual"),
+            "truth": truth("visual", 1),
         },
         {
-            "VAE tactile only": predicted[TITLES["vae-tactile"]].tactile[shown],
-            "MVAE": both.tactile[shown],
-            "truth": images("tactile", 1),
+            "VAE tactile only": guess("vae-tactile", "tactile"),
+            "MVAE": guess(MVAE, "tactile"),
+            "truth": truth("tactile", 1),
         },
     ]
     evaluation.figures.comparison(
