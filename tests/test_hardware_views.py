@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recorded_session import LENS, SQUARE, drawn, pair, raw, record
+from recorded_session import LENS, SQUARE, drawn, raw, record
 
 import sts_jax as sts
 from sts_jax import hardware
@@ -17,7 +17,7 @@ CAMERA = sts.Sensor().camera
 
 def test_a_raw_pair_becomes_the_views_that_it_was_made_from():
     visual, tactile = drawn((10, 20), (60, 60, 60)), drawn((30, 40), (220, 90, 40))
-    found = hardware.sensor_view(LENS, CAMERA, pair(raw(visual), raw(tactile)))
+    found = hardware.sensor_view(LENS, CAMERA, raw(visual), raw(tactile))
     for image, truth in ((found.visual, visual), (found.tactile, tactile)):
         assert image.shape == (64, 64, 3)
         assert image.dtype == np.float32
@@ -67,36 +67,58 @@ def test_images_of_another_size_than_the_lens_are_refused(tmp_path):
         hardware.moments(hardware.load_recordings(tmp_path / "work" / "dataset"), lens, CAMERA)
 
 
+def test_a_view_is_relit_by_the_ratio_of_the_empty_pads():
+    random = np.random.default_rng(0)
+    view, background, empty = (hardware.SensorView(*random.random((2, 8, 8, 3), np.float32)) for _ in range(3))
+    found = hardware.relit(view, background, empty)
+    for own, image, here, there in zip(found, view, background, empty, strict=True):
+        for place in np.ndindex(image.shape):
+            assert own[place] == pytest.approx(
+                min(image[place] * there[place] / max(here[place], 1 / 255), 1), rel=1e-5
+            )
+    for own, there in zip(hardware.relit(background, background, empty), empty, strict=True):
+        lit = (background.visual > 0.1) & (background.tactile > 0.1)
+        np.testing.assert_allclose(own[lit], there[lit], rtol=1e-5)
+    small = hardware.SensorView(*np.zeros((2, 4, 4, 3), np.float32))
+    with pytest.raises(ValueError, match="must be equal"):
+        hardware.relit(view, small, empty)
+
+
 @pytest.mark.slow
 def test_the_view_of_a_twin_is_the_rendering_of_the_pose_and_gives_the_same_prediction():
     height, width = 480, 640
     sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(0), "camera")
     scene = twin.ObjectScene(body, sensor=sensor, resolution=(height, width), motion_rate=0.2)
     lens = hardware.Lens.ideal(width, height)
-    # The simulated sensor has no vignetting and no leakage.
-    flaws = twin.Imperfections(vignetting=0.0, leakage=0.0)
-    shots = []
-    with twin.Twin(scene, imperfections=flaws, warp=twin.lens_warp(lens, sensor.camera, (height, width))) as device:
+    with twin.Twin(scene, warp=twin.lens_warp(lens, sensor.camera, (height, width))) as device:
+
+        def view():
+            images = []
+            for levels in ((0,) * 4, (255,) * 4):
+                device.set(levels)
+                device.step(0.2)
+                exposure, image = device.capture()
+                images.append(image)
+            return exposure.pose, hardware.sensor_view(lens, sensor.camera, *images, (128, 128))
+
+        background = view()[1]
         device.command("hold")
-        for levels in ((0,) * 4, (255,) * 4):
-            device.set(levels)
-            device.step(0.2)
-            shots.append(device.capture())
-    pose = jnp.asarray(shots[0][0].pose)
-    frame = sts.sense(sensor, body, pose, resolution=(128, 128))
-    found = hardware.sensor_view(lens, sensor.camera, pair(*(image for _, image in shots)), (128, 128))
-    inside = np.s_[3:-3, 3:-3]  # beyond the view, a raw pixel is dark
-    difference = np.abs(found.visual - np.asarray(frame.visual))[inside]
-    print(f"visual: mean {255 * difference.mean():.2f}, 99 % below {255 * np.quantile(difference, 0.99):.1f} of 255")
-    assert difference.mean() < 1.5 / 255
-    assert np.quantile(difference, 0.99) < 20 / 255  # outlines
-    wrong = np.abs(found.visual[:, ::-1] - np.asarray(frame.visual))[inside]
-    assert wrong.mean() > 4 * difference.mean()
+        pose, found = view()
+    wrench = jnp.asarray(scene._motion(0).wrench[0])
     predict = sts.Predictor.load("freefall", resolution=(128, 128))
-    own, direct, empty = (
-        np.asarray(predict(visual=image).visual)
-        for image in (found.visual, np.asarray(frame.visual), np.full((128, 128, 3), 0.7, np.float32))
+    frame = sts.sense(sensor, body, jnp.asarray(pose), wrench, resolution=(128, 128))
+    lit = hardware.relit(found, background, hardware.SensorView(**predict.empty))
+    for stream in ("visual", "tactile"):
+        truth, image = np.asarray(getattr(frame, stream)), getattr(lit, stream)
+        difference = 255 * np.abs(image - truth)
+        wrong = 255 * np.abs(image[:, ::-1] - truth)
+        print(f"{stream}: {difference.mean():.2f} of 255 on average, median {np.median(difference):.2f}")
+        assert difference.mean() < 2
+        assert np.median(difference) < 1.5  # noise of the frame and of the background
+        assert wrong.mean() > 1.5 * difference.mean()
+    plain, own, direct = (
+        np.asarray(predict(visual=image).visual) for image in (found.visual, lit.visual, np.asarray(frame.visual))
     )
-    apart, scale = np.abs(own - direct).mean(), np.abs(empty - direct).mean()
-    print(f"predictions: {255 * apart:.2f} of 255 apart, {255 * scale:.2f} from that of a grey image")
-    assert apart < scale / 3
+    apart, without = 255 * np.abs(own - direct).mean(), 255 * np.abs(plain - direct).mean()
+    print(f"predictions: {apart:.2f} of 255 apart, {without:.2f} if the view is not relit")
+    assert apart < without / 3

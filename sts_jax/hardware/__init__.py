@@ -63,7 +63,7 @@ from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, Wr
 from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
 from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
-from sts_jax.hardware.views import Moments, SensorView, moments, sensor_view
+from sts_jax.hardware.views import Moments, SensorView, moments, relit, sensor_view
 
 __all__ = [
     "STS",
@@ -155,6 +155,7 @@ __all__ = [
     "project",
     "rectification",
     "rectified",
+    "relit",
     "restore_recording",
     "save_board",
     "sensor_view",

@@ -8,7 +8,6 @@ from jaxtyping import Float, Int, UInt8
 
 from sts_jax.hardware.lens import Lens, Pinhole, rectified
 from sts_jax.hardware.recordings import Recordings
-from sts_jax.hardware.sts import Pair
 
 Progress = Callable[[int, int], None]  # takes the trajectories that were read, and their number
 
@@ -28,21 +27,53 @@ class Moments(NamedTuple):
     number: Int[np.ndarray, "n"]  # of the trajectory in its session
 
 
-def sensor_view(lens: Lens, pinhole: Pinhole, pair: Pair, resolution: tuple[int, int] = (64, 64)) -> SensorView:
-    """Rectify a raw pair, so that `predictor(**sensor_view(...)._asdict())` predicts from it.
+def sensor_view(
+    lens: Lens,
+    pinhole: Pinhole,
+    visual: UInt8[np.ndarray, "rows columns 3"],
+    tactile: UInt8[np.ndarray, "rows columns 3"],
+    resolution: tuple[int, int] = (64, 64),
+) -> SensorView:
+    """Rectify the two raw images of a pair, or the two backgrounds of a sensor file.
 
     Args:
         lens: the lens of the camera, `Device.lens`.
         pinhole: the view of the sensor, `Sensor.camera`.
-        pair: raw images, from `STS.read` or a recording.
+        visual: raw image, `pair.visual.image` of `STS.read` or of a recording.
+        tactile: raw image.
         resolution: (height, width) of the view, `Predictor.preprocessing.resolution`. Each pixel is the mean of the raw
             image over its area.
 
     Raises:
         ValueError: an image has another size than the lens, see `rectified`.
     """
-    images = (rectified(lens, pinhole, shot.image, resolution) for shot in (pair.visual, pair.tactile))
+    images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
     return SensorView(*(image.astype(np.float32) / 255 for image in images))
+
+
+def relit(view: SensorView, background: SensorView, empty: SensorView) -> SensorView:
+    """A view in the light of another empty pad: each pixel times `empty / background`, at most 1.
+
+    A model that was trained on simulated images, or on another sensor, takes every difference from its empty pad for an
+    object. The vignetting of a camera and its edge of the view are such differences.
+
+    Args:
+        view: the view of a sensor.
+        background: the view of the empty pad of this sensor.
+        empty: the empty pad of the model, `SensorView(**predictor.empty)`.
+
+    Raises:
+        ValueError: the three have not the same resolution.
+    """
+    shapes = {name: own.visual.shape for name, own in (("view", view), ("background", background), ("empty", empty))}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(f"the images have the shapes {shapes}, but they must be equal: give the same resolution")
+    return SensorView(
+        *(
+            np.clip(own * there / np.maximum(here, 1 / 255), 0, 1)
+            for own, here, there in zip(view, background, empty, strict=True)
+        )
+    )
 
 
 def moments(
