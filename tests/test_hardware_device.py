@@ -11,7 +11,7 @@ import pytest
 from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from sts_jax import hardware
-from sts_jax.hardware.settling import Settling, Switch, settling, switched_share
+from sts_jax.hardware.settling import Settling, Switch, settling
 
 SETTLING = Settling(visual_s=0.1, tactile_s=0.1)
 
@@ -79,18 +79,6 @@ def test_settling_time_of_known_switches_is_that_of_the_last_mixed_frame():
     np.testing.assert_allclose((found.tactile_s, found.visual_s), (0.07, 0.071), rtol=1e-5)
     with pytest.raises(hardware.NoContrastError, match="wiring"):
         settling([on], [on], period_s=0.02)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_an_object_that_moves_at_the_switch_is_not_mistaken_for_the_light(share):
-    random = np.random.default_rng(0)
-    dark = random.uniform(60, 180, (24, 32, 3)).astype(np.float32)
-    change = np.full_like(dark, 12)
-    change[:, :8] = 0  # the light reaches three quarters of the view
-    look = dark + share * change + random.normal(0, 0.3, dark.shape).astype(np.float32)
-    look[:, 10:20] -= 100  # an object appears, which changes the mean by far more than the light does
-    assert switched_share(look, dark, change) == pytest.approx(share, abs=0.05)
-    assert switched_share(look, dark, np.zeros_like(change)) == 0
 
 
 @pytest.mark.parametrize("duty", [0.0, 0.25, 0.5, 1.0])

@@ -11,16 +11,7 @@ from sts_jax.hardware.camera_errors import CameraError, CameraLostError
 from sts_jax.hardware.frames import Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError
-from sts_jax.hardware.settling import (
-    Settling,
-    Switch,
-    Thumbnail,
-    check_contrast,
-    difference,
-    settling,
-    switched_share,
-    thumbnail,
-)
+from sts_jax.hardware.settling import Settling, Switch, Thumbnail, check_contrast, difference, settling, thumbnail
 from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
 
 _DEPARTED = 0.5  # of the contrast, by which a frame must differ from the last one before the switch
@@ -63,7 +54,7 @@ class ProvenFrames:
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
         self._settling: Settling | None = None  # in use
         self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
-        self._contrast = 0.0  # of images without and with the light, of 255
+        self._contrast: float | None = None  # of images without and with the light, of 255
         self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
         self._black: dict[Stream, bool] = {}  # whether this image was black
         self._previous: Captured | None = None  # the last frame of the camera
@@ -211,16 +202,14 @@ class ProvenFrames:
     def _shows(self, frame: Captured, stream: Stream) -> bool:
         """Whether the image has changed since the switch by at least half as much as it does with the light.
 
-        Most of the view must have changed as the light changes it, so an object that moves at the switch is no light.
         If the light before is unknown, whether the image is nearer to the last one of its stream than to the other.
         """
         look = thumbnail(frame.image)
+        if self._reference is not None and self._contrast is not None:
+            return difference(look, self._reference) > _DEPARTED * self._contrast
         if len(self._looks) < 2:
             return True
         other: Stream = "tactile" if stream == "visual" else "visual"
-        if self._reference is not None:
-            share = switched_share(look, self._reference, self._looks[stream] - self._looks[other])
-            return share > _DEPARTED and difference(look, self._reference) > _DEPARTED * self._contrast
         return difference(look, self._looks[stream]) < difference(look, self._looks[other])
 
     def _repeats(self, frame: Captured) -> bool:

@@ -76,22 +76,6 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
     return float(((look - dark) * change).sum() / (change**2).sum())
 
 
-def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
-    """The share of a change of the light that an image shows in comparison with an image before the switch.
-
-    It is the median over the blocks on which the light has an effect. An object that moves in less than half of them at
-    the same time has no influence.
-
-    Args:
-        look: The image.
-        before: The image before the switch.
-        change: The difference that the switch makes, from earlier images.
-    """
-    effect = np.abs(change)
-    lit = (effect >= effect.mean()) & (effect > 0)
-    return float(np.median((look - before)[lit] / change[lit])) if lit.any() else 0.0
-
-
 def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
     """The settling times that a number of switches show.
 
