@@ -48,8 +48,8 @@ class Simulated:
 class Hand(twin.Hand):
     """Moves the twin's object, and shows the progress."""
 
-    def __init__(self, device: twin.Twin, bar: Bar, count: int):
-        super().__init__(device)
+    def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
+        super().__init__(device, session)
         self._bar, self._count = bar, count
         self._problem: str | None = None
 
@@ -89,7 +89,7 @@ def collect(config: Simulated) -> None:
             number = hardware.collect(
                 sensor,
                 session,
-                Hand(device, bar, config.count),
+                Hand(device, session, bar, config.count),
                 config=config.guide,
                 empty=empty,
                 trusted=True,
