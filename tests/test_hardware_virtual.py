@@ -175,7 +175,7 @@ def test_the_hand_moves_the_object_as_the_guide_asks(tmp_path):
     collected(scene, tmp_path, 3)
     assert_spots(tmp_path, range(3), scene)
     phases = [phase for _, phase, _ in scene.events[1:]]
-    assert [str(phase) for phase in phases[:6]] == ["empty", "held", "still"] * 2
+    assert [str(phase) for phase in phases[:6]] == ["held", "still", "empty"] * 2
 
 
 def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
@@ -192,6 +192,20 @@ def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
     scene = Spots(first=first)
     collected(scene, tmp_path, 3)
     assert_spots(tmp_path, [0, 2, 3], scene)
+
+
+def test_a_disk_that_is_busy_after_each_trajectory_delays_the_hand_only(tmp_path, monkeypatch):
+    answers = iter(["the disk is too slow"] * 40)  # 8 s, longer than the hand waits for a contact
+
+    def busy(self):
+        if self.confirmed and (problem := next(answers, None)) is not None:
+            raise hardware.SessionError(problem)
+
+    monkeypatch.setattr(hardware.Session, "check_ready", busy)
+    scene = Spots()
+    collected(scene, tmp_path, 2)
+    assert next(answers, None) is None
+    assert_spots(tmp_path, range(2), scene)
 
 
 def test_a_pose_without_contact_is_left_out_with_its_number(tmp_path):

@@ -36,7 +36,8 @@ class Hand(AutomaticPerson):
         self._patience_s = patience_s
         self._seen: Stage | None = None  # stage of the last view
         self._since_s = self._now_s = 0.0  # begin of that stage, and time of the last view
-        self._held_s: float | None = None  # time since which the object is held
+        self._placed = False  # whether the object is on the pad
+        self._held_s: float | None = None  # time since which it is held, without a problem of the session
         self._unseen = 0  # held poses in a row without a contact
 
     def show(self, view: View) -> None:
@@ -50,15 +51,15 @@ class Hand(AutomaticPerson):
         self._now_s = self._twin.now_s
         if entered or view.problem is not None:
             self._since_s = self._now_s
-        if view.problem is not None:
-            return
+        if view.problem is not None and self._held_s is not None:
+            self._held_s = self._now_s
         match view.stage:
-            case Stage.CLEAR if entered:
+            case Stage.CLEAR if self._placed:
                 self._twin.command("clear")
-                self._held_s = None
+                self._placed, self._held_s = False, None
             case Stage.PLACE:
                 self._place()
-            case Stage.RELEASE if entered:
+            case Stage.RELEASE if self._held_s is not None:
                 self._twin.command("release")
                 self._held_s, self._unseen = None, 0
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
@@ -76,7 +77,7 @@ class Hand(AutomaticPerson):
     def _place(self) -> None:
         """Hold the object in the next pose, unless the guide may still see the contact of the current one."""
         if self._held_s is None:
-            self._held_s = self._now_s
+            self._placed, self._held_s = True, self._now_s
             self._twin.command("hold")
         elif self._now_s - self._held_s > _UNSEEN_S:
             self._held_s = self._now_s
