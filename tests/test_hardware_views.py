@@ -101,9 +101,10 @@ def test_the_view_of_a_twin_is_the_rendering_of_the_pose_and_gives_the_same_pred
                 images.append(image)
             return exposure.pose, hardware.sensor_view(lens, sensor.camera, *images, (128, 128))
 
-        background = view()[1]
+        empties = [view()[1] for _ in range(10)]
         device.command("hold")
         pose, found = view()
+    background = hardware.SensorView(*(np.mean(images, axis=0) for images in zip(*empties, strict=True)))
     wrench = jnp.asarray(scene._motion(0).wrench[0])
     predict = sts.Predictor.load("freefall", resolution=(128, 128))
     frame = sts.sense(sensor, body, jnp.asarray(pose), wrench, resolution=(128, 128))

@@ -18,8 +18,8 @@ MOVED = 60  # pixels, between the ends of a trajectory
 class Spots(twin.Scene):
     """A dark spot under both lights. Trajectory n starts in a column of its own, and its object moves to the right."""
 
-    def __init__(self, *, tactile=True, unmoved=(), first=0):
-        self.tactile, self.unmoved = tactile, unmoved
+    def __init__(self, *, unseen=(), unmoved=(), first=0):
+        self.unseen, self.unmoved = unseen, unmoved
         self.events = [(-np.inf, twin.Phase.EMPTY, first - 1)]
 
     @staticmethod
@@ -44,7 +44,7 @@ class Spots(twin.Scene):
         if seen.phase is not twin.Phase.EMPTY:
             column = self.column(seen)
             visual[40:70, column - 12 : column + 12] = 0.1
-            if self.tactile:
+            if seen.trajectory not in self.unseen:
                 tactile[40:70, column - 12 : column + 12] = 0.2
         return blender.ends(visual, tactile)
 
@@ -155,7 +155,7 @@ def collected(scene, folder, count, hand=twin.Hand, **options):
     with twin.Twin(scene, rate=15) as made:
         sensor = twin.VirtualSensor(made)
         with hardware.Session.open(folder, sensor.origin, settling=sensor.settling) as session:
-            person = hand(made, **options)
+            person = hand(made, session, **options)
             hardware.collect(sensor, session, person, config=GUIDE, trusted=True, count=count)
 
 
@@ -175,7 +175,7 @@ def test_the_hand_moves_the_object_as_the_guide_asks(tmp_path):
     collected(scene, tmp_path, 3)
     assert_spots(tmp_path, range(3), scene)
     phases = [phase for _, phase, _ in scene.events[1:]]
-    assert [str(phase) for phase in phases[:6]] == ["empty", "held", "still"] * 2
+    assert [str(phase) for phase in phases[:6]] == ["held", "still", "empty"] * 2
 
 
 def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
@@ -194,8 +194,30 @@ def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
     assert_spots(tmp_path, [0, 2, 3], scene)
 
 
-def test_a_guide_that_sees_no_contact_ends_with_an_error(tmp_path):
-    with pytest.raises(ValueError, match=r"after 5 s \(contact: False, still: True\): the thresholds of the guide"):
-        collected(Spots(tactile=False), tmp_path, 1, patience_s=5.0)
-    with twin.Twin(picture()) as made, pytest.raises(ValueError, match="patience_s must be > 0, got 0"):
-        twin.Hand(made, patience_s=0.0)
+def test_a_disk_that_is_busy_after_each_trajectory_delays_the_hand_only(tmp_path, monkeypatch):
+    answers = iter(["the disk is too slow"] * 40)  # 8 s, longer than the hand waits for a contact
+
+    def busy(self):
+        if self.confirmed and (problem := next(answers, None)) is not None:
+            raise hardware.SessionError(problem)
+
+    monkeypatch.setattr(hardware.Session, "check_ready", busy)
+    scene = Spots()
+    collected(scene, tmp_path, 2)
+    assert next(answers, None) is None
+    assert_spots(tmp_path, range(2), scene)
+
+
+def test_a_pose_without_contact_is_left_out_with_its_number(tmp_path):
+    scene = Spots(unseen=(1,))
+    collected(scene, tmp_path, 3)
+    assert_spots(tmp_path, [0, 2, 3], scene)
+
+
+def test_a_guide_that_waits_for_ever_ends_with_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"Place the object.*\(contact: False, still: True\): its thresholds do not"):
+        collected(Spots(unseen=range(20)), tmp_path / "unseen", 1)
+    with pytest.raises(ValueError, match=r"Take everything.* after 0.\d s .*its thresholds do not suit"):
+        collected(Spots(), tmp_path / "impatient", 1, patience_s=0.1)
+    with pytest.raises(ValueError, match="patience_s must be > 0, got 0"):
+        collected(Spots(), tmp_path / "none", 1, patience_s=0.0)

@@ -19,6 +19,7 @@ from sts_jax.hardware import EmptyPad, GuideConfig, View, twin
 OBJECT = "camera"  # class of the object. The paper releases a small camera
 FIELD_OF_VIEW = 160.0  # degrees across the diagonal of the lens, as of the paper's device
 RATE = 15.0  # frames/s of the camera. The guide needs few, and each one costs time
+WAIT_S = 0.1  # s of the computer's clock between two looks at a disk that is too slow
 MOTION_RATE = 4.0  # drawn poses per second of a moving object. Between two of them the object must not seem to rest
 
 
@@ -48,8 +49,8 @@ class Simulated:
 class Hand(twin.Hand):
     """Moves the twin's object, and shows the progress."""
 
-    def __init__(self, device: twin.Twin, bar: Bar, count: int):
-        super().__init__(device)
+    def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
+        super().__init__(device, session)
         self._bar, self._count = bar, count
         self._problem: str | None = None
 
@@ -57,8 +58,10 @@ class Hand(twin.Hand):
         """Act in a new stage, and show the number of confirmed trajectories, or a problem."""
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
-        if view.problem is not None and view.problem != self._problem:
-            say(view.problem)
+        if view.problem is not None:
+            if self._problem is None:
+                say(view.problem)
+            time.sleep(WAIT_S)
         self._problem = view.problem
 
 
@@ -89,7 +92,7 @@ def collect(config: Simulated) -> None:
             number = hardware.collect(
                 sensor,
                 session,
-                Hand(device, bar, config.count),
+                Hand(device, session, bar, config.count),
                 config=config.guide,
                 empty=empty,
                 trusted=True,

@@ -62,7 +62,8 @@ from sts_jax.hardware.recordings import (
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
 from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
-from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
+from sts_jax.hardware.shots import LightError, NotStillError, Pair, Shot
+from sts_jax.hardware.sts import STS, FoundSensors, find_sensors
 from sts_jax.hardware.views import Moments, SensorView, moments, relit, sensor_view
 
 __all__ = [

@@ -10,7 +10,7 @@ from sts_jax.hardware.camera_errors import CameraLostError, CameraTimeoutError, 
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError
 from sts_jax.hardware.session import Session, SessionError
-from sts_jax.hardware.sts import LightError, Pair
+from sts_jax.hardware.shots import LightError, Pair
 
 _PASSING = (
     CameraLostError,

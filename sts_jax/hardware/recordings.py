@@ -32,7 +32,7 @@ from sts_jax._files import TornFileError
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.sts import Pair, Shot, Stream
+from sts_jax.hardware.shots import Pair, Shot, Stream
 
 FORMAT = 1  # of the files of a session, incremented when older files can no longer be read
 SESSION, CONFIRMED, PAIR = "session.json", "confirmed.json", "pair.json"

@@ -6,7 +6,8 @@ from sts_jax.hardware import protocol
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.session import Origin
 from sts_jax.hardware.settling import Settling, Switch, settling, thumbnail
-from sts_jax.hardware.sts import LightError, Pair, Shot, Stream, checked_levels
+from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
+from sts_jax.hardware.sts import checked_levels
 from sts_jax.hardware.twin.device import Twin
 
 CAMERA = "twin"  # name of the camera in sessions and sensor files
