@@ -86,7 +86,7 @@ class Session:
         """Use `Session.open`."""
         self.folder = folder
         self._lock, self._settling = lock, settling
-        self._next = recordings.next_number(folder)
+        self._next = recordings.next_recording(folder)
         entries = recordings.list_recordings(folder)
         self._confirmed = {entry.number for entry in entries if entry.standing == "confirmed"}
         content = recordings.read_session(folder)

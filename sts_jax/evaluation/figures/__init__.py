@@ -1,5 +1,6 @@
 """Figures of predictions, training and simulation, each written to one file."""
 
+from sts_jax.evaluation.figures.comparison import comparison
 from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves
 from sts_jax.evaluation.figures.held_out import SAMPLES, calibration, ends, predictions
 from sts_jax.evaluation.figures.motion import SLOWER, animation, strip
@@ -11,6 +12,7 @@ __all__ = [
     "Trained",
     "animation",
     "calibration",
+    "comparison",
     "ends",
     "predictions",
     "scaling",
