@@ -124,13 +124,15 @@ def of_twin(config: Collect) -> simulated.Simulated:
     for name, value in devices.items():
         if value is not None:
             raise ValueError(f"--{name} is {value}, but --twin has no devices: leave out --{name} or --twin")
-    given = {"count": config.count, "size": config.size, "levels": config.levels}
+    default = simulated.Simulated(config.workdir)
     return simulated.Simulated(
         config.workdir,
+        count=default.count if config.count is None else config.count,
+        size=default.size if config.size is None else config.size,
+        levels=default.levels if config.levels is None else config.levels,
         seed=config.seed,
         note=config.note,
         guide=config.guide,
-        **{name: value for name, value in given.items() if value is not None},
     )
 
 
