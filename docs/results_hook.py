@@ -1,4 +1,4 @@
-"""MkDocs hook: serves the pictures and text files of benchmarks/results, which lie outside docs/.
+"""MkDocs hook: serves the pictures, tables and text files of benchmarks/results, which lie outside docs/.
 
 Pages link to them by their path in the repository (`../benchmarks/results/...`), so that the links also work in the
 Markdown files themselves. The hook copies the files into the site and shortens the links accordingly.
@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 RESULTS = "benchmarks/results/"
-SUFFIXES = (".png", ".txt")
+SUFFIXES = (".md", ".png", ".txt")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

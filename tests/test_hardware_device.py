@@ -11,7 +11,7 @@ import pytest
 from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from sts_jax import hardware
-from sts_jax.hardware.settling import Settling, Switch, settling
+from sts_jax.hardware.settling import Settling, Switch, difference, settling, switched_share
 
 SETTLING = Settling(visual_s=0.1, tactile_s=0.1)
 
@@ -68,6 +68,27 @@ def test_measured_settling_covers_lag_and_exposure(tmp_path, lag_s, exposure_s):
 
 def _both(pair):
     return pair.visual, pair.tactile
+
+
+def test_an_object_that_moves_is_not_taken_for_the_light():
+    """An object covers a quarter of the view and moves far, and the light changes each block by 3 of 255 only."""
+    random = np.random.default_rng(0)
+    empty = random.uniform(80, 160, (24, 32, 3)).astype(np.float32)
+    light = 3 * random.choice([-1, 1], empty.shape).astype(np.float32)
+
+    def view(lit, column, thickness):
+        """The object is dark without the light, and shows its contact only with the light."""
+        image = empty + lit * light + random.normal(0, 0.2, empty.shape).astype(np.float32)
+        image[:, column : column + thickness] -= 20 if lit else 70
+        return image
+
+    dark, lit, before = view(0, 2, 8), view(1, 2, 2), view(0, 2, 8)
+    moved, switched = view(0, 20, 8), view(1, 20, 2)
+    assert difference(moved, before) > 3 * np.abs(light).mean()
+    assert abs(switched_share(moved, before, lit - dark)) < 0.2
+    assert switched_share(switched, before, lit - dark) == pytest.approx(1, abs=0.2)
+    assert switched_share(moved, lit, dark - lit) == pytest.approx(1, abs=0.2)
+    assert switched_share(before, before, np.zeros_like(before)) == 0
 
 
 def test_settling_time_of_known_switches_is_that_of_the_last_mixed_frame():

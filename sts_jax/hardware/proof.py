@@ -11,10 +11,20 @@ from sts_jax.hardware.camera_errors import CameraError, CameraLostError
 from sts_jax.hardware.frames import Captured
 from sts_jax.hardware.leds import Leds, Lit
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError
-from sts_jax.hardware.settling import Settling, Switch, Thumbnail, check_contrast, difference, settling, thumbnail
+from sts_jax.hardware.settling import (
+    Settling,
+    Switch,
+    Thumbnail,
+    check_contrast,
+    difference,
+    settling,
+    switched_share,
+    thumbnail,
+)
 from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
 
-_DEPARTED = 0.5  # of the contrast, by which a frame must differ from the last one before the switch
+_DEPARTED = 0.5  # of the effect of the light, by which most of a frame must differ from that before the switch
+_KEPT = 0.5  # of the effect of the light, which must be left of it for the last images to replace earlier ones
 _AGAIN_S = 1.0  # s, after which a switch that does not show is repeated
 _ATTEMPTS = 3  # to measure the settling
 _PHASE = 0.618  # of a period, by which the phase of the measured switches advances
@@ -54,7 +64,7 @@ class ProvenFrames:
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
         self._settling: Settling | None = None  # in use
         self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
-        self._contrast: float | None = None  # of images without and with the light, of 255
+        self._effect: Thumbnail | None = None  # of the light on the image, the lit one minus the dark one
         self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
         self._black: dict[Stream, bool] = {}  # whether this image was black
         self._previous: Captured | None = None  # the last frame of the camera
@@ -101,9 +111,8 @@ class ProvenFrames:
     def _begin(self, settling: Settling, dark: Thumbnail, lit: Thumbnail) -> None:
         """Use settling times, and keep images without and with the light, with which later ones are compared."""
         self._settling = settling
-        self._contrast = difference(dark, lit)
-        check_contrast(self._contrast)
-        self._looks = {"visual": dark, "tactile": lit}
+        check_contrast(difference(dark, lit))
+        self._effect, self._looks = lit - dark, {"visual": dark, "tactile": lit}
 
     def see_both(self, settling: Settling) -> None:
         """Use settling times that are known. Takes an image of each light, with which later ones are compared."""
@@ -153,9 +162,16 @@ class ProvenFrames:
                 continue
             if until_s is not None:
                 self._black[stream], self._looks[stream] = frame.black, thumbnail(frame.image)
+                self._follow()
                 return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
             self.discarded += 1
             self._doubtful = True
+
+    def _follow(self) -> None:
+        """Let the effect of the light follow the last images, unless it would vanish, as with lights that failed."""
+        effect = self._looks["tactile"] - self._looks["visual"]
+        if self._effect is not None and np.abs(effect).mean() > _KEPT * np.abs(self._effect).mean():
+            self._effect = effect
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
         """A frame that arrives when the light has settled, and the answer of the controller before it."""
@@ -200,17 +216,18 @@ class ProvenFrames:
         )
 
     def _shows(self, frame: Captured, stream: Stream) -> bool:
-        """Whether the image has changed since the switch by at least half as much as it does with the light.
+        """Whether most of the image has changed as the switch of the light changes it, by at least half as much.
 
-        If the light before is unknown, whether the image is nearer to the last one of its stream than to the other.
+        The image is compared with the last frame before the switch. If the light before is unknown, it is compared with
+        the last image of the other stream.
         """
-        look = thumbnail(frame.image)
-        if self._reference is not None and self._contrast is not None:
-            return difference(look, self._reference) > _DEPARTED * self._contrast
-        if len(self._looks) < 2:
+        if self._effect is None:
             return True
-        other: Stream = "tactile" if stream == "visual" else "visual"
-        return difference(look, self._looks[stream]) < difference(look, self._looks[other])
+        before = self._looks["tactile" if stream == "visual" else "visual"]
+        if self._reference is not None:
+            before = self._reference
+        change = self._effect if stream == "tactile" else -self._effect
+        return switched_share(thumbnail(frame.image), before, change) > _DEPARTED
 
     def _repeats(self, frame: Captured) -> bool:
         """Whether a frame is the one before once more, in a scene that is not free of noise."""

@@ -9,6 +9,8 @@ from jaxtyping import Float, UInt8
 
 _SIZE = 32, 24  # pixels of a thumbnail, width and height. Its pixels are means of many, so noise hardly counts
 _LEAST_CONTRAST = 2.0  # of 255, mean difference of thumbnails of both lights below which no switch is recognised
+_VISIBLE = 0.5  # of 255, least effect of the light on a value of a thumbnail, which has less noise
+_CLEAR = 0.25  # of the median visible effect, below which a value is not used
 _TOLERANCE = 0.02  # of the share of the light, within which a frame has the new light
 
 Thumbnail = Float[np.ndarray, "24 32 3"]
@@ -74,6 +76,28 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
     """
     change = lit - dark
     return float(((look - dark) * change).sum() / (change**2).sum())
+
+
+def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
+    """The share of a change of the light that an image shows in comparison with an image before the switch.
+
+    It is the median over the values on which the light has an effect, so what moves in less than half of the view has
+    no influence.
+
+    Args:
+        look: The image.
+        before: The image before the switch.
+        change: The difference that the switch makes, from earlier images.
+
+    Returns:
+        0 for the light before the switch, 1 for the one after it, and 0 if the change has no effect anywhere.
+    """
+    effect = np.abs(change)
+    visible = effect >= _VISIBLE
+    if not visible.any():
+        return 0.0
+    used = effect >= max(_VISIBLE, _CLEAR * float(np.median(effect[visible])))
+    return float(np.median((look - before)[used] / change[used]))
 
 
 def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
