@@ -21,7 +21,7 @@ import time
 import zlib
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 
@@ -29,12 +29,13 @@ from sts_jax import _files
 from sts_jax.hardware import matroska
 from sts_jax.hardware.recordings import encoded
 from sts_jax.hardware.sensor_file import Device, sensor_file
-from sts_jax.hardware.sts import STS, Shot
+from sts_jax.hardware.session import Origin
+from sts_jax.hardware.settling import Settling
+from sts_jax.hardware.sts import Shot
 
 FORMAT = 1  # of the files of a recording, incremented when older files can no longer be read
 HEAD, FRAMES = "recording.json", "frames.jsonl"
 
-Encoding = Literal["png", "jpeg"]
 _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
@@ -47,9 +48,10 @@ class Recorder:
     """Writes the images of a sensor to a folder, which `Replay` plays back.
 
     ```python
-    with hardware.STS.from_file("bench") as sensor, hardware.Recorder("runs/monday", sensor) as recorder:
-        for shot in sensor.stream():
-            recorder.add(shot)
+    with hardware.STS.from_file("bench") as sensor:
+        with hardware.Recorder("runs/monday", hardware.Origin.of(sensor), file="bench") as recorder:
+            for shot in sensor.stream():
+                recorder.add(shot)
     ```
 
     When `add` returns, the image is in its file, also if the process is killed afterwards. A power failure can lose the
@@ -59,16 +61,18 @@ class Recorder:
     def __init__(
         self,
         folder: str | os.PathLike,
-        sensor: STS,
+        origin: Origin,
         *,
-        encoding: Encoding = "png",
+        settling: Settling | None = None,
+        encoding: str = "png",
         file: str | os.PathLike | None = None,
     ):
         """Make the folder.
 
         Args:
             folder: A new or an empty folder.
-            sensor: The connected sensor.
+            origin: The sensor.
+            settling: Its settling times, kept for the reader.
             encoding: "png" is lossless. "jpeg" (quality 95, full colour resolution) needs about a quarter of the space.
             file: The sensor file, of which a copy is kept with the recording. None: there is none.
 
@@ -84,7 +88,7 @@ class Recorder:
         self.counts = {"visual": 0, "tactile": 0}  # images on disk
         self._encoding = encoding
         self._start_s: float | None = None  # time of the first image (s)
-        self._sizes: dict[str, tuple[int, int]] = {}
+        self._size = origin.height, origin.width
         self._files: dict[str, int] = {}  # open file descriptors, by name
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
             raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new one.")
@@ -96,10 +100,8 @@ class Recorder:
             {
                 "format": FORMAT,
                 "encoding": encoding,
-                "camera": sensor.camera.source,
-                "leds": sensor.leds.serial_number,
-                "levels": sensor.levels,
-                "settling": dataclasses.asdict(sensor.settling),
+                **dataclasses.asdict(origin),
+                "settling": None if settling is None else dataclasses.asdict(settling),
                 "begun": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             },
         )
@@ -111,19 +113,19 @@ class Recorder:
             shot: An image that is later than the ones before.
 
         Raises:
-            ValueError: The image has another size than those before.
+            ValueError: The image has another size than those of the sensor.
             OSError: The disk is full or the folder is not writable. Everything that was added before is kept.
         """
-        size = shot.image.shape[:2]
-        if self._sizes.setdefault(shot.stream, size) != size:
+        height, width = self._size
+        if shot.image.shape != (height, width, 3):
             raise ValueError(
-                f"the {shot.stream} image has shape {size}, but those before have {self._sizes[shot.stream]}: make a "
-                "new recording for another size."
+                f"the {shot.stream} image has shape {shot.image.shape}, but those of the recording have "
+                f"{(height, width, 3)}: make a new recording for another size."
             )
         self._start_s = shot.time_s if self._start_s is None else self._start_s
         name, image = video_name(shot.stream), self._encoded(shot)
         data = matroska.cluster(max(round(1000 * (shot.time_s - self._start_s)), 0), image)
-        end = self._append(name, data, head=matroska.header(size[1], size[0], self._encoding))
+        end = self._append(name, data, head=matroska.header(width, height, self._encoding))
         taken_s = time.time() - (time.monotonic() - shot.time_s)
         line: dict[str, Any] = {
             "stream": shot.stream,
