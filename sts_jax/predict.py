@@ -253,6 +253,11 @@ class Predictor:
         """The modalities that the model accepts: its inputs, except those that were absent in training."""
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
+    @property
+    def blank(self) -> dict[str, Array]:
+        """The visual and the tactile image of the untouched sensor in training, by name, `(height, width, 3)`, [0, 1]."""
+        return dict(self._empty)
+
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
         """Check type and shape of an input and return it as float32. A traced value stays traced."""
         if name not in (*self._inputs, *self.preprocessing.absent):

@@ -47,7 +47,7 @@ def played(replay, **options):
 def test_a_replay_equals_the_recording_in_every_pixel_and_time(folder):
     with hardware.Replay(folder, speed=None) as replay:
         found = played(replay)
-        with pytest.raises(hardware.EndOfVideoError, match="ended after 12 images: connect again .* or give loop=True"):
+        with pytest.raises(hardware.EndOfVideoError, match=r"ended after 12 images: connect again .*loop=True"):
             replay.read()
     assert len(found) == 12
     for number, one in enumerate(found):
