@@ -35,7 +35,7 @@ from experiments.shared.own_twin import own_twin
 from experiments.shared.progress import say
 from sts_jax import hardware
 
-SCENARIOS = {
+SCENARIOS: dict[str, type[sts.physics.Scenario]] = {
     "freefall": sts.physics.Freefall,
     "inclined": sts.physics.Inclined,
     "perturbed": sts.physics.Perturbed,

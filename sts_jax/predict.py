@@ -255,7 +255,7 @@ class Predictor:
 
     @property
     def blank(self) -> dict[str, Array]:
-        """The visual and the tactile image of the untouched sensor in training, by name, `(height, width, 3)`, [0, 1]."""
+        """Both images of the untouched sensor in training, by name, `(height, width, 3)`, [0, 1]."""
         return dict(self._empty)
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:

@@ -5,14 +5,14 @@ import dataclasses
 import statistics
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, ArrayLike, Float, UInt8
 
 import sts_jax as sts
 from sts_jax import hardware
@@ -220,7 +220,7 @@ class Live:
         contact, occupied = self._contact(visual, tactile)
         resolution = self._predictor.preprocessing.resolution
         shots = {"visual": visual, "tactile": tactile}
-        views = {
+        views: dict[str, np.ndarray] = {
             name: np.clip(self._views.floats(shots[name].image, resolution) * self._gain[name], 0, 1)
             for name in self._streams
         }
@@ -238,10 +238,12 @@ class Live:
             max(visual.time_s, tactile.time_s),
         )
 
-    def _compute(self, views: dict[str, np.ndarray], *, contact: bool) -> sts.Prediction:
+    def _compute(self, views: Mapping[str, np.ndarray], *, contact: bool) -> sts.Prediction:
         """Predict, and wait for the result. A touch without contact does not count."""
-        present = {"tactile": np.bool_(contact)} if "tactile" in views else None
-        return jax.block_until_ready(self._predictor(**views, condition=self._condition, present=present))
+        touch = views.get("tactile")
+        present: dict[str, ArrayLike] | None = None if touch is None else {"tactile": np.bool_(contact)}
+        found = self._predictor(visual=views["visual"], tactile=touch, condition=self._condition, present=present)
+        return jax.block_until_ready(found)
 
     def _contact(self, visual: hardware.Shot, tactile: hardware.Shot) -> tuple[bool | None, bool | None]:
         """Whether the tactile image shows a contact, and whether any of both shows an object."""

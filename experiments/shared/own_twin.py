@@ -5,13 +5,11 @@ import json
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 from experiments import commission
-from sts_jax import hardware
 
 SIZE = (640, 480)  # pixels, width and height
 FIELD_OF_VIEW = 160.0  # degrees, across the diagonal
