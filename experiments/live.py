@@ -54,7 +54,8 @@ class Config:
     replay: tuple[Path, ...] = ()  # folder of a recording, or two videos: visual and tactile
     twin: bool = False  # start a digital twin. Default if no other source is given
 
-    model: str = "freefall"  # freefall, inclined or perturbed, which come with the library, or a model's folder
+    # inclined, freefall or perturbed, which come with the library, or a model's folder. docs/hardware/live.md compares
+    model: str = "inclined"
     scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None  # of a model's folder, for names
     condition: tuple[float, ...] = ()  # of the model, SI units (default: zeros)
     flat: bool = True  # divide out the backgrounds of the sensor file, such as vignetting

@@ -85,7 +85,7 @@ class PanelFile:
     def add(self, seen: Seen) -> None:
         """Add a moment, if the next one is due."""
         now_s = time.monotonic()
-        if now_s < self._next_s or seen.predicted is None:
+        if now_s < self._next_s or seen.rate == 0:
             return
         period_s = 1 / _RATE if self._is_video else _EVERY_S
         late = self._next_s < now_s - 1

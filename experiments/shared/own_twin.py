@@ -43,7 +43,7 @@ class OwnTwin:
     def _operate(self) -> None:
         while not self._stop.is_set():
             for command, seconds, note in (
-                ("hold", HELD_S, "a hand holds the object in an unstable pose"),
+                ("hold", HELD_S, "a hand holds the object"),
                 ("release", FREE_S, "the hand has let go"),
             ):
                 with contextlib.suppress(OSError):  # the twin has ended
