@@ -67,6 +67,7 @@ class Config:
     seconds: float | None = None  # stop after this time (default: at the end of a recording, or never)
 
     record: Path | None = None  # record both streams into this new folder
+    encoding: Literal["png", "jpeg"] = "png"  # of the recorded images. PNG is lossless, JPEG faster and smaller
     save: Path | None = None  # write a picture (.png) or a video (.mp4) of the view
     headless: bool = False  # print in this terminal instead of showing a page
     host: str = "127.0.0.1"  # address of the page. 0.0.0.0: every computer of the network can watch
@@ -253,8 +254,10 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
             sensor.connect()  # the clock starts now
         elif config.record is not None:
             origin = hardware.Origin.of(sensor)
-            made = hardware.Recorder(config.record, origin, settling=sensor.settling, file=source.file)
-            recorder = stack.enter_context(made)
+            recorder = hardware.Recorder(
+                config.record, origin, settling=sensor.settling, encoding=config.encoding, file=source.file
+            )
+            stack.callback(recorder.close)
         source.connected()
         started_s, newest = time.monotonic(), dict[str, hardware.Shot]()
         try:

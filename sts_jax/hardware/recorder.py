@@ -73,7 +73,7 @@ class Recorder:
             folder: A new or an empty folder.
             origin: The sensor.
             settling: Its settling times, kept for the reader.
-            encoding: "png" is lossless. "jpeg" (quality 95, full colour resolution) needs about a quarter of the space.
+            encoding: "png" is lossless. "jpeg" (quality 95, full colour resolution) needs about a fifth of the space.
             file: The sensor file, of which a copy is kept with the recording. None: there is none.
 
         Raises:
