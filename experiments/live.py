@@ -109,6 +109,11 @@ def check(config: Config) -> None:
         )
     if config.sensor is None and (config.camera is None) != (config.leds is None):
         raise ValueError("without a sensor file, both --camera and --leds are needed")
+    if config.sensor is not None and not hardware.sensor_file.sensor_file(config.sensor).exists():
+        raise ValueError(
+            f"sensor is {config.sensor}, but there is no sensor file: give another one, or write it with `python -m "
+            "experiments.commission`"
+        )
     if config.dwell < 1:
         raise ValueError(f"dwell must be >= 1, got {config.dwell}")
     if config.seconds is not None and not config.seconds > 0:

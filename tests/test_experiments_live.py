@@ -232,6 +232,7 @@ def test_files_of_panels(tmp_path, monkeypatch):
     [
         ({"twin": True, "replay": ("a",)}, "--twin and --replay exclude each other"),
         ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
+        ({"sensor": "none"}, "sensor is none, but there is no sensor file: give another one, or write it with"),
         ({"replay": ("a", "b", "c")}, "replay has 3 paths, but it takes a folder, or a visual and a tactile video"),
         ({"camera": "http://127.0.0.1/"}, "both --camera and --leds are needed"),
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
@@ -239,7 +240,7 @@ def test_files_of_panels(tmp_path, monkeypatch):
         ({"replay": ("a",), "record": "b"}, "--record and --replay exclude each other"),
     ],
 )
-def test_contradicting_options(options, match):
+def test_bad_options(options, match):
     with pytest.raises(ValueError, match=match):
         live.check(live.Config(**options))
 

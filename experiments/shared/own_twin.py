@@ -73,7 +73,7 @@ def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
     leds = folder / "leds"
     command = [sys.executable, "-m", "experiments.twin", "--port", str(leds), "--seed", str(seed)]
     command += ["--resolution", str(SIZE[1]), str(SIZE[0]), "--field-of-view", str(FIELD_OF_VIEW)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
         try:
             url = _address(process)
             commission.main(
