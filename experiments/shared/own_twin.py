@@ -71,9 +71,11 @@ def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
         RuntimeError: The twin does not start.
     """
     leds = folder / "leds"
-    command = [sys.executable, "-m", "experiments.twin", "--port", str(leds), "--seed", str(seed)]
+    command = [sys.executable, "-m", "experiments.twin", "--attached", "--port", str(leds), "--seed", str(seed)]
     command += ["--resolution", str(SIZE[1]), str(SIZE[0]), "--field-of-view", str(FIELD_OF_VIEW)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True) as process:
+    pipe = subprocess.PIPE
+    # Ctrl-C must not reach the twin, which ends after its reader or when the pipe to it is closed.
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
         try:
             url = _address(process)
             commission.main(
