@@ -20,11 +20,16 @@ import tyro
 from tqdm import tqdm
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed
+from experiments import freefall, inclined, perturbed, released
 from experiments.shared import rerolls, stages
 from sts_jax import _files, dataset, evaluation
 
-CONFIGS = {"freefall": freefall.DEFAULT, "perturbed": perturbed.DEFAULT, "inclined": inclined.DEFAULT}
+CONFIGS = {
+    "freefall": freefall.DEFAULT,
+    "perturbed": perturbed.DEFAULT,
+    "inclined": inclined.DEFAULT,
+    "released": released.DEFAULT,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +40,7 @@ class Args:
         ValueError: `times` is less than 2.
     """
 
-    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
+    scenario: Literal["freefall", "inclined", "perturbed", "released"] = "freefall"
     times: int = 16  # simulations of each start, at least 2
     workdir: Path | None = None  # work directory of a run with --preset default (default: collect a new dataset)
 

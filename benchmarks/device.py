@@ -2,12 +2,15 @@
 
     python -m benchmarks.device --pairs 1000                                                     # about eight minutes
     python -m benchmarks.device --pairs 1000 --out benchmarks/results/hardware/device.txt        # also write the table
+    python -m benchmarks.device --pairs 1000 --twin                                              # the digital twin
     python -m benchmarks.device --pairs 10 --lags-ms 15
 
-A controller on a pseudo-terminal and a camera on loopback, in a process of their own, stand for the devices
-(`instruments/sensor_peer.py`). The pairs are shared between several lags, which is the time from the end of a frame's
-exposure to its sending. `hardware.STS` measures the settling times itself. The camera's log of each frame decides which
-light an image shows, never the host's label.
+A controller on a pseudo-terminal and a camera on loopback, in a process of their own, stand for the devices. Their
+images are flat (`instruments/sensor_peer.py`), or with `--twin` those of the digital twin (`instruments/twin_peer.py`),
+whose object is held or released after every ten pairs. The pairs are shared between several lags, which is the time
+from the end of a frame's exposure to its sending. `hardware.STS` measures the settling times itself. The camera's log
+of each frame decides which light an image shows, never the host's label. An image is of a wrong or mixed light if the
+mean light of its exposure differs from the wanted one by more than 0.1 %.
 
 The limit of the camera is one pair in two frame periods and the settling time. A pair has one switch, and the two
 directions alternate, so the settling time is the mean of both.
@@ -24,13 +27,15 @@ from typing import NamedTuple
 
 import tyro
 
-from benchmarks.instruments.camera_server import number_of
-from benchmarks.instruments.sensor_peer import CORNER, Exposure, SensorPeer
+from benchmarks.instruments import sensor_peer, twin_peer
+from benchmarks.instruments.shown import Shown
 from sts_jax import hardware
 
 SIZE = (640, 480)
 FPS = 60.0
 EXPOSURE_S = 0.016
+MOVE, FINISHED = "move", "finished"  # requests of the host to the process of the devices
+EVERY = 10  # pairs between two of its movements of the twin's object
 LEAST = 0.8  # share of the camera's limit that is required
 
 
@@ -44,6 +49,7 @@ class Args:
 
     pairs: int = 1000  # of all lags together
     lags_ms: tuple[float, ...] = (15, 30, 50, 80, 120)
+    twin: bool = False  # images of the digital twin instead of flat ones
     out: Path | None = None  # file of the table
 
     def __post_init__(self) -> None:
@@ -74,42 +80,48 @@ class Measured(NamedTuple):
         return 1 / (2 / FPS + (self.settling.visual_s + self.settling.tactile_s) / 2)
 
 
-def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float) -> None:
+def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float, twin: bool) -> None:
     """Run the devices until the host has finished, then hand over the camera's log."""
-    peer = SensorPeer(path, fps=FPS, lag_s=lag_s, exposure_s=EXPOSURE_S, size=SIZE)
+    make: type[twin_peer.TwinPeer | sensor_peer.SensorPeer] = twin_peer.TwinPeer if twin else sensor_peer.SensorPeer
+    peer = make(path, fps=FPS, lag_s=lag_s, exposure_s=EXPOSURE_S, size=SIZE)
     link.send(peer.url)
-    link.recv()
+    while link.recv() == MOVE:
+        if isinstance(peer, twin_peer.TwinPeer):
+            peer.move()
     peer.stop()
-    link.send(peer.camera.log)
+    link.send(peer.shown())
 
 
-def measure(lag_ms: float, pairs: int, path: Path) -> Measured:
+def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
     """Read pairs at one lag and judge their images."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    process = context.Process(target=serve, args=(there, path, lag_ms / 1000), daemon=True)
+    process = context.Process(target=serve, args=(there, path, lag_ms / 1000, twin), daemon=True)
     process.start()
     url = here.recv()
-    shown: list[tuple[int, float]] = []  # number of each image, and the share of light that it must have
+    key = twin_peer.key if twin else sensor_peer.key
+    taken: list[tuple[int, float]] = []  # key of each image, and the share of light that it must have
     sequences: list[int] = []
     camera = hardware.CameraConfig(url, *SIZE, lock=False, buffer=8)
     with hardware.STS(camera=camera, leds=str(path)) as sensor:
         settled = sensor.settling
         sensor.read()
         before, begun_s = sensor.discarded, time.perf_counter()
-        for _ in range(pairs):
+        for number in range(pairs):
+            if twin and number % EVERY == 0:
+                here.send(MOVE)
             pair = sensor.read()
             for shot, share in ((pair.visual, 0.0), (pair.tactile, 1.0)):
-                shown.append((number_of(shot.image[:CORNER, :CORNER]), share))
+                taken.append((key(shot.image), share))
                 sequences.append(shot.sequence)
         seconds = time.perf_counter() - begun_s
         discarded = sensor.discarded - before
-    here.send("finished")
-    log: dict[int, Exposure] = here.recv()
+    here.send(FINISHED)
+    log: dict[int, Shown] = here.recv()
     process.join()
-    wrong = sum(number not in log or log[number].shares != [share] for number, share in shown)
+    wrong = sum(name not in log or not log[name].is_of(share) for name, share in taken)
     frames = max(sequences) - min(sequences) + 1
-    numbers = [number for number, _ in shown]
+    numbers = [log[name].number for name, _ in taken if name in log] or [0]
     lost = max(numbers) - min(numbers) + 1 - frames
     return Measured(lag_ms, settled, pairs, wrong, frames, discarded, lost, seconds)
 
@@ -138,7 +150,7 @@ def measure_all(args: Args) -> list[Measured]:
     with tempfile.TemporaryDirectory() as folder:
         for index, lag_ms in enumerate(args.lags_ms):
             pairs = args.pairs * (index + 1) // number - args.pairs * index // number
-            found.append(measure(lag_ms, pairs, Path(folder) / "leds"))
+            found.append(measure(lag_ms, pairs, Path(folder) / "leds", twin=args.twin))
     return found
 
 

@@ -81,13 +81,12 @@ def main(args: Args) -> None:
         word = "divided out" if divided else "kept"
         for name in MODELS:
             predictor = sts.Predictor.load(name)
-            resolution, blank = predictor.preprocessing.resolution, predictor.blank
-            gains = (views.gain("visual", blank["visual"]), views.gain("tactile", blank["tactile"]))
+            resolution = predictor.preprocessing.resolution
 
             def seen(pairs: list[Pair], index: int, size: tuple[int, int]) -> np.ndarray:
-                flat = [views.floats(pair[index], resolution) * gains[index] for pair in pairs]  # noqa: B023
+                flat = [views.prepared(*pair, predictor.empty)[index] for pair in pairs]  # noqa: B023
                 step = resolution[0] // size[0]  # noqa: B023
-                images = np.clip(flat, 0, 1).reshape(len(pairs), size[0], step, size[1], step, 3)
+                images = np.stack(flat).reshape(len(pairs), size[0], step, size[1], step, 3)
                 return images.mean((2, 4)).astype(np.float32)
 
             truth = [seen(rest, index, size) for index in (0, 1)]

@@ -19,16 +19,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import tyro
-from jaxtyping import UInt8
 
 import sts_jax as sts
-from experiments.shared import boards, errors, output
+from experiments.shared import backgrounds, boards, errors, output
 from experiments.shared.command import Folder
 from sts_jax import _files, hardware
 
-BACKGROUNDS = 20  # pairs of images whose mean is the background
 FRAME_SHARE = 0.9  # of the time between two frames, the longest exposure
 DARK = (0, 0, 0, 0)  # levels of the visual stream
 V4L2_UNIT = 1e-4  # s, unit of a device's exposure
@@ -58,16 +55,6 @@ class Config:
         """The board as it was printed."""
         scale, nominal = self.ruler / 100, hardware.Board()
         return dataclasses.replace(nominal, square=scale * nominal.square, marker=scale * nominal.marker)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Backgrounds:
-    """The mean images of both streams with nothing on the pad."""
-
-    visual: UInt8[np.ndarray, "height width 3"]
-    tactile: UInt8[np.ndarray, "height width 3"]
-    noise: tuple[float, float]  # standard deviation of one pixel over time in each stream, of 255
-    rate: float  # pairs per second
 
 
 def check(config: Config) -> None:
@@ -165,30 +152,6 @@ def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tupl
         say(f"exposure of the {stream} stream: brightness {seen:.0f} of 255, {words}")
     leds.set(DARK)
     return (chosen[0], chosen[1]) if settable else None
-
-
-def record(sensor: hardware.STS) -> Backgrounds:
-    """Record the backgrounds, the noise and the number of pairs per second."""
-    sums: dict[str, np.ndarray] = {}
-    squares: dict[str, np.ndarray] = {}
-    taken_s = 0.0
-    sensor.wait_until_still()
-    sensor.read()
-    for _ in range(BACKGROUNDS):
-        start = time.monotonic()
-        pair = sensor.read()
-        taken_s += time.monotonic() - start
-        for shot in (pair.visual, pair.tactile):
-            image = shot.image.astype(np.uint32)
-            sums[shot.stream] = sums.get(shot.stream, 0) + image
-            squares[shot.stream] = squares.get(shot.stream, 0) + image**2
-    means, noise = [], []
-    for stream in ("visual", "tactile"):
-        mean = sums[stream] / BACKGROUNDS
-        variance = (squares[stream] / BACKGROUNDS - mean**2) * BACKGROUNDS / (BACKGROUNDS - 1)
-        means.append(np.round(mean).astype(np.uint8))
-        noise.append(math.sqrt(max(float(variance.mean()), 0.0)))
-    return Backgrounds(means[0], means[1], (noise[0], noise[1]), BACKGROUNDS / taken_s)
 
 
 def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
@@ -295,14 +258,18 @@ def main(config: Config) -> None:
         with hardware.STS(camera=camera, leds=leds, levels=config.levels, exposures=exposures).connect() as sensor:
             settling = sensor.settling
             say(f"latency: light on {1e3 * settling.tactile_s:.0f} ms, off {1e3 * settling.visual_s:.0f} ms")
-            backgrounds = record(sensor)
-            visual, tactile = backgrounds.noise
-            say(f"background: mean of {BACKGROUNDS} pairs, noise {visual:.2f} (visual), {tactile:.2f} (tactile) of 255")
+            sensor.wait_until_still()
+            recorded = backgrounds.record(sensor)
+            visual, tactile = recorded.noise
+            say(
+                f"background: mean of {backgrounds.PAIRS} pairs, noise {visual:.2f} (visual), {tactile:.2f} (tactile) "
+                "of 255"
+            )
             rate = camera.statistics.rate
             assert rate is not None
             nominal = 1 / (2 / rate + (settling.visual_s + settling.tactile_s) / 2)
             say(
-                f"speed: {backgrounds.rate:.2f} pairs/s, {backgrounds.rate / nominal:.0%} of {nominal:.2f}, which are "
+                f"speed: {recorded.rate:.2f} pairs/s, {recorded.rate / nominal:.0%} of {nominal:.2f}, which are "
                 "two frames and the mean latency a pair"
             )
             source: Literal["board", "ideal"] = "board" if config.ideal_lens is None else "ideal"
@@ -324,7 +291,7 @@ def main(config: Config) -> None:
                 focus=camera.locked.get("focus"),
                 lens_from=source,
             )
-    device.save(config.out, simulated.constants(), visual=backgrounds.visual, tactile=backgrounds.tactile)
+    device.save(config.out, simulated.constants(), visual=recorded.visual, tactile=recorded.tactile)
     print(f"{config.out / hardware.sensor_file.NAME}: camera {device.camera}, controller {device.leds}, lens {source}")
     print(
         f"next, in Python: `with sts_jax.hardware.STS.from_file({str(config.out)!r}) as sensor: pair = sensor.read()`"
@@ -341,8 +308,6 @@ if __name__ == "__main__":
     try:
         with errors.on_one_line():
             main(arguments)
-    except (hardware.CameraError, hardware.LightError, hardware.NoContrastError) as error:
-        raise SystemExit(f"error: {error}") from None
     except KeyboardInterrupt:
         number = len(list((arguments.out / "board").glob("*.png")))
         raise SystemExit(f"interrupted: {number} pictures of the board are kept for the same command") from None

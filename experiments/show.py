@@ -15,7 +15,7 @@ import numpy as np
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed
+from experiments import freefall, inclined, perturbed, released
 from experiments.shared import errors, output, pictures
 from sts_jax import dataset, evaluation
 
@@ -23,6 +23,7 @@ SCENARIOS = {
     "freefall": freefall.DEFAULT.collection,
     "inclined": inclined.DEFAULT.collection,
     "perturbed": perturbed.DEFAULT.collection,
+    "released": released.DEFAULT.collection,
 }
 
 
@@ -30,7 +31,7 @@ SCENARIOS = {
 class Config:
     """Scenario, number and size of the pictures."""
 
-    scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined or perturbed
+    scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined, perturbed or released
     num: int = 4  # trajectories, each of another object
     seed: int = 0
     out: Path = Path("show")  # the folder

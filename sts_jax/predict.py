@@ -254,9 +254,9 @@ class Predictor:
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
     @property
-    def blank(self) -> dict[str, Array]:
-        """Both images of the untouched sensor in training, by name, `(height, width, 3)`, [0, 1]."""
-        return dict(self._empty)
+    def empty(self) -> dict[str, np.ndarray]:
+        """The images of the untouched sensor in its training by stream, float32 `(height, width, 3)` in [0, 1]."""
+        return {name: np.asarray(image) for name, image in self._empty.items()}
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
         """Check type and shape of an input and return it as float32. A traced value stays traced."""

@@ -10,7 +10,7 @@ import trimesh
 import tyro
 
 import sts_jax as sts
-from experiments import freefall, inclined, perturbed
+from experiments import freefall, inclined, perturbed, released
 from experiments.shared import command, config, errors, judging, pictures, results, stages
 from sts_jax import _files, compilation, dataset, physics, training
 
@@ -33,7 +33,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize(
     ("experiment", "classes", "trajectories"),
-    [(freefall, sts.objects.CATEGORIES, 1700), (inclined, sts.objects.CATEGORIES, 2400), (perturbed, BOTTLES, 2500)],
+    [
+        (freefall, sts.objects.CATEGORIES, 1700),
+        (inclined, sts.objects.CATEGORIES, 2400),
+        (perturbed, BOTTLES, 2500),
+        (released, ("camera",), 500),
+    ],
 )
 def test_presets_hold_out_enough_objects_and_that_of_the_paper_has_its_counts(experiment, classes, trajectories):
     default, paper = experiment.DEFAULT.collection, experiment.PAPER.collection

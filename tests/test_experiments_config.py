@@ -4,13 +4,13 @@ import dataclasses
 
 import pytest
 
-from experiments import freefall, inclined, perturbed
+from experiments import freefall, inclined, perturbed, released
 from experiments.shared import config, stages
 from sts_jax import dataset
 
 PRESETS = {
     f"{experiment.__name__}-{name}": preset
-    for experiment in (freefall, inclined, perturbed)
+    for experiment in (freefall, inclined, perturbed, released)
     for name, preset in experiment.PRESETS.items()
 }
 

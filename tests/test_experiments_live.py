@@ -39,7 +39,7 @@ class StubPredictor:
     def __init__(self, seconds=0.0, modalities=("visual", "tactile"), condition=0):
         self.modalities, self.seconds, self.calls = modalities, seconds, []
         self.preprocessing = SimpleNamespace(resolution=(16, 16))
-        self.blank = {"visual": np.full((16, 16, 3), 0.6), "tactile": np.full((16, 16, 3), 0.7)}
+        self.empty = {"visual": np.full((16, 16, 3), 0.6, np.float32), "tactile": np.full((16, 16, 3), 0.7, np.float32)}
         self.model = SimpleNamespace(config=SimpleNamespace(condition=condition))
 
     def __call__(self, *, visual, tactile, condition, present):
@@ -81,8 +81,8 @@ def test_backgrounds_become_the_untouched_sensor_of_the_model():
     np.testing.assert_allclose(visual[inside], 0.6, atol=1e-6)
     np.testing.assert_allclose(tactile[inside], 0.7, atol=1e-6)
     assert not present["tactile"]
-    unchanged = Views(LENS, PINHOLE, Backgrounds(grey(100), grey(180), False))
-    np.testing.assert_array_equal(unchanged.gain("visual", predictor.blank["visual"]), 1.0)
+    kept = views(divided=False).prepared(grey(100), grey(180), predictor.empty)
+    np.testing.assert_allclose(kept.visual[inside], 100 / 255, atol=1e-6)
 
 
 @pytest.mark.parametrize(

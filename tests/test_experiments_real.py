@@ -22,8 +22,9 @@ import sts_jax as sts
 from benchmarks.instruments.camera_server import SIZE
 from benchmarks.instruments.sensor_peer import DARK, LIT, SensorPeer
 from experiments import real
+from experiments.shared.collecting import person
 from experiments.shared.page import Page
-from experiments.shared.terminal import Terminal
+from experiments.shared.terminal import Terminal, single_keys
 from sts_jax import hardware
 from sts_jax.hardware import Action, Stage
 
@@ -225,7 +226,7 @@ def test_an_address_in_use_is_named(page):
 
 def test_the_page_states_where_it_listens(capsys):
     for host, text in (("127.0.0.1", "only this computer can open it"), ("0.0.0.0", "EVERY computer")):
-        with real.person(real.Collect(host=host, port=0)):
+        with person(real.Collect(host=host, port=0)):
             pass
         assert f"listens on {host}, so {text}" in capsys.readouterr().err
 
@@ -235,7 +236,7 @@ def test_keys_of_a_terminal(monkeypatch, capsys):
     with os.fdopen(slave) as terminal:
         monkeypatch.setattr(sys, "stdin", terminal)
         keys = Terminal(7)
-        with real.single_keys():
+        with single_keys():
             keys.show(view(Stage.HOLD))
             os.write(master, b"\n")
             keys.show(view(Stage.RELEASE))
@@ -297,6 +298,7 @@ def test_reviewing(workdir, capsys):
         ({"camera": "a", "leds": "b", "count": 0}, "count must be >= 1, got 0"),
         ({"camera": "a", "leds": "b", "levels": (0, 0, 0, 0)}, "at least one above 0"),
         ({"sensor": Path("none.json")}, "none.json"),
+        ({"sensor": Path("none.json"), "size": (640, 480)}, "--size is .*, but the sensor file none.json determines"),
         ({"camera": "http://127.0.0.1:1/video", "leds": "/dev/none"}, "/dev/none"),
     ],
 )

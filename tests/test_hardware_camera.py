@@ -213,12 +213,23 @@ def test_frames_that_are_only_late_are_not_counted_as_lost():
     assert pace.rate == pytest.approx(10)
 
 
+def test_frames_that_a_network_held_back_are_known():
+    """The frames of 1.0 to 1.5 s arrive together at 1.52 s, and then the camera misses one."""
+    pace, held = frames.Pace(None), []
+    times = [*0.1 * np.arange(10), *(1.52 + 0.002 * np.arange(6)), 1.6, 1.7, 1.9, 2.0]
+    for time_s in times:
+        pace.arrived(time_s)
+        held.append(pace.held_back)
+    assert held == [10 <= i < 16 for i in range(20)]
+
+
 def test_jitter_is_not_counted_as_loss():
     pace = frames.Pace(10.0)
     times = 0.1 * np.arange(200) + np.random.default_rng(0).uniform(0, 0.06, 200)
     times[50:53] = [5.16, 5.2, 5.25]  # late, and made up for
     for time_s in times:
         pace.arrived(time_s)
+        assert not pace.held_back
     assert pace.dropped == 0
     for time_s in times[-1] + [0.2, 0.3, 0.4]:  # one frame is missing
         pace.arrived(time_s)

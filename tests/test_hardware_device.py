@@ -179,9 +179,9 @@ def test_frames_that_are_held_back_do_not_pass_as_those_of_another_light(peer, s
 def test_the_watchdog_is_not_mistaken_for_a_switch(peer, sensor, monkeypatch, first):
     """The lights go off just before the request that is to turn them off or on."""
     sensor.read()
-    while sensor._stream != first:
+    while sensor._frames.stream != first:
         next(sensor.stream(first == "tactile"))
-    proof, boots = sensor._proof, []
+    proof, boots = sensor._frames._proof, []
 
     def disturbed(before, then):
         if not boots:
@@ -189,7 +189,7 @@ def test_the_watchdog_is_not_mistaken_for_a_switch(peer, sensor, monkeypatch, fi
             peer.leds.fire_watchdog()
         return proof(before, then)
 
-    monkeypatch.setattr(sensor, "_proof", disturbed)
+    monkeypatch.setattr(sensor._frames, "_proof", disturbed)
     pair = sensor.read()
     assert (getattr(pair, first).before.counter > boots[0].counter) == (first == "tactile")
     assert all(judged(peer, shot) for shot in _both(pair))
@@ -199,7 +199,7 @@ def test_late_frames_of_two_switches_are_not_mixed_up(peer, sensor, monkeypatch)
     """The watchdog fires, the lights are set again, and only then the frames around the watchdog's switch arrive."""
     last = sensor.read().tactile
     sequence, late, fired = itertools.count(last.sequence + 1000), [], []
-    proof = sensor._proof
+    proof = sensor._frames._proof
 
     def disturbed(before, then):
         if not fired:
@@ -214,7 +214,7 @@ def test_late_frames_of_two_switches_are_not_mixed_up(peer, sensor, monkeypatch)
         image = np.full((SIZE[1], SIZE[0], 3), round(DARK + light * (LIT - DARK)), np.uint8)
         return hardware.Captured(image, time.monotonic(), next(sequence), last.epoch, 0, 0, False)
 
-    monkeypatch.setattr(sensor, "_proof", disturbed)
+    monkeypatch.setattr(sensor._frames, "_proof", disturbed)
     monkeypatch.setattr(sensor.camera, "async_read", async_read)
     pair = sensor.read()
     assert fired[0].levels == (255, 255, 255, 255)

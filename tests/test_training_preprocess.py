@@ -1,12 +1,17 @@
-"""Codes of poses: encoding, decoding, and the short codes of an uncertain network."""
+"""Codes of poses: encoding, decoding, and the short codes of an uncertain network. The criterion for a touch."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
-from sts_jax import geometry, training
+import sts_jax as sts
+from sts_jax import geometry, hardware, training
 from sts_jax.evaluation.metrics import geodesic_angle
+from sts_jax.hardware import twin
 
 
 def poses(count):
@@ -48,3 +53,103 @@ def test_an_uncertain_code_is_decoded_to_a_valid_pose(rotation):
     assert geodesic_angle(np.asarray(faint), np.asarray(pose)).max() < 2e-3
     nothing = preprocessing.decode_pose(jnp.zeros(preprocessing.pose_size))
     np.testing.assert_array_equal(nothing[3:], [1, 0, 0, 0])
+
+
+BLANK = np.full((64, 64, 3), 180, np.uint8)
+
+
+def touched(preprocessing, images, blank=BLANK):
+    return np.asarray(preprocessing.touched(jnp.asarray(images / 255, jnp.float32), jnp.asarray(blank / 255)))
+
+
+def test_the_criterion_of_simulated_images_and_of_older_models_is_a_single_pixel():
+    images = np.stack([BLANK] * 3).astype(float)
+    images[1, 20, 30, 1] += 3  # not more than the threshold
+    images[2, 20, 30, 1] += 4
+    older = dataclasses.asdict(training.Preprocessing())
+    for field in ("touch_block", "touch_blocks", "touch_level"):
+        del older[field]
+    read = training.preprocessing_from_json(older)
+    assert read == training.Preprocessing()
+    np.testing.assert_array_equal(touched(read, images), [False, False, True])
+    random = np.random.default_rng(0)
+    noisy = random.normal(180, 1, (50, 64, 64, 3))
+    largest = np.abs(np.float32(noisy / 255) - np.float32(BLANK / 255)).max((1, 2, 3))
+    np.testing.assert_array_equal(touched(read, noisy), largest > 3 / 255)
+
+
+def test_every_shipped_model_has_the_criterion_of_simulated_images():
+    for name in ("freefall", "inclined", "perturbed"):
+        own = sts.Predictor.load(name).preprocessing
+        assert (own.touch_threshold, own.touch_block, own.touch_blocks, own.touch_level) == (3 / 255, 1, 1, False)
+
+
+def test_noise_bright_pixels_and_a_change_of_the_light_are_no_touch_and_a_faint_imprint_is():
+    random = np.random.default_rng(1)
+
+    def taken(change):
+        return np.clip(np.round(BLANK.astype(float) + change + random.normal(0, 4, (40, *BLANK.shape))), 0, 255).astype(
+            np.uint8
+        )
+
+    imprint, bright = np.zeros(BLANK.shape), np.zeros(BLANK.shape)
+    imprint[30:36, 10:20] = [-25, 10, 15]
+    bright[5, 5] = bright[50, 20] = 70
+    own = training.touch_of_noisy_images(training.Preprocessing(), taken(imprint), BLANK)
+    assert own.touch_threshold * 255 == pytest.approx(
+        6 * 4 / 2, rel=0.15
+    )  # the mean of 2 x 2 pixels has half the noise
+    assert touched(training.Preprocessing(), taken(0)).all()  # the criterion of simulated images fails
+    assert not touched(own, taken(0)).any()
+    assert not touched(own, taken(-20)).any()
+    assert not touched(own, taken(bright)).any()
+    assert touched(own, taken(imprint)).all()
+    assert touched(own, taken(imprint + 20)).all()
+    again = training.preprocessing_from_json(dataclasses.asdict(own))
+    assert again == own
+
+
+def test_images_of_another_resolution_and_invalid_fields_are_refused():
+    with pytest.raises((ValueError, TypeCheckError), match="tactile"):
+        training.touch_of_noisy_images(training.Preprocessing(), np.zeros((2, 32, 32, 3), np.uint8), BLANK)
+    with pytest.raises(ValueError, match="touch_block must divide"):
+        training.Preprocessing(touch_block=3)
+    with pytest.raises(ValueError, match="touch_blocks must be >= 1"):
+        training.Preprocessing(touch_blocks=0)
+
+
+@pytest.mark.slow
+def test_the_criterion_finds_light_contacts_of_a_noisy_twin_and_nothing_on_its_empty_pad():
+    size = (240, 320)
+    sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(0), "camera")
+    gentle = sts.physics.Released(carried=(0.05, 0.1))  # the pad carries 5 to 10 % of the weight
+    scene = twin.ObjectScene(body, sensor=sensor, scenario=gentle, resolution=size, motion_rate=0.2)
+    lens = hardware.Lens.ideal(size[1], size[0])
+    noisy = twin.Imperfections(full_well=800, read_noise=0.005)  # three times the noise of the default
+    warp = twin.lens_warp(lens, sensor.camera, size)
+    with twin.Twin(scene, imperfections=noisy, warp=warp) as device:
+
+        def view():
+            device.set((255,) * 4)
+            device.step(0.2)
+            return hardware.rectified(lens, sensor.camera, device.capture()[1], (64, 64))
+
+        blank = np.round(np.mean([view() for _ in range(20)], axis=0)).astype(np.uint8)
+        empty = np.stack([view() for _ in range(100)])
+        held = []
+        for _ in range(24):
+            device.command("hold")
+            device.step(0.2)
+            held.append(view())
+            assert device.state.phase == "held"
+    held = np.stack(held)
+    own = training.touch_of_noisy_images(training.Preprocessing(), held, blank)
+    before = touched(training.Preprocessing(), empty, blank).mean()
+    false, true = touched(own, empty, blank).mean(), touched(own, held, blank).mean()
+    print(
+        f"threshold {255 * own.touch_threshold:.1f} of 255; empty pad: {false:.2f} of 100 images are touches "
+        f"({before:.2f} by the criterion of simulated images); light contacts: {true:.2f} of {len(held)}"
+    )
+    assert before > 0.5
+    assert false <= 0.01
+    assert true >= 0.95

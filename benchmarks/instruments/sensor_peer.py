@@ -15,6 +15,7 @@ import numpy as np
 
 from benchmarks.instruments.camera_server import SIZE, Image, MotionJpeg, draw, jpeg, number_of
 from benchmarks.instruments.led_peer import Peer
+from benchmarks.instruments.shown import Shown
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 
@@ -72,6 +73,7 @@ class Exposure:
     """One frame as the camera took it."""
 
     shares: list[float]  # shares of the light that occurred during it. A frame of one light has one
+    mean: float  # their mean
     start_s: float  # on `time.monotonic`
     end_s: float
 
@@ -97,7 +99,7 @@ class SeenLights(MotionJpeg):
             return super()._frame()
         end_s = time.monotonic() - self.lag_s
         shares, mean = self.lights.shares(end_s - self.exposure_s, end_s)
-        self.log[self.number] = Exposure(shares, end_s - self.exposure_s, end_s)
+        self.log[self.number] = Exposure(shares, mean, end_s - self.exposure_s, end_s)
         width, height = self.size
         image = np.full((height, width, 3), DARK if self.blind else DARK + mean * (LIT - DARK), np.uint8)
         if self.numbered:
@@ -161,3 +163,12 @@ class SensorPeer:
         """Unplug both devices."""
         self.camera.stop()
         self.leds.vanish()
+
+    def shown(self) -> dict[int, Shown]:
+        """The light of each frame, by `key` of its image."""
+        return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
+
+
+def key(image: Image) -> int:
+    """The number of the frame that an image shows, from its corner."""
+    return number_of(image[:CORNER, :CORNER])

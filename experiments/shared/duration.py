@@ -3,6 +3,7 @@
 import dataclasses
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -62,6 +63,11 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
     repeats = len(config.splits)
     lines = [*once, *(line._replace(seconds=repeats * line.seconds) for line in each)]
     lines.append(Line("together", sum(line.seconds for line in lines), f"for {', '.join(config.splits)} split"))
+    return shown(lines)
+
+
+def shown(lines: Sequence[Line]) -> str:
+    """Parts of an experiment with their seconds, as text."""
     return "\n".join(f"{line.part:<36}{line.seconds:>9.0f} s   ({line.note})" for line in lines)
 
 

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
+from sts_jax import hardware
 from sts_jax.dataset import LockedError
 
 # The types of errors that the library raises for input that the user can correct
@@ -12,6 +13,9 @@ CORRECTABLE = (
     ImportError,
     FloatingPointError,
     LockedError,
+    hardware.CameraError,
+    hardware.LightError,
+    hardware.NoContrastError,
 )
 
 

@@ -19,15 +19,12 @@ from sts_jax import hardware
 from sts_jax.hardware import guide
 
 SIDE = 384  # pixels, of the images that are shown
-_DARK = 0.05  # brightness of a background below which it is not divided out
-_LARGEST_GAIN = 4.0  # by which a background may brighten a pixel
 _RECENT_S = 3.0  # s, over which the rate is measured
 _KEPT = 4096  # latencies that are kept for the median
 _OCCUPIED = 8.0  # of 255, change of a block of the visual image that shows an object
 _BLOCKS = 3  # such blocks
 
 Image = UInt8[np.ndarray, "height width 3"]
-Stream = hardware.sts.Stream
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,16 +78,22 @@ class Views:
         """The view of a raw image, for a model, [0, 1]."""
         return hardware.rectified(self.lens, self.pinhole, image, resolution).astype(np.float32) / 255
 
-    def gain(self, stream: Stream, blank: Float[Array, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
-        """Factors that turn the view of the empty pad into the model's image of the untouched sensor.
+    def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
+        """Raw images as a model takes them, in the light of its untouched sensor.
 
-        They remove vignetting, and differences in the brightness and the colour of the lights.
+        Args:
+            visual: Raw image.
+            tactile: Raw image.
+            empty: The images of the untouched sensor, `Predictor.empty`.
         """
-        simulated = np.asarray(blank)
-        if self.backgrounds is None or not self.backgrounds.divided:
-            return np.ones_like(simulated)
-        real = self.floats(getattr(self.backgrounds, stream), simulated.shape[:2])
-        return np.where(real > _DARK, np.minimum(simulated / np.maximum(real, _DARK), _LARGEST_GAIN), 1.0)
+        model = hardware.SensorView(**empty)
+        rows, columns = model.visual.shape[:2]
+        size, empty_pad = (rows, columns), self.backgrounds
+        view = hardware.SensorView(self.floats(visual, size), self.floats(tactile, size))
+        if empty_pad is None or not empty_pad.divided:
+            return view
+        background = hardware.SensorView(self.floats(empty_pad.visual, size), self.floats(empty_pad.tactile, size))
+        return hardware.relit(view, background, model)
 
 
 class Live:
@@ -132,8 +135,7 @@ class Live:
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
         self._show = show
         self._streams = tuple(name for name in ("visual", "tactile") if name in predictor.modalities)
-        blank = predictor.blank
-        self._gain = {name: views.gain(name, blank[name]) for name in self._streams}
+        self._untouched = predictor.empty
         empty = views.backgrounds
         self._empty = None if empty is None else hardware.known_pad(empty.visual, empty.tactile)
         self.offered = self.made = 0
@@ -144,7 +146,7 @@ class Live:
         self._newest: Predicted | None = None
         self._error: BaseException | None = None
         self._stopped = False
-        self._compute({name: np.asarray(blank[name]) for name in self._streams}, contact=True)
+        self._compute(self._untouched, contact=True)
         self._thread = threading.Thread(target=self._run, name="predictions", daemon=True)
         self._thread.start()
 
@@ -218,13 +220,8 @@ class Live:
 
     def _predict(self, visual: hardware.Shot, tactile: hardware.Shot) -> Predicted:
         contact, occupied = self._contact(visual, tactile)
-        resolution = self._predictor.preprocessing.resolution
-        shots = {"visual": visual, "tactile": tactile}
-        views: dict[str, np.ndarray] = {
-            name: np.clip(self._views.floats(shots[name].image, resolution) * self._gain[name], 0, 1)
-            for name in self._streams
-        }
-        found = self._compute(views, contact=contact is not False)
+        view = self._views.prepared(visual.image, tactile.image, self._untouched)
+        found = self._compute(view._asdict(), contact=contact is not False)
         names = self._outcomes
         chances = [] if found.outcome_probability is None else np.asarray(found.outcome_probability).tolist()
         if len(names) != len(chances):
@@ -240,7 +237,7 @@ class Live:
 
     def _compute(self, views: Mapping[str, np.ndarray], *, contact: bool) -> sts.Prediction:
         """Predict, and wait for the result. A touch without contact does not count."""
-        touch = views.get("tactile")
+        touch = views["tactile"] if "tactile" in self._streams else None
         present: dict[str, ArrayLike] | None = None if touch is None else {"tactile": np.bool_(contact)}
         found = self._predictor(visual=views["visual"], tactile=touch, condition=self._condition, present=present)
         return jax.block_until_ready(found)

@@ -1,7 +1,8 @@
 """Evaluation of predictions: metrics per item, tables with intervals, ceilings and figures."""
 
-from sts_jax.evaluation import figures, metrics
+from sts_jax.evaluation import figures, gap, metrics
 from sts_jax.evaluation.catalogue import COLUMNS, METRICS
+from sts_jax.evaluation.images import STREAMS, image_baselines, image_summary
 from sts_jax.evaluation.outcomes import emptiness, frequency, outcome_of_image, outcome_of_pose, shares
 from sts_jax.evaluation.predictions import TRUE_STATE, Forecaster, Predicted, first, joined, predict, subsets
 from sts_jax.evaluation.records import Column, Judged, Metric, Scores
@@ -20,6 +21,7 @@ __all__ = [
     "COLUMNS",
     "METRICS",
     "ONE_REROLL",
+    "STREAMS",
     "TRUE_STATE",
     "Column",
     "Forecaster",
@@ -35,6 +37,9 @@ __all__ = [
     "frequency",
     "full_table",
     "gain",
+    "gap",
+    "image_baselines",
+    "image_summary",
     "joined",
     "metrics",
     "outcome_of_image",

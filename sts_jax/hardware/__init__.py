@@ -27,7 +27,7 @@ from sts_jax.hardware.camera_errors import (
     FrozenCameraError,
     StaleFrameError,
 )
-from sts_jax.hardware.collecting import Action, AutomaticPerson, Person, View, collect
+from sts_jax.hardware.collecting import Action, AutomaticPerson, PairReader, Person, View, collect
 from sts_jax.hardware.coverage import check_view, covered, view_angle
 from sts_jax.hardware.devices import FoundCamera, find_cameras
 from sts_jax.hardware.exposure import Exposed, brightness, choose_exposure
@@ -57,13 +57,16 @@ from sts_jax.hardware.recordings import (
     discard_recording,
     list_recordings,
     load_recordings,
+    next_recording,
     restore_recording,
 )
 from sts_jax.hardware.replay import Replay
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
 from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
-from sts_jax.hardware.sts import STS, FoundSensors, LightError, NotStillError, Pair, Shot, find_sensors
+from sts_jax.hardware.shots import LightError, NotStillError, Pair, Shot
+from sts_jax.hardware.sts import STS, FoundSensors, find_sensors
+from sts_jax.hardware.views import Moments, SensorView, moments, relit, sensor_view
 
 __all__ = [
     "STS",
@@ -104,11 +107,13 @@ __all__ = [
     "Lens",
     "LightError",
     "Lit",
+    "Moments",
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
     "Origin",
     "Pair",
+    "PairReader",
     "Person",
     "Pinhole",
     "Port",
@@ -120,6 +125,7 @@ __all__ = [
     "Recordings",
     "Replay",
     "SensorFileError",
+    "SensorView",
     "Session",
     "SessionError",
     "Settling",
@@ -149,10 +155,14 @@ __all__ = [
     "known_pad",
     "list_recordings",
     "load_recordings",
+    "moments",
+    "next_recording",
     "project",
     "rectification",
     "rectified",
+    "relit",
     "restore_recording",
     "save_board",
+    "sensor_view",
     "view_angle",
 ]

@@ -10,7 +10,7 @@ from sts_jax.hardware.camera_errors import CameraLostError, CameraTimeoutError, 
 from sts_jax.hardware.guide import EmptyPad, GuideConfig, Stage
 from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError
 from sts_jax.hardware.session import Session, SessionError
-from sts_jax.hardware.sts import STS, LightError, Pair
+from sts_jax.hardware.shots import LightError, Pair
 
 _PASSING = (
     CameraLostError,
@@ -49,6 +49,14 @@ class View:
 
 
 @runtime_checkable
+class PairReader(Protocol):
+    """What takes pairs of images: `STS`, or the digital twin's `VirtualSensor`."""
+
+    def read(self) -> Pair:
+        """Take an image of each stream. Both arrive after the call."""
+
+
+@runtime_checkable
 class Person(Protocol):
     """Shows views and returns actions. Neither method may wait."""
 
@@ -75,7 +83,7 @@ class AutomaticPerson:
 
 
 def collect(
-    sensor: STS,
+    sensor: PairReader,
     session: Session,
     person: Person,
     *,
@@ -114,7 +122,7 @@ def collect(
 class _Collecting:
     """The loop of `collect`."""
 
-    def __init__(self, sensor: STS, session: Session, person: Person, config: GuideConfig, note: str):
+    def __init__(self, sensor: PairReader, session: Session, person: Person, config: GuideConfig, note: str):
         self._sensor, self._session, self._person = sensor, session, person
         self._config, self._note = config, note
         self._pair: Pair | None = None  # the newest one

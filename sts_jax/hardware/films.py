@@ -20,7 +20,7 @@ from sts_jax.hardware.camera_errors import CameraOpenError
 from sts_jax.hardware.capture import Capture
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.recorder import FORMAT, FRAMES, HEAD, video_name
-from sts_jax.hardware.sts import Stream
+from sts_jax.hardware.shots import Stream
 
 _AGAIN = "copy the recording again"
 _RATE = 30.0  # frames per second of a video whose header states no rate

@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
 _INTERVALS = 61  # recent intervals between frames, of which the median is the period
 _FEWEST = 8  # intervals from which a period is measured
+_LONG, _SHORT = 2.5, 0.5  # periods: a frame that comes later was held back, and so were those that follow it sooner
 _MADE_UP = 4  # frames after late ones that may still be early. More would add up the error of the period
 
 
@@ -29,6 +30,7 @@ class Captured:
     dropped: int  # frames that the camera lost just before this one, estimated from the times
     repeats: int  # frames just before this one that are identical with it
     black: bool  # whether the image is black, see `is_black`
+    held_back: bool = False  # whether it may be older than its arrival: it came late, or together with one that did
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +80,7 @@ class Pace:
         self._gap: _Gap | None = None
         self._intervals: collections.deque[float] = collections.deque(maxlen=_INTERVALS)
         self.dropped = 0
+        self.held_back = False  # whether the last frame came after 2.5 periods or more, or together with one that did
 
     @property
     def rate(self) -> float | None:
@@ -93,6 +96,8 @@ class Pace:
         self._intervals.append(time_s - last)
         if period is None:
             return 0
+        periods = (time_s - last) / period
+        self.held_back = periods > _LONG or (self.held_back and periods < _SHORT)
         missing = max(round((time_s - last) / period) - 1, 0)
         if missing:
             self._gap = _Gap(last, 1, missing, missing + _MADE_UP)
@@ -110,4 +115,4 @@ class Pace:
 
     def interrupted(self) -> None:
         """Forget the last frame, because the connection was interrupted."""
-        self._last, self._gap = None, None
+        self._last, self._gap, self.held_back = None, None, False

@@ -289,10 +289,12 @@ class Grabber:
                 time_s, sequence = time.monotonic(), self._next
                 self._next += 1
                 if playback is None:
-                    dropped = self._pace.arrived(capture.stamp() or time_s)
+                    stamp = capture.stamp()
+                    dropped = self._pace.arrived(stamp or time_s)
+                    held_back = self._pace.held_back and not stamp
                     self._counts = dataclasses.replace(self._counts, dropped=self._pace.dropped)
                 else:
-                    dropped = 0
+                    dropped, held_back = 0, False
                     self._pace.arrived(time_s)
             if playback is not None:
                 while playback.late() and capture.grab():
@@ -331,7 +333,7 @@ class Grabber:
                 )
                 continue
             image.flags.writeable = False
-            self._publish(Captured(image, time_s, sequence, self._epoch, dropped, repeats, black))
+            self._publish(Captured(image, time_s, sequence, self._epoch, dropped, repeats, black, held_back))
             self._settle_now(capture)
             self._expose_now(capture)
         return False

@@ -31,7 +31,7 @@ from sts_jax.hardware.recordings import encoded
 from sts_jax.hardware.sensor_file import Device, sensor_file
 from sts_jax.hardware.session import Origin
 from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.sts import Shot
+from sts_jax.hardware.shots import Shot
 
 FORMAT = 1  # of the files of a recording, incremented when older files can no longer be read
 HEAD, FRAMES = "recording.json", "frames.jsonl"

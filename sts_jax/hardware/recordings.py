@@ -32,7 +32,7 @@ from sts_jax._files import TornFileError
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.sts import Pair, Shot, Stream
+from sts_jax.hardware.shots import Pair, Shot, Stream
 
 FORMAT = 1  # of the files of a session, incremented when older files can no longer be read
 SESSION, CONFIRMED, PAIR = "session.json", "confirmed.json", "pair.json"
@@ -92,6 +92,12 @@ class Recordings:
 
     def __len__(self) -> int:
         return len(self.numbers)
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of the checksums of all confirmed trajectories. It changes if one is added, discarded or replaced."""
+        files = {number: trajectory_folder(self.folder, number) / CONFIRMED for number in self.numbers}
+        return _files.digest({str(number): _files.sha256(file) for number, file in files.items()})
 
     def __getitem__(self, index: int) -> RecordedTrajectory:
         """The trajectory at an index, which is not its number.
@@ -209,9 +215,9 @@ def list_recordings(folder: str | os.PathLike) -> list[Entry]:
     return sorted(entries, key=lambda entry: entry.number)
 
 
-def next_number(folder: Path) -> int:
-    """The number after all that were ever given."""
-    return max((number for _, number, _ in _numbered(folder)), default=-1) + 1
+def next_recording(folder: str | os.PathLike) -> int:
+    """The number of a session's next trajectory, after all that were ever given. 0 if there is no session yet."""
+    return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
 
 
 def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:

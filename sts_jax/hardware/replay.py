@@ -13,7 +13,8 @@ from sts_jax.hardware.camera_errors import CameraError, CameraNotConnectedError,
 from sts_jax.hardware.films import Film, RecordedFilm, Still, VideoFilm
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.sensor_file import Device, sensor_file
-from sts_jax.hardware.sts import LightError, Pair, Shot, Stream, first_still, stream_order
+from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
+from sts_jax.hardware.sts import first_still, stream_order
 
 _LATE_S = 0.25  # s by which an image may be late. The buffer of a sensor's camera holds as much at 30 frames a second
 

@@ -15,7 +15,8 @@ from sts_jax.hardware import devices, protocol, recordings
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.settling import Settling
-from sts_jax.hardware.sts import STS, Pair
+from sts_jax.hardware.shots import Pair
+from sts_jax.hardware.sts import STS
 
 _JOBS_OF_TRAJECTORY = 3  # two pairs and the confirmation
 _QUEUE = 2 * _JOBS_OF_TRAJECTORY  # jobs that may wait
@@ -85,7 +86,7 @@ class Session:
         """Use `Session.open`."""
         self.folder = folder
         self._lock, self._settling = lock, settling
-        self._next = recordings.next_number(folder)
+        self._next = recordings.next_recording(folder)
         entries = recordings.list_recordings(folder)
         self._confirmed = {entry.number for entry in entries if entry.standing == "confirmed"}
         content = recordings.read_session(folder)

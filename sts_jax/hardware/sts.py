@@ -1,49 +1,32 @@
 """`STS`: camera and lights as one sensor. Every image is proven to be of one light."""
 
-import contextlib
 import dataclasses
 import itertools
 import os
-import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
 
 from sts_jax.hardware import protocol
+from sts_jax.hardware.background import Background
 from sts_jax.hardware.camera import Camera
 from sts_jax.hardware.camera_config import CameraConfig
-from sts_jax.hardware.camera_errors import CameraError, CameraLostError, CameraNotConnectedError, StaleFrameError
+from sts_jax.hardware.camera_errors import CameraNotConnectedError, StaleFrameError
 from sts_jax.hardware.devices import FoundCamera, find_cameras
-from sts_jax.hardware.frames import Captured
-from sts_jax.hardware.leds import Leds, Lit
-from sts_jax.hardware.ports import DisconnectedError, LedTimeoutError, Port, find_controllers
+from sts_jax.hardware.leds import Leds
+from sts_jax.hardware.ports import Port, find_controllers
+from sts_jax.hardware.proof import ProvenFrames
 from sts_jax.hardware.sensor_file import Device
-from sts_jax.hardware.settling import Settling, Switch, Thumbnail, check_contrast, difference, settling, thumbnail
+from sts_jax.hardware.settling import Settling, thumbnail
+from sts_jax.hardware.shots import NotStillError, Pair, Shot, Stream
 
-Stream = Literal["visual", "tactile"]
-
-_DEPARTED = 0.5  # of the contrast, by which a frame must differ from the last one before the switch
-_AGAIN_S = 1.0  # s, after which a switch that does not show is repeated
-_ATTEMPTS = 3  # to measure the settling
 _SWITCHES = 8  # of each direction, to measure the settling
-_PHASE = 0.618  # of a period, by which the phase of the measured switches advances
-_CHECK_S = 0.1  # s, least time between two questions to the controller while frames show another light
-_GRACE_S = 0.2  # s, by which a wait for the camera may exceed a limit, so that the cause of a delay is the one reported
 _STILL = 6.0  # of 255, change of a thumbnail's pixel that always counts as still
 _NOISE = 8.0  # times the median change of all pixels, which counts as still too. Noise has changes of 5 times that
-
-
-class LightError(RuntimeError):
-    """No image of the wanted light could be taken in time."""
-
-
-class NotStillError(TimeoutError):
-    """The view did not come to rest in time."""
 
 
 class FoundSensors(NamedTuple):
@@ -51,31 +34,6 @@ class FoundSensors(NamedTuple):
 
     cameras: list[FoundCamera]
     ports: list[Port]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Shot:
-    """An image of one stream.
-
-    The lights were the same without interruption from `before.acknowledged_s` until `until_s`, and the frame arrived
-    between both, later than the settling time after the former.
-    """
-
-    image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only
-    stream: Stream
-    time_s: float  # arrival of the frame, on the clock `time.monotonic` (s)
-    sequence: int  # number of the frame
-    epoch: int  # number of the camera's connection
-    before: Lit  # the controller's answer before the frame
-    until_s: float  # time until which the controller's later answer proves the lights unchanged (s)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Pair:
-    """Both streams of one moment."""
-
-    visual: Shot
-    tactile: Shot
 
 
 def find_sensors() -> FoundSensors:
@@ -144,18 +102,8 @@ class STS:
         self._exposures = exposures
         self._device: Device | None = None
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
-        self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
-        self._stream: Stream = "visual"
-        self._contrast: float | None = None  # of images without and with the light, of 255
-        self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
-        self._black: dict[Stream, bool] = {}  # whether this image was black
-        self._previous: Captured | None = None  # the last frame of the camera
-        self._reference: Thumbnail | None = None  # of the last frame before the switch
-        self._departed = 0  # successive frames since the switch that show the new light, 2 and more: all are of it
-        self._doubtful = False  # whether the lights may have switched without an answer, so late frames may show it
-        self._background: _Background | None = None
-        self._stopping = False  # whether the thread in the background is to end
-        self.discarded = 0  # frames that could not be proven to be of one light
+        self._frames: ProvenFrames | None = None  # of the last connection
+        self._background: Background | None = None
 
     @classmethod
     def from_file(
@@ -237,6 +185,11 @@ class STS:
         return self._levels
 
     @property
+    def discarded(self) -> int:
+        """Number of frames since `connect` that could not be proven to be of one light."""
+        return 0 if self._frames is None else self._frames.discarded
+
+    @property
     def settling(self) -> Settling:
         """The settling times that are in use.
 
@@ -272,10 +225,18 @@ class STS:
                 self._device.check_identity(leds=self._leds.serial_number)
             if not self._camera.is_connected:
                 self._camera.connect(warmup_s)
+            self._frames = ProvenFrames(
+                self._camera,
+                self._leds,
+                levels=self._levels,
+                exposures=self._exposures,
+                timeout_s=self._timeout_s,
+                reconnect_s=self._reconnect_s,
+            )
             if self._settling is None:
-                self._settling = self.measure_settling()
+                self.measure_settling()
             else:
-                self._see_both(self._settling)
+                self._frames.see_both(self._settling)
         except BaseException:
             self.disconnect()
             raise
@@ -284,8 +245,7 @@ class STS:
     def disconnect(self) -> None:
         """Turn the lights off and close both devices. Without a connection, it does nothing."""
         self._stop_background()
-        leds, self._leds, self._lit = self._leds, None, None
-        self._contrast, self._looks = None, {}
+        leds, self._leds = self._leds, None
         if leds is not None:
             leds.close()
         self._camera.disconnect()
@@ -306,7 +266,7 @@ class STS:
             CameraError: There are no frames, for the reasons that `Camera.read` states.
         """
         self._stop_background()
-        return self._pair(timeout_ms)
+        return self._connected.pair(time.monotonic() + self._limit_s(timeout_ms, 2))
 
     def async_read(self, timeout_ms: float | None = None) -> Pair:
         """Return the newest pair that has not been returned yet, or wait for the next one.
@@ -385,7 +345,7 @@ class STS:
         return first_still(self._images(0.0, 1), timeout_s, window_s)
 
     def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 1.0) -> Settling:
-        """Measure how long after an acknowledgement frames with the former light arrive.
+        """Measure how long after an acknowledgement frames with the former light arrive, and use the result.
 
         Args:
             switches: Number of switches in each direction.
@@ -396,50 +356,8 @@ class STS:
             NoContrastError: The lights do not change the image.
             LightError: The image still changes at the end of a watch, three times in a row.
         """
-        for _ in range(_ATTEMPTS - 1):
-            with contextlib.suppress(LightError):
-                return self._measured(switches, watch_s)
-        return self._measured(switches, watch_s)
-
-    def _measured(self, switches: int, watch_s: float) -> Settling:
-        """One attempt of `measure_settling`, which a movement or a delay of the computer can spoil."""
-        self._lit = None
-        period_s = self._period_s()
-        self._watched("visual", watch_s)
-        on, off = [self._watched("tactile", watch_s)], [self._watched("visual", watch_s)]
-        found = self._settled(on, off, period_s, watch_s)
-        shorter_s = min(3 * max(found.visual_s, found.tactile_s) + 3 * period_s, watch_s)
-        for number in range(1, switches):
-            phase_s = period_s * (_PHASE * number % 1)  # a watch ends just after a frame
-            time.sleep(phase_s)
-            on.append(self._watched("tactile", shorter_s))
-            time.sleep(phase_s)
-            off.append(self._watched("visual", shorter_s))
-        found = self._settled(on, off, period_s, shorter_s)
-        self._compare_with(off[-1].thumbnails[-1], on[-1].thumbnails[-1])
-        return found
-
-    def _compare_with(self, dark: Thumbnail, lit: Thumbnail) -> None:
-        """Keep images without and with the light, with which later ones are compared."""
-        self._contrast = difference(dark, lit)
-        check_contrast(self._contrast)
-        self._looks = {"visual": dark, "tactile": lit}
-
-    def _see_both(self, settling: Settling) -> None:
-        """Take an image of each light, with which the first frames are compared."""
-        lit = self._watched("tactile", 2 * settling.tactile_s).thumbnails[-1]
-        dark = self._watched("visual", 2 * settling.visual_s).thumbnails[-1]
-        self._compare_with(dark, lit)
-
-    def _settled(self, on: list[Switch], off: list[Switch], period_s: float, watch_s: float) -> Settling:
-        found = settling(on, off, period_s)
-        slowest_s = max(found.visual_s, found.tactile_s)
-        if slowest_s > watch_s - period_s:
-            raise LightError(
-                f"the image still changes {slowest_s:.2f} s after a switch: keep the scene at rest, lock the camera's "
-                f"exposure, or watch for longer than {watch_s:.2f} s."
-            )
-        return found
+        self._settling = self._connected.measure_settling(switches, watch_s)
+        return self._settling
 
     def __enter__(self) -> "STS":
         return self if self._leds is not None and self._camera.is_connected else self.connect()
@@ -449,169 +367,9 @@ class STS:
     ) -> None:
         self.disconnect()
 
-    def _pair(self, timeout_ms: float | None = None) -> Pair:
-        deadline = time.monotonic() + self._limit_s(timeout_ms, 2)
-        first = self._stream
-        second: Stream = "tactile" if first == "visual" else "visual"
-        while True:
-            one = self._shot(first, deadline, after_s=time.monotonic(), then=second)
-            two = self._shot(second, deadline)
-            if one.epoch == two.epoch and one.before.boot == two.before.boot:
-                return Pair(one, two) if first == "visual" else Pair(two, one)
-
     def _images(self, duty: float, dwell: int) -> Iterator[Shot]:
         for stream in stream_order(duty, dwell):
-            yield self._shot(stream, time.monotonic() + self._timeout_s)
-
-    def _shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
-        """An image of one stream that arrives after a time.
-
-        With `then`, the lights are switched to that stream afterwards, and the answer to this switch is the proof.
-        """
-        while True:
-            try:
-                if self._doubtful:
-                    # Late frames may show the former light and then a mixed one. After a frame of the other light, all
-                    # frames that still come are of a single switch.
-                    self._frame("visual" if stream == "tactile" else "tactile", deadline, 0.0)
-                    self._doubtful = False
-                before, frame = self._frame(stream, deadline, after_s)
-                until_s = self._proof(before, then)
-            except (DisconnectedError, LedTimeoutError):
-                lost_s = time.monotonic()
-                self._lit, self._doubtful = None, True
-                self.leds.reconnect(limit_s=self._reconnect_s)
-                deadline += time.monotonic() - lost_s
-                continue
-            if until_s is not None:
-                self._black[stream], self._looks[stream] = frame.black, thumbnail(frame.image)
-                return Shot(frame.image, stream, frame.time_s, frame.sequence, frame.epoch, before, until_s)
-            self.discarded += 1
-            self._doubtful = True
-
-    def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
-        """A frame that arrives when the light has settled, and the answer of the controller before it."""
-        lit, checked_s = self._switched(stream), 0.0
-        settled_s = self.settling.visual_s if stream == "visual" else self.settling.tactile_s
-        while not self._stopping:
-            left_s = deadline - time.monotonic()
-            if left_s <= 0:
-                raise self._light_error(stream)
-            try:
-                frame = self._camera.async_read(1000 * (left_s + _GRACE_S))
-            except CameraLostError:
-                if time.monotonic() >= deadline:
-                    raise
-                continue
-            spoilt = self._repeats(frame) or (frame.black and self._black.get(stream) is False)
-            if self._departed < 2 and not spoilt:
-                self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
-            self._previous = frame
-            late_s = frame.time_s - max(lit.acknowledged_s + settled_s, after_s)
-            if self._departed >= 2 and late_s >= 0 and not spoilt:
-                return lit, frame
-            self.discarded += 1
-            if self._departed == 0 and late_s >= 0 and time.monotonic() >= checked_s + _CHECK_S:
-                if not self.leds.ping().unchanged_since(lit):  # the controller has turned its lights off
-                    lit = self._set(stream)
-                elif frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
-                    # The scene may have changed at the switch. It is repeated, and compared with a newer frame.
-                    self._watched("tactile" if stream == "visual" else "visual", settled_s)
-                    lit = self._set(stream)
-                checked_s = time.monotonic()
-        raise LightError("the thread that takes pairs was stopped.")
-
-    def _light_error(self, stream: Stream) -> LightError:
-        cause = "check that the LEDs light up, that the camera's exposure is locked, and its rate"
-        if self._previous is not None and self._previous.black:
-            cause = "its frames are black now, so check the camera, or connect again if the scene has become dark"
-        return LightError(
-            f"no frame of {self._camera.config.name} could be proven to be of the {stream} stream in time "
-            f"({self.discarded} frames were discarded so far): {cause}."
-        )
-
-    def _shows(self, frame: Captured, stream: Stream) -> bool:
-        """Whether the image has changed since the switch by at least half as much as it does with the light.
-
-        If the light before is unknown, whether the image is nearer to the last one of its stream than to the other.
-        """
-        look = thumbnail(frame.image)
-        if self._reference is not None and self._contrast is not None:
-            return difference(look, self._reference) > _DEPARTED * self._contrast
-        if len(self._looks) < 2:
-            return True
-        other: Stream = "tactile" if stream == "visual" else "visual"
-        return difference(look, self._looks[stream]) < difference(look, self._looks[other])
-
-    def _repeats(self, frame: Captured) -> bool:
-        """Whether a frame is the one before once more, in a scene that is not free of noise."""
-        return frame.repeats > 0 and self._camera.config.frozen_after_s is not None
-
-    def _in_order(self, frame: Captured) -> bool:
-        """Whether a frame is the next one after the last."""
-        last = self._previous
-        return last is not None and (frame.epoch, frame.sequence) == (last.epoch, last.sequence + 1)
-
-    def _switched(self, stream: Stream) -> Lit:
-        """Set the lights of a stream unless they are known to be set."""
-        if self._lit is None or self._stream != stream:
-            self._set(stream)
-        assert self._lit is not None
-        return self._lit
-
-    def _set(self, stream: Stream) -> Lit:
-        before = self._previous if self._lit is not None and self._stream != stream else None
-        if self._exposures is not None and self._exposures[0] != self._exposures[1]:
-            self._expose(self._exposures[stream == "tactile"])
-        lit = self.leds.set(self._levels if stream == "tactile" else protocol.DARK)
-        self._reference = None if before is None else thumbnail(before.image)
-        self._lit, self._stream, self._departed = lit, stream, 0
-        return lit
-
-    def _expose(self, exposure: float) -> None:
-        """Set the exposure before the lights, so that the settling covers both."""
-        if self._camera.set_exposure(exposure) is None:
-            raise CameraError(
-                f"the driver of {self._camera.config.name} does not let the exposure be set to {exposure:g}: give "
-                "exposures=None."
-            )
-
-    def _proof(self, before: Lit, then: Stream | None) -> float | None:
-        """The time until which the lights are proven to be unchanged, or None if they changed. May switch them."""
-        if then == self._stream:
-            then = None
-        # The watchdog turns the lights off as a switch to the visual stream does, and the counter of changes would not
-        # tell one from the other.
-        if then is None or self._stream == "tactile":
-            after = self.leds.ping()
-            if not after.unchanged_since(before):
-                self._lit = None
-                return None
-            if then is not None:
-                self._set(then)
-            return after.sent_s
-        after = self._set(then)
-        # Nothing but a request turns the lights on, so a single change is that of this request.
-        return after.sent_s if (after.boot, after.counter) == (before.boot, before.counter + 1) else None
-
-    def _watched(self, stream: Stream, watch_s: float) -> Switch:
-        """Switch the lights and collect the frames that arrive during a time, with thumbnails."""
-        lit = self._set(stream)
-        delays: list[float] = []
-        looks: list[Thumbnail] = []
-        while not delays or delays[-1] < watch_s:
-            frame = self._previous = self._camera.async_read(1000 * self._timeout_s)
-            delays.append(frame.time_s - lit.acknowledged_s)
-            looks.append(thumbnail(frame.image))
-        return Switch(np.array(delays, np.float32), np.array(looks, np.float32))
-
-    def _period_s(self) -> float:
-        """The time between two frames, measured from some frames if it is not known yet."""
-        while True:
-            rate = self._camera.statistics.rate
-            if rate is not None:
-                return 1 / rate
-            self._camera.async_read()
+            yield self._connected.shot(stream, time.monotonic() + self._timeout_s)
 
     def _limit_s(self, timeout_ms: float | None, images: int) -> float:
         if timeout_ms is None:
@@ -620,71 +378,26 @@ class STS:
             raise ValueError(f"timeout_ms must be > 0, got {timeout_ms}")
         return timeout_ms / 1000
 
-    def _started(self) -> "_Background":
-        self.leds  # noqa: B018  raises an error if the sensor is not connected
-        if self._background is None:
-            self._background = _Background(self)
+    @property
+    def _connected(self) -> ProvenFrames:
+        if self._leds is None or self._frames is None:
+            raise CameraNotConnectedError("the sensor is not connected: call connect() first.")
+        return self._frames
+
+    def _started(self) -> Background:
+        """The thread in the background, a new one if the last one has failed and its error has been raised."""
+        frames = self._connected
+        if self._background is None or self._background.reported:
+            self._background = Background(
+                lambda: frames.pair(time.monotonic() + self._limit_s(None, 2)), interrupt=frames.stop
+            )
         return self._background
 
     def _stop_background(self) -> None:
         background, self._background = self._background, None
         if background is not None:
-            self._stopping = True
             background.stop()
-            self._stopping = False
-
-
-class _Background:
-    """A thread that takes pairs continuously and keeps the newest one."""
-
-    def __init__(self, sensor: STS):
-        self._sensor = sensor
-        self._changed = threading.Condition()
-        self._pair: Pair | None = None
-        self._fresh = False
-        self._error: BaseException | None = None
-        self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="pairs of the sensor", daemon=True)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._stopped:
-            try:
-                pair = self._sensor._pair()
-            except Exception as error:  # raised by the next call of the user
-                with self._changed:
-                    self._error = error
-                    self._changed.notify_all()
-                return
-            with self._changed:
-                self._pair, self._fresh = pair, True
-                self._changed.notify_all()
-
-    def latest(self) -> Pair | None:
-        """The newest pair, or None. Raises the thread's error."""
-        with self._changed:
-            self._raise()
-            return self._pair
-
-    def next(self, limit_s: float) -> Pair:
-        """The newest pair that was not returned by this method yet. Raises the thread's error."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._fresh or self._error is not None, limit_s):
-                raise LightError(f"no pair was taken within {limit_s:g} s: call read() to see the reason.")
-            self._raise()
-            self._fresh = False
-            assert self._pair is not None
-            return self._pair
-
-    def stop(self) -> None:
-        """End the thread."""
-        self._stopped = True
-        self._thread.join()
-
-    def _raise(self) -> None:
-        if self._error is not None:
-            self._sensor._background = None
-            raise self._error
+            self._connected.resume()
 
 
 def stream_order(duty: float, dwell: int) -> Iterator[Stream]:

@@ -9,8 +9,22 @@ from sts_jax.training.learners import Learner, Loss, learner
 from sts_jax.training.loop import initial, step, train
 from sts_jax.training.model import Model, load
 from sts_jax.training.optimisers import optimiser
-from sts_jax.training.preprocess import Preprocessing, load_blank, preprocessing_from_json, save_blank
-from sts_jax.training.trajectories import moments, paper_model, state_codes, state_model, state_moments
+from sts_jax.training.preprocess import (
+    Preprocessing,
+    load_blank,
+    preprocessing_from_json,
+    save_blank,
+    touch_of_noisy_images,
+)
+from sts_jax.training.shifts import shifted
+from sts_jax.training.trajectories import (
+    image_moments,
+    moments,
+    paper_model,
+    state_codes,
+    state_model,
+    state_moments,
+)
 
 __all__ = [
     "Arrays",
@@ -22,6 +36,7 @@ __all__ = [
     "TrainState",
     "Weights",
     "calibrate",
+    "image_moments",
     "initial",
     "learner",
     "load",
@@ -36,9 +51,11 @@ __all__ = [
     "save_blank",
     "save_calibration",
     "seal",
+    "shifted",
     "state_codes",
     "state_model",
     "state_moments",
     "step",
+    "touch_of_noisy_images",
     "train",
 ]

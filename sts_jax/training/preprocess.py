@@ -4,14 +4,21 @@ import dataclasses
 import io
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
 from sts_jax import _files, geometry
 from sts_jax.training import manifest
+
+# The contact test of noisy images, with the values of the contact test during a collection (`hardware.GuideConfig`)
+_NOISY_BLOCK = 2  # pixels
+_NOISY_BLOCKS = 3
+_DEVIATIONS = 6.0  # standard deviations of a block's mean
+_SMALLEST, _LARGEST = 3.0, 24.0  # of 255, limits of the threshold
+_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,13 +32,21 @@ class Preprocessing:
     # its sign changes (Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks").
     rotation: Literal["matrix", "quaternion"] = "matrix"
     mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is, as in the paper)
-    touch_threshold: float = 3 / 255  # an image is a touch if a pixel differs from the blank image by more than this
+    touch_threshold: float = 3 / 255  # blocks of a touch differ from those of the blank image by more than this
+    # The defaults are for simulated images. `touch_of_noisy_images` sets these fields for images of a camera.
+    touch_block: int = 1  # pixels, side of the blocks whose means are compared
+    touch_blocks: int = 1  # number of blocks that differ in a touch
+    touch_level: bool = False  # subtract the median change first, so that a change of the whole light is no touch
     absent: tuple[str, ...] = ()  # modalities that no training input had
     condition_scale: tuple[float, ...] = ()  # SI units, divisors of the numbers of the scenario's condition
 
     def __post_init__(self) -> None:
         if self.rotation not in ("matrix", "quaternion"):
             raise ValueError(f"rotation must be 'matrix' or 'quaternion', got {self.rotation!r}")
+        if self.touch_block < 1 or any(side % self.touch_block for side in self.resolution):
+            raise ValueError(f"touch_block must divide the resolution {self.resolution}, got {self.touch_block}")
+        if self.touch_blocks < 1:
+            raise ValueError(f"touch_blocks must be >= 1, got {self.touch_blocks}")
 
     @property
     def pose_size(self) -> int:
@@ -67,7 +82,56 @@ class Preprocessing:
         """Whether a tactile image differs somewhere from the blank one, or True if blank touches are not masked."""
         if not self.mask_blank_touch:
             return jnp.ones(tactile.shape[:-3], bool)
-        return jnp.max(jnp.abs(tactile - blank), axis=(-3, -2, -1)) > self.touch_threshold
+        change = _block_means(tactile - blank, self.touch_block)
+        if self.touch_level:
+            change = change - jnp.median(change, axis=(-3, -2), keepdims=True)
+        differs = jnp.any(jnp.abs(change) > self.touch_threshold, axis=-1)
+        return jnp.sum(differs, axis=(-2, -1)) >= self.touch_blocks
+
+
+def touch_of_noisy_images(
+    preprocessing: Preprocessing, tactile: UInt8[np.ndarray, "n h w 3"], blank: UInt8[np.ndarray, "h w 3"]
+) -> Preprocessing:
+    """Set the criterion for a touch by the noise of a camera's images.
+
+    A touch differs from the blank image in three blocks of 2 x 2 pixels by more than six standard deviations of the
+    noise of a block's mean, and by at least 3 of 255. The noise is 1.4826 times the median absolute difference from the
+    blank image, so that contacts on less than half of the pad do not count. Slow changes of the light since the blank
+    image count as noise.
+
+    Args:
+        preprocessing: The other fields.
+        tactile: Images of the empty pad, or with contacts on less than half of it.
+        blank: The tactile image of the untouched sensor, a mean over many frames.
+
+    Raises:
+        ValueError: The images have another resolution than the preprocessing, or there are none.
+    """
+    shape = (*preprocessing.resolution, 3)
+    if tactile.shape[1:] != shape or blank.shape != shape or not len(tactile):
+        raise ValueError(
+            f"tactile has shape {tactile.shape} and blank has shape {blank.shape}, but they must be (n, "
+            f"{', '.join(map(str, shape))}) with n >= 1 and {shape}: reduce the images to the resolution"
+        )
+    change = _block_means(tactile.astype(np.float32) - blank, _NOISY_BLOCK)
+    change = change - np.median(change, axis=(-3, -2), keepdims=True)
+    noise = _NORMAL * float(np.median(np.abs(change)))
+    threshold = min(max(_DEVIATIONS * noise, _SMALLEST), _LARGEST) / 255
+    return dataclasses.replace(
+        preprocessing,
+        touch_threshold=threshold,
+        touch_block=_NOISY_BLOCK,
+        touch_blocks=_NOISY_BLOCKS,
+        touch_level=True,
+    )
+
+
+def _block_means(images: Any, side: int) -> Any:
+    """Means over blocks of `side` x `side` pixels of images (*n, h, w, 3), of NumPy or JAX."""
+    if side == 1:
+        return images
+    height, width = images.shape[-3] // side, images.shape[-2] // side
+    return images.reshape(*images.shape[:-3], height, side, width, side, 3).mean((-4, -2))
 
 
 def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import UInt8
 
 from sts_jax import mvae, optics, physics, statespace
 from sts_jax.dataset import Ends, Pairs, Views, reduced
@@ -32,13 +33,54 @@ def moments(
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
-    touched = _touched(pairs, preprocessing, blank)
+    return _moments(found, modalities, preprocessing, blank, condition if condition.shape[1] else None)
+
+
+def image_moments(
+    visual: UInt8[np.ndarray, "n 2 h w 3"],
+    tactile: UInt8[np.ndarray, "n 2 h w 3"],
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: UInt8[np.ndarray, "h w 3"],
+) -> tuple[Arrays, Preprocessing]:
+    """`moments` of images without poses, such as those of a real sensor (`hardware.moments`).
+
+    Args:
+        visual: first and last images.
+        tactile: first and last images.
+        modalities: modalities of the model, some of `visual` and `tactile`.
+        preprocessing: its criterion for a touch decides which first touches are inputs, see `touch_of_noisy_images`.
+        blank: the tactile image of the untouched sensor.
+
+    Raises:
+        ValueError: another modality is asked for, or the images have not all the shape of the preprocessing.
+    """
+    found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
+    if not modalities or not set(modalities) <= set(found):
+        raise ValueError(f"modalities must be one or both of {', '.join(found)}, got {modalities}")
+    for name, images in found.items():
+        if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
+            raise ValueError(
+                f"{name} is {images.dtype} of shape {images.shape}, but it must be uint8 of shape (n, "
+                f"{', '.join(map(str, shape))}) with the same n >= 1 for both streams"
+            )
+    return _moments(found, modalities, preprocessing, blank, None)
+
+
+def _moments(
+    found: dict[str, np.ndarray],
+    modalities: tuple[str, ...],
+    preprocessing: Preprocessing,
+    blank: np.ndarray,
+    condition: np.ndarray | None,
+) -> tuple[Arrays, Preprocessing]:
+    touched = _touched(found["tactile"], preprocessing, blank)
     absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
     arrays = Arrays(
         inputs={name: np.ascontiguousarray(found[name][:, 0]) for name in modalities if name not in absent},
         targets={name: np.ascontiguousarray(found[name][:, 1]) for name in modalities},
         present={"tactile": touched} if "tactile" in modalities and not absent else {},
-        condition=condition if condition.shape[1] else None,
+        condition=condition,
     )
     return arrays, dataclasses.replace(preprocessing, absent=absent)
 
@@ -82,7 +124,7 @@ def state_moments(
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     last = reduced(pairs._replace(visual=pairs.visual[:, 1:], tactile=pairs.tactile[:, 1:]), model.image_size)
     inputs = {"visual": pairs.visual[:, 0], "tactile": pairs.tactile[:, 0], "pose": code[:, 0]}
-    touched = {"tactile": _touched(pairs, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
+    touched = {"tactile": _touched(pairs.tactile, preprocessing, empty["tactile"])} if "tactile" in model.inputs else {}
     further: dict[str, dict[str, np.ndarray]] = {"views": {}, "falls": {}}
     if views is not None and len(views.pose) and "visual" in model.inputs:
         further["views"] = {
@@ -171,7 +213,7 @@ def state_model(
             f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}, but a state-space model "
             "takes square images of the whole view: give a preprocessing with resolution=(n, n) and crop=False"
         )
-    absent = () if _touched(pairs, preprocessing, empty["tactile"]).any() else ("tactile",)
+    absent = () if _touched(pairs.tactile, preprocessing, empty["tactile"]).any() else ("tactile",)
     model = statespace.Config(
         inputs=tuple(name for name in statespace.INPUTS if name not in absent),
         outcomes=len(scenario.outcomes),
@@ -186,9 +228,9 @@ def state_model(
     return model, dataclasses.replace(preprocessing, absent=absent)
 
 
-def _touched(pairs: Pairs, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
+def _touched(tactile: np.ndarray, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
     """Whether the first tactile image of each trajectory shows a contact. Images are split to bound the memory."""
-    parts = np.array_split(pairs.tactile[:, 0], max(len(pairs.tactile) // 256, 1))
+    parts = np.array_split(tactile[:, 0], max(len(tactile) // 256, 1))
     return np.concatenate(
         [
             np.asarray(preprocessing.touched(jnp.asarray(part / 255, jnp.float32), jnp.asarray(blank / 255)))

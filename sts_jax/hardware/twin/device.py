@@ -131,6 +131,11 @@ class Twin:
         return self._virtual_s if self._clock is None else self._clock()
 
     @property
+    def serial_number(self) -> str:
+        """Serial number of the LED controller."""
+        return self._serial_number
+
+    @property
     def state(self) -> State:
         """The current state."""
         with self._lock:
@@ -162,13 +167,15 @@ class Twin:
     def command(self, command: str) -> State:
         """Apply `hold`, `release` or `clear` to the scene. Returns when the scene has changed.
 
-        The renderings that the command needs come first, so a command may take seconds of the real clock.
+        On the real clock, the renderings that the command needs come first, so it may take seconds. On the virtual
+        clock, a pose is rendered when a frame shows it.
 
         Raises:
             ValueError: The command is unknown or not possible now.
         """
         with self._commands:
-            self.scene.prepare(command, self.blender)
+            if self._clock is not None:
+                self.scene.prepare(command, self.blender)
             with self._lock:
                 self.scene.command(command, self.now_s)
         return self.state

@@ -21,8 +21,8 @@ MOTION_RATE = 10.0  # drawn poses per second of a moving object, up to the size 
 _MOTION_PIXELS = 640 * 480  # a larger view takes longer to render and has proportionally fewer poses, at least 1
 STILL_M = 0.0002  # m, an object whose origin remains within this distance of its last place is still
 STILL_RAD = 0.01  # rad, the same for its orientation
-_BATCH = 4  # trajectories that are simulated at once
-_ATTEMPTS = 8  # batches without a settled trajectory before giving up
+_BATCH = 16  # trajectories that are simulated at once
+_ATTEMPTS = 2  # batches without a settled trajectory before giving up
 _EVENTS = 64  # remembered changes of the scene. Exposures lie at most a few of them back
 _NOWHERE = np.array([0, 0, -1, 1, 0, 0, 0], np.float32)  # pose of an object that is not in view
 
@@ -40,7 +40,7 @@ class Seen(NamedTuple):
     """The scene at one moment."""
 
     phase: Phase
-    trajectory: int  # number of the trajectory, from 0, or -1 before the first
+    trajectory: int  # number of the trajectory, from 0. With an empty pad that of the last one, or -1
     frame: int  # index of the drawn pose in the trajectory
     pose: tuple[float, ...] | None  # mesh frame in the sensor frame (m, quaternion), or None without an object
 
@@ -137,6 +137,7 @@ class ObjectScene(Scene):
         resolution: tuple[int, int] = (480, 640),
         motion_rate: float | None = None,
         seed: int = 0,
+        first: int = 0,
     ):
         """Describe the scene. Nothing is simulated yet.
 
@@ -148,7 +149,13 @@ class ObjectScene(Scene):
             motion_rate: Drawn poses per second of the motion. Each one is rendered once. Default: 10 up to 640x480
                 pixels, and proportionally fewer for larger views.
             seed: Of the trajectories.
+            first: Number of the first trajectory, to continue an earlier scene.
+
+        Raises:
+            ValueError: A value is out of range.
         """
+        if first < 0:
+            raise ValueError(f"first must be >= 0, got {first}")
         if motion_rate is None:
             motion_rate = max(1.0, MOTION_RATE * min(1.0, _MOTION_PIXELS / math.prod(resolution)))
         if not 0 < motion_rate < float("inf"):
@@ -161,7 +168,7 @@ class ObjectScene(Scene):
         self._resolution = resolution
         self._motion_rate = motion_rate
         self._key = jax.random.key(seed)
-        self._events: list[tuple[float, Phase, int]] = [(-float("inf"), Phase.EMPTY, -1)]
+        self._events: list[tuple[float, Phase, int]] = [(-float("inf"), Phase.EMPTY, first - 1)]
         self._batches = 0
         self._motions: list[_Motion] = []  # all so far. Their poses take a few kilobytes each
         self._rendered: dict[tuple[int, int], Ends] = {}  # by trajectory and frame. (-1, 0) is the empty pad

@@ -1,0 +1,282 @@
+"""Known differences between two sets of images, and the distances of `experiments.gap` for them.
+
+    python -m benchmarks.gap                                                  # about ten minutes
+    python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table
+
+No real sensor is measured. The digital twin with its imperfections stands for the device, and the same twin without any
+for the simulation. Both run on a virtual clock with equal seeds, and their logs must show the same poses. Writes
+`WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`, which are sessions for
+
+    python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
+
+The table adds one imperfection at a time to the images of the clean session and compares them with the images
+themselves. Two rows have no difference: the two halves of the clean session, and two draws of the twin's noise.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import jax
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from experiments.shared import errors, output
+from experiments.shared.command import Folder
+from experiments.shared.progress import Bar
+from sts_jax import _files, hardware
+from sts_jax.evaluation import gap
+from sts_jax.hardware import twin
+from sts_jax.hardware.twin import photometry
+
+SIZE = (480, 640)  # height and width of the twin's frames
+ON = (255, 255, 255, 255)
+OFF = (0, 0, 0, 0)
+SETTLE_S = 0.1  # between a switch and a frame
+MOTION_RATE = 0.5  # drawn poses per second of the motion, which nobody looks at
+LONGEST_S = 60.0  # of a motion
+# Without light losses, noise and lens. The rest of the JPEG's error is below a grey level
+CLEAN = twin.Imperfections(leakage=0.0, vignetting=0.0, read_noise=0.0, full_well=1e12, jpeg_quality=100)
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line."""
+
+    workdir: Folder = Path("runs/gap-twin")  # for both sessions
+    trajectories: int = 40
+    resolution: tuple[int, int] = (240, 320)  # height and width at which images are compared, pixels
+    seed: int = 0  # of the object, the trajectories and the noise
+    out: Path | None = None  # text file for the table
+
+
+def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | None) -> twin.Twin:
+    """A twin of a small camera on a virtual clock."""
+    sensor = sts.Sensor()
+    scene = twin.ObjectScene(
+        sts.objects.make(jax.random.key(seed), "camera"), resolution=SIZE, motion_rate=MOTION_RATE, seed=seed
+    )
+    warp = None if lens is None else twin.lens_warp(lens, sensor.camera, SIZE)
+    return twin.Twin(scene, imperfections=imperfections, warp=warp, seed=seed)
+
+
+def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
+    """Both streams of an object at rest, and its pose from the twin's log."""
+    shots, poses = [], []
+    streams: tuple[tuple[Literal["visual", "tactile"], tuple[int, ...], float], ...] = (
+        ("visual", OFF, 0.0),
+        ("tactile", ON, 1.0),
+    )
+    for stream, levels, light in streams:
+        before = device.set(levels)
+        device.step(SETTLE_S)
+        truth, image = device.capture()
+        if not truth.lowest == truth.highest == light:
+            raise AssertionError(f"the {stream} frame has the light {truth.lowest} to {truth.highest}")
+        after = device.ping()
+        shots.append(hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s))
+        assert truth.pose is not None
+        poses.append(truth.pose)
+    device.set(OFF)
+    assert poses[0] == poses[1], "the object has moved between both streams"
+    return hardware.Pair(*shots), poses[0]
+
+
+def release(device: twin.Twin) -> None:
+    """Let the object go, and wait until it is still."""
+    device.command("release")
+    until_s = device.now_s + LONGEST_S
+    while device.state.phase != twin.Phase.STILL:
+        if device.now_s > until_s:
+            raise AssertionError(f"the object still moves after {LONGEST_S} s")
+        device.step(0.1)
+
+
+@contextlib.contextmanager
+def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
+    """A session of the twin."""
+    origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
+    with hardware.Session.open(folder, origin) as session:
+        yield session
+        session.flush()
+
+
+def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
+    """Record trajectories. Returns the poses of all pairs, from the twin's log."""
+    poses = []
+    with recording(folder, note) as session:
+        if session.confirmed:
+            raise ValueError(f"{folder} has {session.confirmed} trajectories already: delete it, or give --workdir")
+        for done in range(count):
+            bar(note, done, count)
+            session.check_ready()
+            number = session.begin()
+            device.command("hold")
+            for end in ("initial", "final"):
+                if end == "final":
+                    release(device)
+                pair, pose = read_pair(device)
+                session.save(number, end, pair)
+                poses.append(pose)
+            session.confirm(number, note)
+            session.flush()
+        bar(note, count, count)
+    return poses
+
+
+def sessions(args: Args) -> hardware.Recordings:
+    """Record both sessions and write the sensor file of the device. Returns the clean one."""
+    lens = hardware.Lens.ideal(SIZE[1], SIZE[0])
+    poses = []
+    with Bar() as bar:
+        for name, imperfections, own in (("device", twin.Imperfections(), lens), ("clean", CLEAN, None)):
+            with make(args.seed, imperfections, own) as device:
+                poses.append(record(device, args.workdir / name, args.trajectories, name, bar))
+    if poses[0] != poses[1]:
+        raise AssertionError("the logs of both twins show different poses")
+    hardware.Device(
+        camera="http://127.0.0.1/camera",
+        fps=30.0,
+        leds="TWIN",
+        lens=lens,
+        settle_on_s=SETTLE_S,
+        settle_off_s=SETTLE_S,
+        levels=ON,
+        commissioned=datetime.date.today().isoformat(),
+        lens_from="ideal",
+    ).save(args.workdir, sts.Sensor().constants())
+    return hardware.load_recordings(args.workdir / "clean")
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A known difference from clean images."""
+
+    name: str
+    imperfections: twin.Imperfections = CLEAN
+    lens: bool = False  # the fisheye lens
+    rectified: bool = True  # undo the lens again
+
+
+def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
+    """One imperfection with growing values."""
+    return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
+
+
+DIFFERENCES = (
+    *levels("read_noise", (0.0015, 0.005, 0.02)),
+    *levels("full_well", (8000.0, 2000.0, 500.0)),
+    *levels("vignetting", (0.05, 0.25, 0.6)),
+    *levels("leakage", (0.005, 0.05, 0.2)),
+    *levels("jpeg_quality", (92, 70, 30)),
+    Difference("lens of 160 degrees, rectified", lens=True),
+    Difference("lens of 160 degrees, left as it is", lens=True, rectified=False),
+    Difference("the twin's defaults, rectified", twin.Imperfections(), lens=True),
+)
+
+
+def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, int], seed: int) -> gap.Streams:
+    """Images with a known difference from clean ones, at a resolution."""
+    sensor, (height, width) = sts.Sensor(), clean.visual.shape[1:3]
+    lens = hardware.Lens.ideal(width, height)
+    blender = photometry.Blender(
+        difference.imperfections,
+        exposure=float(sensor.room.exposure),
+        warp=twin.lens_warp(lens, sensor.camera, (height, width)) if difference.lens else None,
+        seed=seed,
+    )
+    streams: list[list[np.ndarray]] = [[], []]
+    for visual, tactile in zip(clean.visual, clean.tactile, strict=True):
+        ends = blender.ends(visual / np.float32(255), tactile / np.float32(255))
+        for light, stream in enumerate(streams):
+            image = blender.frame(ends, light)
+            if (quality := difference.imperfections.jpeg_quality) < CLEAN.jpeg_quality:
+                image = photometry.decode(photometry.encode(image, quality))
+            if difference.lens and difference.rectified:
+                stream.append(hardware.rectified(lens, sensor.camera, image, resolution))
+            else:
+                stream.append(reduced(image, resolution))
+    return gap.Streams(np.stack(streams[0]), np.stack(streams[1]), clean.group)
+
+
+def reduced(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+    """An image of the same aspect ratio at a resolution."""
+    return cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
+
+
+def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) -> str:
+    """The distances of both streams."""
+    words = [f"{name:36s}"]
+    for stream in ("visual", "tactile"):
+        one, two = getattr(first, stream), getattr(second, stream)
+        error = "-" if not matched else f"{gap.pixel_errors(one, two, first.group).mae.value:.2f}"
+        described = gap.features(one), gap.features(two), first.group, second.group
+        energy, accuracy = gap.energy_distance(*described), gap.told_apart(*described)
+        words.append(
+            f"{error:>6s} {energy.value:7.3f} ({energy.p:.3f})  {accuracy.value:.2f} [{accuracy.low:.2f}, "
+            f"{accuracy.high:.2f}]"
+        )
+    return "   ".join(words).rstrip()
+
+
+def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
+    """The lines of the table.
+
+    Args:
+        clean: Images of the clean session at the size of the camera.
+        resolution: At which images are compared.
+    """
+    visual, tactile = (np.stack([reduced(image, resolution) for image in images]) for images in clean[:2])
+    shown = gap.Streams(visual, tactile, clean.group)
+    columns = f"{'MAE':>6s} {'energy':>7s} ({'p':^5s})  accuracy [95 %]  "
+    yield f"{'':36s}   {'visual':39s}{'tactile'}"
+    yield f"{'difference':36s}   {columns} {columns}".rstrip()
+    middle = np.unique(clean.group)[len(np.unique(clean.group)) // 2]
+    halves = [gap.Streams(*(leaf[part] for leaf in shown)) for part in (clean.group < middle, clean.group >= middle)]
+    yield row("none: two halves of the clean session", halves[0], halves[1], matched=False)
+    defaults = Difference("", twin.Imperfections(), lens=True)
+    draws = [changed(clean, defaults, resolution, seed) for seed in (1, 2)]
+    yield row("none: two draws of the twin's noise", draws[0], draws[1], matched=True)
+    for difference in DIFFERENCES:
+        yield row(difference.name, changed(clean, difference, resolution, 0), shown, matched=True)
+
+
+def main(args: Args) -> None:
+    """Record both sessions, then print the table.
+
+    Raises:
+        ValueError: An option is out of range.
+    """
+    if args.trajectories < 2 * gap.FOLDS:
+        raise ValueError(
+            f"trajectories must be >= {2 * gap.FOLDS}, so that both halves can be compared, got {args.trajectories}"
+        )
+    height, width = args.resolution
+    if min(args.resolution) < gap.LEAST_SIDE or not math.isclose(width / height, SIZE[1] / SIZE[0]):
+        raise ValueError(f"resolution must be of the aspect {SIZE} and >= {gap.LEAST_SIDE}, got {args.resolution}")
+    if args.out is not None:
+        output.make_folder(args.out.parent)
+    recordings = sessions(args)
+    images = recordings.images()
+    visual = np.stack([images.initial_visual, images.final_visual], 1).reshape(-1, *SIZE, 3)
+    tactile = np.stack([images.initial_tactile, images.final_tactile], 1).reshape(-1, *SIZE, 3)
+    clean = gap.Streams(visual, tactile, np.repeat(np.array(recordings.numbers), 2))
+    lines = [f"{args.trajectories} trajectories, compared at {height} x {width} pixels, MAE of 255"]
+    print(lines[0], flush=True)
+    for line in table(clean, args.resolution):
+        print(line, flush=True)
+        lines.append(line)
+    if args.out is not None:
+        _files.write_bytes(args.out, ("\n".join(lines) + "\n").encode())
+
+
+if __name__ == "__main__":
+    sts.enable_compilation_cache()
+    with errors.on_one_line():
+        main(tyro.cli(Args, description=__doc__))

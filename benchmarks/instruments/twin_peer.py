@@ -1,0 +1,63 @@
+"""The digital twin as a sensor's devices, with the light of each frame by its own log."""
+
+import math
+import zlib
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import UInt8
+
+import sts_jax as sts
+from benchmarks.instruments.shown import Shown
+from sts_jax.hardware import Lens, twin
+from sts_jax.hardware.twin import photometry
+
+FIELD_OF_VIEW = math.radians(160)  # of the lens, across the diagonal
+_START = b"\xff\xd8\xff"  # of a JPEG image
+
+
+class TwinPeer:
+    """A served twin whose object is held and released in turn. Its log and record lie beside the port's link."""
+
+    def __init__(self, path: Path, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int]) -> None:
+        """Render the first images, and serve. `path` becomes the link to the LED controller's port."""
+        width, height = size
+        sensor = sts.Sensor()
+        scene = twin.ObjectScene(
+            sts.objects.make(jax.random.key(0), "camera"), sensor=sensor, resolution=(height, width)
+        )
+        lens = Lens.ideal(width, height, field_of_view=FIELD_OF_VIEW, distance=float(sensor.camera.distance))
+        self._log, self._record = path.with_suffix(".jsonl"), path.with_suffix(".mjpeg")
+        self.twin = twin.Twin(
+            scene,
+            rate=fps,
+            imperfections=twin.Imperfections(exposure_s=exposure_s, lag_s=lag_s),
+            warp=twin.lens_warp(lens, sensor.camera, (height, width)),
+            log=self._log,
+            record=self._record,
+        )
+        for command in ("clear", "hold"):
+            scene.prepare(command, self.twin.blender)
+        self._served = twin.Served(self.twin, link=path)
+        self.url = self._served.camera
+
+    def move(self) -> None:
+        """Release the object if it is held, or hold it in its next pose."""
+        self.twin.command("release" if self.twin.state.phase == twin.Phase.HELD else "hold")
+
+    def stop(self) -> None:
+        """End all threads."""
+        self._served.close()
+        self.twin.close()
+
+    def shown(self) -> dict[int, Shown]:
+        """The light of each frame, by `key` of its image."""
+        _, *parts = self._record.read_bytes().split(_START)
+        frames = zip(parts, twin.read_log(self._log), strict=True)
+        return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}
+
+
+def key(image: UInt8[np.ndarray, "height width 3"]) -> int:
+    """The checksum of an image's pixels. No two frames with noise have the same."""
+    return zlib.crc32(image.tobytes())

@@ -1,0 +1,239 @@
+"""The gap between real and simulated images of the same object, as numbers and as a figure.
+
+    python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/twin/dataset
+    python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
+
+A side is a session of `experiments.real collect`. The simulated side may also be the dataset of an experiment. Raw
+images are rectified with the lens of the sensor file. Prints differences per pixel, a distance of both distributions in
+a feature space, and the accuracy of a classifier that tells both sides apart. Writes the same text and a figure of both
+sides to `--out`. Takes about a minute for 40 trajectories. The classifier needs scikit-learn (`sts_jax[bench]`).
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from experiments.shared import errors, output
+from experiments.shared.command import Folder
+from sts_jax import _files, dataset, hardware
+from sts_jax.evaluation import figures, gap
+
+STREAMS = ("visual", "tactile")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Two sides and the way to compare them."""
+
+    real: Folder  # a session of `experiments.real collect`
+    simulated: Folder  # a session, such as that of a digital twin, or the dataset of an experiment
+    sensor: Path | None = None  # sensor file of the real images (default: they are rectified already)
+    simulated_sensor: Path | None = None  # sensor file of a simulated session (default: it is rectified already)
+    # number: trajectories of equal number show the same object in the same poses, and others are left out.
+    # none: both sides are draws of the same object and scenario, without a correspondence of single images
+    match: Literal["number", "none"] = "number"
+    # height and width at which images are compared, pixels (default: those of the dataset, or 240 x 320)
+    resolution: tuple[int, int] | None = None
+    names: tuple[str, str] = ("real", "simulated")  # of the two sides in the figure
+    rows: int = 4  # trajectories in the figure, two rows each
+    out: Folder = Path("runs/gap")  # folder for gap.txt and gap.png
+    debug: bool = False  # show the traceback of every error
+
+
+@dataclasses.dataclass(frozen=True)
+class Side:
+    """The images of one side: the two ends of each trajectory, in this order."""
+
+    images: gap.Streams
+    described: str  # the source, in words
+
+    def of(self, numbers: np.ndarray) -> "Side":
+        """The images of some trajectories."""
+        chosen = np.isin(self.images.group, numbers)
+        return dataclasses.replace(self, images=gap.Streams(*(leaf[chosen] for leaf in self.images)))
+
+
+def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> Side:
+    """The images of a session, rectified with the lens of a sensor file.
+
+    Raises:
+        FileNotFoundError: There is no session or no sensor file.
+        SensorFileError: The sensor file is damaged or describes no device.
+        ValueError: There is no confirmed trajectory, or the images are not of the size of the lens.
+    """
+    recordings = hardware.load_recordings(folder)
+    size = f"{resolution[0]} x {resolution[1]}"
+    if sensor is None:
+        described = f"taken as rectified, reduced to {size}"
+
+        def convert(image: np.ndarray) -> np.ndarray:
+            return centred(image, resolution)
+    else:
+        lens, pinhole = (
+            hardware.Device.load(sensor).lens,
+            sts.Sensor.load(hardware.sensor_file.sensor_file(sensor)).camera,
+        )
+        described = f"rectified with the lens of {sensor} to {size}"
+
+        def convert(image: np.ndarray) -> np.ndarray:
+            return hardware.rectified(lens, pinhole, image, resolution)
+
+    found = recordings.images(convert)
+    ends = (
+        np.stack([found.initial_visual, found.final_visual], 1),
+        np.stack([found.initial_tactile, found.final_tactile], 1),
+    )
+    return side(*ends, np.array(recordings.numbers), f"{folder}, {described}")
+
+
+def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
+    """The first and last frames of a dataset.
+
+    Raises:
+        ValueError: The images have another size than the one asked for, or show only the object.
+    """
+    data = dataset.load(folder)
+    if data.collection["crop"]:
+        raise ValueError(f"{folder} has crop=True, but real images show the whole pad: collect with --no-crop")
+    own = tuple(data.collection["resolution"])
+    if resolution is not None and resolution != own:
+        raise ValueError(f"resolution is {resolution}, but the images of {folder} have {own}: leave it out")
+    pairs = data.pairs(data.rendered())
+    return side(pairs.visual, pairs.tactile, pairs.trajectory, f"{folder}, a dataset of {own[0]} x {own[1]}")
+
+
+def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> Side:
+    """A side from images `(n, 2, height, width, 3)` of both ends."""
+    visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
+    return Side(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
+
+
+def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+    """The largest centred part of a rectified image with the resolution's aspect ratio, averaged to the resolution."""
+    (height, width), (rows, columns) = image.shape[:2], resolution
+    scale = min(height / rows, width / columns)
+    tall, wide = round(rows * scale), round(columns * scale)
+    top, left = (height - tall) // 2, (width - wide) // 2
+    part = image[top : top + tall, left : left + wide]
+    return cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA)
+
+
+def load(config: Config) -> tuple[Side, Side]:
+    """Both sides, with the trajectories that are compared. The groups of both are equal if they are matched.
+
+    Raises:
+        FileNotFoundError: A folder holds no session or dataset.
+        ValueError: The options do not fit each other, or there is nothing to compare.
+    """
+    is_dataset = (config.simulated / "collection.json").exists()
+    if is_dataset and config.match == "number":
+        raise ValueError(
+            f"{config.simulated} is a dataset, whose numbers are not those of a session: give --match none"
+        )
+    if is_dataset and config.simulated_sensor is not None:
+        raise ValueError("simulated-sensor is given, but the images of a dataset are rectified: leave it out")
+    if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
+        raise ValueError(f"resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {config.resolution}")
+    if is_dataset:
+        simulated = simulated_dataset(config.simulated, config.resolution)
+    else:
+        simulated = session(config.simulated, config.simulated_sensor, config.resolution or (240, 320))
+    height, width = simulated.images.visual.shape[1:3]
+    real = session(config.real, config.sensor, (height, width))
+    if config.match == "none":
+        others = simulated.images._replace(group=simulated.images.group + real.images.group.max() + 1)
+        return real, dataclasses.replace(simulated, images=others)
+    common = np.intersect1d(real.images.group, simulated.images.group)
+    if not len(common):
+        raise ValueError(
+            f"no trajectory of {config.real} has the number of one of {config.simulated}: give --match none if they "
+            "show the same object in other poses"
+        )
+    return real.of(common), simulated.of(common)
+
+
+def report(real: Side, simulated: Side, *, matched: bool) -> str:
+    """The table of distances."""
+    number = len(np.unique(real.images.group))
+    head = f"matched by number: {number} trajectories" if matched else "not matched"
+    lines = [f"real:      {real.described}", f"simulated: {simulated.described}", head, ""]
+    lines.append(f"{'':42s}{'visual':26s}{'tactile':26s}".rstrip())
+    rows: dict[str, list[str]] = {}
+    for stream in STREAMS:
+        for name, value in measured(real.images, simulated.images, stream, matched=matched).items():
+            rows.setdefault(name, []).append(value)
+    lines += [f"{name:42s}{''.join(f'{value:26s}' for value in values)}".rstrip() for name, values in rows.items()]
+    lines += ["", "In brackets: 95 % interval over trajectories (bootstrap)."]
+    return "\n".join(lines)
+
+
+def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
+    """The distances of one stream, as words by name."""
+    first, second = getattr(real, stream), getattr(simulated, stream)
+    rows = {}
+    if matched:
+        found = gap.pixel_errors(first, second, real.group)
+        rows["mean absolute error (of 255)"] = written(found.mae, 2)
+        rows["root mean squared error (of 255)"] = written(found.rmse, 2)
+        rows["PSNR (dB)"] = written(found.psnr, 1)
+        rows["SSIM"] = written(found.ssim, 3)
+        # Two images on: the same end of the next trajectory
+        other = gap.pixel_errors(first, np.roll(second, 2, axis=0), real.group)
+        rows["  same, for another trajectory: MAE"] = written(other.mae, 2)
+        rows["  same, for another trajectory: SSIM"] = written(other.ssim, 3)
+    one, two = gap.features(first), gap.features(second)
+    energy = gap.energy_distance(one, two, real.group, simulated.group)
+    rows["energy distance (0: equal, 1: far apart)"] = f"{energy.value:.3f} (p = {energy.p:.3f})"
+    rows["accuracy of a classifier (0.5: chance)"] = written(gap.told_apart(one, two, real.group, simulated.group), 3)
+    return rows
+
+
+def written(estimate: gap.Estimate, digits: int) -> str:
+    """An estimate in words."""
+    return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+
+
+def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
+    """Draw the first trajectories."""
+    rows = config.rows
+    numbers = np.unique(real.images.group)[:rows]
+    others = numbers if matched else np.unique(simulated.images.group)[:rows]
+    shown = min(len(numbers), len(others))
+    first, second = real.of(numbers[:shown]).images, simulated.of(others[:shown]).images
+    labels = [
+        f"{'#' + str(number) if matched else 'draw'}\n{end}"
+        for number in numbers[:shown]
+        for end in ("initial", "final")
+    ]
+    title = "the same object in the same poses" if matched else "draws of both sides, in other poses"
+    path = config.out / "gap.png"
+    figures.side_by_side(path, first, second, labels, matched=matched, title=title, names=config.names)
+
+
+def main(config: Config) -> None:
+    """Load, measure, print, draw.
+
+    Raises:
+        ValueError: An option is out of range, or there is nothing to compare.
+        OSError: A file cannot be read or written.
+    """
+    if config.rows < 1:
+        raise ValueError(f"rows must be >= 1, got {config.rows}")
+    output.make_folder(config.out)
+    real, simulated = load(config)
+    matched = config.match == "number"
+    text = report(real, simulated, matched=matched)
+    print(text)
+    _files.write_bytes(config.out / "gap.txt", f"{text}\n".encode())
+    draw(config, real, simulated, matched=matched)
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Config, description=__doc__)
+    with errors.on_one_line(debug=arguments.debug):
+        main(arguments)

@@ -1,0 +1,207 @@
+"""`collect`: from the options of the command line to guided trajectories in a work directory."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+from experiments.shared import simulated
+from experiments.shared.command import Folder
+from experiments.shared.page import Page
+from experiments.shared.progress import say
+from experiments.shared.terminal import Terminal, single_keys
+from sts_jax import _files, hardware
+from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, View
+
+
+@dataclasses.dataclass(frozen=True)
+class Collect:
+    """Guide a person through trajectories, and save their initial and final pairs."""
+
+    workdir: Folder = Path("runs/real")  # the trajectories go to its folder `dataset`
+    camera: str | None = None  # device, URL or video file (default: that of the sensor file)
+    leds: str | None = None  # its serial port (default: found by the sensor file)
+    twin: bool = False  # the digital twin on a virtual clock instead of devices, without a page or a person
+    seed: int = 0  # of the twin's object and trajectories
+    sensor: Path | None = None  # sensor file of the commissioning, with its camera, levels, settling and backgrounds
+    # width and height, pixels (default: of the sensor file, 640 x 480 of the twin, or 1640 x 1232)
+    size: tuple[int, int] | None = None
+    fourcc: str | None = None  # pixel format of a device, such as MJPG
+    lock: bool = True  # lock exposure and white balance
+    levels: tuple[int, int, int, int] | None = None  # of the LED channels (default: of the sensor file, or 255)
+    count: int | None = None  # stop when the session has as many confirmed trajectories (default: never, twin: 100)
+    note: str = ""  # stored with each trajectory, such as the object's name
+    headless: bool = False  # in this terminal, without a page
+    automatic: bool = False  # confirm every trajectory, and take the pad to be empty at the start
+    host: str = "127.0.0.1"  # address of the page. 0.0.0.0: every computer of the network can watch and press buttons
+    port: int = 8765  # of the page, 0: a free one
+    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)
+    debug: bool = False  # show the traceback of every error
+
+
+def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
+    """The sensor of the options, not connected yet, and the empty pad of the sensor file.
+
+    Raises:
+        ValueError: An option is missing or out of range, or contradicts the sensor file.
+        SensorFileError: The sensor file is damaged, or of another camera.
+        OSError: The sensor file cannot be read.
+    """
+    if config.count is not None and config.count < 1:
+        raise ValueError(f"count must be >= 1, got {config.count}")
+    if config.sensor is not None:
+        return commissioned(config, config.sensor)
+    if config.camera is None or config.leds is None:
+        cameras, ports = hardware.find_sensors()
+        raise ValueError(
+            f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
+            f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
+            f"{', '.join(port.device for port in ports) or 'none'}"
+        )
+    width, height = config.size or (1640, 1232)
+    camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
+    return hardware.STS(camera=camera, leds=config.leds, levels=config.levels or (255, 255, 255, 255)), None
+
+
+def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | None]:
+    """The sensor of a file, with the empty pad of its backgrounds. See `device`."""
+    for name, value in (("size", config.size), ("levels", config.levels)):
+        if value is not None:
+            raise ValueError(
+                f"--{name} is {value}, but the sensor file {file} determines it: leave out --{name} or --sensor"
+            )
+    device = hardware.Device.load(file)
+    camera = device.camera_config(config.camera)
+    camera = dataclasses.replace(camera, lock=config.lock and camera.lock, fourcc=config.fourcc or camera.fourcc)
+    empty = None
+    if device.background_visual is not None and device.background_tactile is not None:
+        empty = hardware.known_pad(device.background(file, "visual"), device.background(file, "tactile"))
+    return hardware.STS.from_file(file, camera=camera, leds=config.leds), empty
+
+
+def collect(config: Collect) -> None:
+    """Connect, guide, save. See `device` and `simulated.collect` for the errors."""
+    if config.twin:
+        simulated.collect(of_twin(config))
+        return
+    sensor, empty = device(config)
+    with person(config) as someone:
+        say("connecting. Keep the pad empty and still")
+        with sensor:
+            origin = hardware.Origin.of(sensor)
+            with hardware.Session.open(config.workdir / "dataset", origin, settling=sensor.settling) as session:
+                if config.sensor is not None:
+                    keep(config.sensor, config.workdir)
+                say(f"{session.confirmed} trajectories in {session.folder}, which is continued")
+                try:
+                    hardware.collect(
+                        sensor,
+                        session,
+                        someone,
+                        config=config.guide,
+                        empty=empty,
+                        trusted=config.automatic,
+                        count=config.count,
+                        note=config.note,
+                    )
+                except KeyboardInterrupt:
+                    say("stopped")
+                session.flush()
+                say(f"{session.confirmed} confirmed trajectories in {session.folder}")
+            counts = sensor.camera.statistics
+            say(
+                f"{counts.frames} frames, of which the computer missed {counts.skipped} and the camera {counts.dropped}"
+            )
+
+
+def of_twin(config: Collect) -> simulated.Simulated:
+    """The options that concern the twin.
+
+    Raises:
+        ValueError: An option is out of range, or concerns devices.
+    """
+    devices = {"camera": config.camera, "leds": config.leds, "sensor": config.sensor, "fourcc": config.fourcc}
+    for name, value in devices.items():
+        if value is not None:
+            raise ValueError(f"--{name} is {value}, but --twin has no devices: leave out --{name} or --twin")
+    default = simulated.Simulated(config.workdir)
+    return simulated.Simulated(
+        config.workdir,
+        count=default.count if config.count is None else config.count,
+        size=default.size if config.size is None else config.size,
+        levels=default.levels if config.levels is None else config.levels,
+        seed=config.seed,
+        note=config.note,
+        guide=config.guide,
+    )
+
+
+def keep(file: Path, workdir: Path) -> None:
+    """Copy a sensor file and its backgrounds into a work directory, or check that those there are the same.
+
+    Raises:
+        ValueError: The work directory has another sensor file.
+        SensorFileError: A sensor file is damaged.
+        OSError: A file cannot be read or written.
+    """
+    file, copy = hardware.sensor_file.sensor_file(file), workdir / hardware.sensor_file.NAME
+    device = hardware.Device.load(file)
+    if copy.exists():
+        if hardware.Device.load(copy) != device:
+            raise ValueError(
+                f"{copy} differs from {file}, so the sensor was commissioned anew: choose another --workdir, because "
+                "all trajectories of a session are rectified with one sensor file"
+            )
+        return
+    for background in (device.background_visual, device.background_tactile):
+        if background is not None:
+            _files.write_bytes(workdir / background.name, file.with_name(background.name).read_bytes())
+    _files.write_bytes(copy, file.read_bytes())
+
+
+@contextlib.contextmanager
+def person(config: Collect) -> Iterator[Person]:
+    """The one who sees and acts: a page, a terminal, or nobody."""
+    if config.headless:
+        with single_keys():
+            yield AutomaticTerminal(config.count) if config.automatic else Terminal(config.count)
+        return
+    page = Page(config.host, config.port, count=config.count)
+    reach = "only this computer can open it"
+    if not page.is_local:
+        reach = "EVERY computer that reaches this address can watch and press the buttons"
+    say(f"open {page.url} in a browser. The page listens on {config.host}, so {reach}")
+    try:
+        yield AutomaticPage(page) if config.automatic else page
+    finally:
+        page.close()
+
+
+class AutomaticTerminal(AutomaticPerson):
+    """Confirms every trajectory, and prints the instructions."""
+
+    def __init__(self, count: int | None):
+        super().__init__()
+        self._terminal = Terminal(count, keys=False)
+
+    def show(self, view: View) -> None:
+        """Print the view if it has changed."""
+        super().show(view)
+        self._terminal.show(view)
+
+
+class AutomaticPage(AutomaticPerson):
+    """Confirms every trajectory, and shows the page, whose buttons work too."""
+
+    def __init__(self, page: Page):
+        super().__init__()
+        self._page = page
+
+    def show(self, view: View) -> None:
+        """Show the view."""
+        super().show(view)
+        self._page.show(view)
+
+    def action(self) -> hardware.Action | None:
+        """The action of a button, or else the automatic one."""
+        return self._page.action() or super().action()

@@ -1,0 +1,102 @@
+"""`review`: list, confirm, discard, check and draw the trajectories of a work directory."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+from PIL import Image, ImageDraw, ImageFont
+
+from experiments.shared import output
+from experiments.shared.command import Folder
+from experiments.shared.progress import say
+from sts_jax import hardware
+
+SHEET = 20  # newest trajectories that a sheet shows
+PANEL = 200  # pixels, width of an image on a sheet
+
+
+@dataclasses.dataclass(frozen=True)
+class Review:
+    """List the trajectories, discard, restore or confirm some, check the files, or draw a sheet."""
+
+    workdir: Folder = Path("runs/real")
+    discard: tuple[int, ...] = ()  # move these to the folder `discarded`
+    restore: tuple[int, ...] = ()  # move these back
+    confirm: tuple[int, ...] = ()  # confirm these, which were complete when the session was interrupted
+    note: str = ""  # stored with those that are confirmed
+    check: bool = False  # read all images and compare their checksums
+    sheet: Path | None = None  # draw the newest confirmed trajectories into this picture
+    numbers: tuple[int, ...] = ()  # draw these instead
+    debug: bool = False  # show the traceback of every error
+
+
+def review(config: Review) -> None:
+    """Apply the changes, then check, draw or list."""
+    folder = config.workdir / "dataset"
+    if config.sheet is not None:
+        output.check_picture(config.sheet)
+    for number in config.restore:
+        hardware.restore_recording(folder, number)
+    for number in config.confirm:
+        hardware.confirm_recording(folder, number, config.note)
+    for number in config.discard:
+        hardware.discard_recording(folder, number)
+    if config.check:
+        check(folder)
+    if config.sheet is not None:
+        draw(folder, config.numbers, config.sheet)
+        print(config.sheet)
+    if config.check or config.sheet is not None:
+        return
+    entries = hardware.list_recordings(folder)
+    for entry in entries:
+        print(f"{entry.number:5d}  {entry.standing:11s}  {entry.taken or '-':29s}  {entry.note}".rstrip())
+    print(f"{sum(entry.standing == 'confirmed' for entry in entries)} confirmed of {len(entries)} in {folder}")
+
+
+def check(folder: Path) -> None:
+    """Read all confirmed trajectories.
+
+    Raises:
+        SystemExit: Some are damaged. All of them are named.
+    """
+    recordings, damaged = hardware.load_recordings(folder), 0
+    for index in range(len(recordings)):
+        try:
+            recordings[index]
+        except OSError as error:
+            say(str(error))
+            damaged += 1
+    print(f"{len(recordings) - damaged} of {len(recordings)} confirmed trajectories are undamaged in {folder}")
+    if damaged:
+        raise SystemExit(1)
+
+
+def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
+    """Draw trajectories as rows of four images: initial visual and tactile, final visual and tactile.
+
+    Raises:
+        ValueError: There is no confirmed trajectory, or one of the numbers has none.
+    """
+    recordings = hardware.load_recordings(folder)
+    if unknown := set(numbers) - set(recordings.numbers):
+        raise ValueError(f"{folder} has no confirmed trajectories {sorted(unknown)}: give others with --numbers")
+    if not recordings.numbers:
+        raise ValueError(f"{folder} has no confirmed trajectory to draw: collect some first")
+    chosen = numbers or recordings.numbers[-SHEET:]
+    rows = []
+    for number in chosen:
+        trajectory = recordings[recordings.numbers.index(number)]
+        shots = [shot for pair in (trajectory.initial, trajectory.final) for shot in (pair.visual, pair.tactile)]
+        height = round(PANEL * shots[0].image.shape[0] / shots[0].image.shape[1])
+        rows.append([cv2.resize(shot.image, (PANEL, height), interpolation=cv2.INTER_AREA) for shot in shots])
+    height, margin, head = rows[0][0].shape[0], 60, 24
+    sheet = Image.new("RGB", (margin + 4 * (PANEL + 4), head + len(rows) * (height + 4)), "white")
+    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=14)
+    for column, title in enumerate(("initial, visual", "initial, tactile", "final, visual", "final, tactile")):
+        pen.text((margin + column * (PANEL + 4), 4), title, fill="black", font=font)
+    for row, (number, images) in enumerate(zip(chosen, rows, strict=True)):
+        pen.text((6, head + row * (height + 4) + height // 2 - 8), str(number), fill="black", font=font)
+        for column, image in enumerate(images):
+            sheet.paste(Image.fromarray(image), (margin + column * (PANEL + 4), head + row * (height + 4)))
+    sheet.save(path)

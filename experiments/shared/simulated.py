@@ -1,0 +1,165 @@
+"""Trajectories of the digital twin on its virtual clock, collected by the ordinary guide into an ordinary session."""
+
+import contextlib
+import dataclasses
+import datetime
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+
+import sts_jax as sts
+from experiments.shared import backgrounds
+from experiments.shared.progress import Bar, say
+from sts_jax import hardware
+from sts_jax.hardware import EmptyPad, GuideConfig, View, twin
+
+OBJECT = "camera"  # class of the object. The paper releases a small camera
+FIELD_OF_VIEW = 160.0  # degrees across the diagonal of the lens, as of the paper's device
+RATE = 15.0  # frames/s of the camera. The guide needs few, and each one costs time
+WAIT_S = 0.1  # s of the computer's clock between two looks at a disk that is too slow
+MOTION_RATE = 4.0  # drawn poses per second of a moving object. Between two of them the object must not seem to rest
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulated:
+    """A collection of the twin.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+
+    workdir: Path  # the trajectories go to its folder `dataset`, the sensor file is `sensor.json`
+    count: int = 100  # confirmed trajectories after which the collection ends, earlier ones included
+    size: tuple[int, int] = (640, 480)  # width and height of the images, pixels
+    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # of the LED channels in the tactile stream
+    seed: int = 0  # of the object, the trajectories and the noise
+    note: str = ""  # stored with each trajectory
+    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"count must be >= 1, got {self.count}")
+        if min(self.size) < 1:
+            raise ValueError(f"size is {self.size}, but width and height must be at least 1 pixel")
+
+
+class Hand(twin.Hand):
+    """Moves the twin's object, and shows the progress."""
+
+    def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
+        super().__init__(device, session)
+        self._bar, self._count = bar, count
+        self._problem: str | None = None
+
+    def show(self, view: View) -> None:
+        """Act in a new stage, and show the number of confirmed trajectories, or a problem."""
+        super().show(view)
+        self._bar("collect", view.confirmed, self._count)
+        if view.problem is not None:
+            if self._problem is None:
+                say(view.problem)
+            time.sleep(WAIT_S)
+        self._problem = view.problem
+
+
+def collect(config: Simulated) -> None:
+    """Collect until there are enough trajectories. A collection that was interrupted is continued.
+
+    Trajectory n of the session is trajectory n of the scene, so none is repeated.
+
+    Raises:
+        ValueError: The work directory holds data of another sensor.
+        LockedError: Another process collects into the work directory.
+        SensorFileError: The sensor file in the work directory is damaged.
+        OSError: Something cannot be written.
+    """
+    dataset = config.workdir / "dataset"
+    if (dataset / hardware.recordings.SESSION).exists() and len(hardware.load_recordings(dataset)) >= config.count:
+        say(f"{dataset} has {config.count} trajectories already")
+        return
+    first = hardware.next_recording(dataset)
+    with started(config, first) as device:
+        sensor, empty = commissioned(config, device)
+        with (
+            hardware.Session.open(dataset, sensor.origin, settling=sensor.settling) as session,
+            Bar() as bar,
+        ):
+            say(f"{session.confirmed} trajectories in {dataset}, which is continued")
+            begun_s = time.monotonic()
+            number = hardware.collect(
+                sensor,
+                session,
+                Hand(device, session, bar, config.count),
+                config=config.guide,
+                empty=empty,
+                trusted=True,
+                count=config.count,
+                note=config.note,
+            )
+            bar("collect", config.count, config.count)
+        seconds = time.monotonic() - begun_s
+        say(f"{number} trajectories in {seconds:.1f} s, {seconds / number:.2f} s each")
+
+
+def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
+    """The lens of the twin."""
+    return hardware.Lens.ideal(
+        *config.size, field_of_view=math.radians(FIELD_OF_VIEW), distance=float(sensor.camera.distance)
+    )
+
+
+@contextlib.contextmanager
+def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
+    """A twin whose next trajectory has a number."""
+    sensor, resolution = sts.Sensor(), config.size[::-1]
+    scene = twin.ObjectScene(
+        sts.objects.make(jax.random.key(config.seed), OBJECT),
+        sensor=sensor,
+        resolution=resolution,
+        motion_rate=MOTION_RATE,
+        seed=config.seed,
+        first=first,
+    )
+    warp = twin.lens_warp(lens(config, sensor), sensor.camera, resolution)
+    with twin.Twin(scene, rate=RATE, warp=warp, seed=config.seed) as device:
+        yield device
+
+
+def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
+    """The sensor with the settling and the backgrounds of its file, which is written if there is none."""
+    file = config.workdir / hardware.sensor_file.NAME
+    if not file.exists():
+        commission(config, device)
+    there = hardware.Device.load(file)
+    there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
+    if (there.width, there.height, there.levels) != (*config.size, config.levels):
+        raise ValueError(
+            f"{file} is of images of {there.width} x {there.height} with levels {there.levels}, but the options "
+            f"are {config.size[0]} x {config.size[1]} with levels {config.levels}: choose another --workdir"
+        )
+    settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
+    sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)
+    return sensor, hardware.known_pad(there.background(file, "visual"), there.background(file, "tactile"))
+
+
+def commission(config: Simulated, device: twin.Twin) -> None:
+    """Measure the settling, record the backgrounds, and write the sensor file."""
+    simulated = sts.Sensor()
+    sensor = twin.VirtualSensor(device, levels=config.levels)
+    recorded = backgrounds.record(sensor)
+    made = hardware.Device(
+        camera=twin.CAMERA,
+        fps=device.rate,
+        leds=device.serial_number,
+        lens=lens(config, simulated),
+        settle_on_s=sensor.settling.tactile_s,
+        settle_off_s=sensor.settling.visual_s,
+        levels=config.levels,
+        commissioned=datetime.date.today().isoformat(),
+        lens_from="ideal",
+    )
+    config.workdir.mkdir(parents=True, exist_ok=True)
+    made.save(config.workdir, simulated.constants(), visual=recorded.visual, tactile=recorded.tactile)

@@ -1,0 +1,129 @@
+"""`train`: from the options of the command line to Table 2."""
+
+import dataclasses
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+import sts_jax as sts
+from experiments.shared import recorded, simulated, stages, table2
+from experiments.shared.command import Folder
+from experiments.shared.duration import Line, shown
+from experiments.shared.progress import say
+from experiments.shared.recorded import Config
+from experiments.shared.simulated import Simulated
+from sts_jax import _files, hardware
+
+_FEW = 2, recorded.LEAST  # trajectories that are measured: at first, and in all
+_STEPS = 4  # gradient steps that are measured
+# The twin's object can stand on a corner, whose imprint covers a single block of the guide.
+_GUIDE = hardware.GuideConfig(contact_blocks=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train VAE visual, VAE tactile and MVAE without pose on the collected trajectories, and write Table 2."""
+
+    # the configuration of the preset, every field of which can be changed
+    config: Annotated[Config, tyro.conf.arg(name="")]
+    workdir: Folder = Path("runs/real")  # the trajectories are in its folder `dataset`, beside its `sensor.json`
+    name: str = "table2"  # the results go to this folder of the work directory
+    preset: Literal["smoke", "default", "paper"] = "default"  # the configuration that other options change
+    only: stages.Stage | None = None  # run this stage only
+    plan: bool = False  # print the expected seconds of each stage, from a short measurement, and stop
+    debug: bool = False  # show the traceback of every error
+
+
+def learn(args: Train) -> None:
+    """Collect trajectories of the twin if there are none, train, evaluate, and print the table.
+
+    Raises:
+        ValueError: An option is out of range, or the results were made with other options or trajectories.
+        FileNotFoundError: There is no sensor file, or a stage before `only` has not been run.
+        LockedError: Another process works on the same results.
+        OSError: A file is damaged or cannot be written.
+    """
+    recorded.check(args.config)
+    if args.name != Path(args.name).name or args.name in ("", "dataset"):
+        raise ValueError(f"name must be the name of a folder other than dataset, got {args.name!r}")
+    sts.enable_compilation_cache()
+    folder = args.workdir / args.name
+    if args.plan or (args.preset == "paper" and not (folder / "metrics.json").exists()):
+        text = plan(args.config, recorded.missing(args.config, args.workdir))
+        print(text, flush=True)
+        if args.plan:
+            return
+    if args.only in (None, "collect"):
+        collect(args.config, args.workdir)
+    if args.only == "collect":
+        return
+    data = recorded.read(args.config, args.workdir)
+    with _files.lock(folder):
+        content = {**dataclasses.asdict(args.config), "trajectories": data.identity}
+        _files.claim(folder / "config.json", content)
+        if args.only in (None, "train"):
+            recorded.train(args.config, data, folder)
+        if args.only in (None, "evaluate"):
+            print(table2.evaluate(args.config, data, folder))
+
+
+def collect(config: Config, workdir: Path) -> None:
+    """Collect the missing trajectories of the twin. Trajectories of a device are left as they are."""
+    count = recorded.missing(config, workdir)
+    if not count:
+        return
+    say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
+    simulated.collect(Simulated(workdir, config.count, config.size, guide=_GUIDE))
+
+
+def plan(config: Config, missing: int) -> str:
+    """Measure a little of each stage, and return a line with the expected seconds for each.
+
+    Args:
+        config: The experiment.
+        missing: Number of trajectories that the twin has to collect.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        workdir, clock = Path(name), [time.perf_counter()]
+        for count in _FEW:
+            simulated.collect(Simulated(workdir, count, config.size, guide=_GUIDE))
+            clock.append(time.perf_counter())
+        first, rest = np.diff(clock)
+        each = rest / (_FEW[1] - _FEW[0])
+        start = max(first - _FEW[0] * each, 0)
+        lines = [
+            Line(f"collect: {missing} trajectories", start + missing * each if missing else 0, f"{each:.2g} s each")
+        ]
+        begin = time.perf_counter()
+        data = recorded.read(config, workdir)
+        reading = (time.perf_counter() - begin) / _FEW[1]
+        lines.append(Line(f"read: {config.count} trajectories", config.count * reading, f"{reading:.2g} s each"))
+        lines += _training(config, data, workdir)
+        begin = time.perf_counter()
+        table2.evaluate(config, data, workdir)
+        lines.append(Line("evaluate and draw", time.perf_counter() - begin, f"of {len(data.validation.number)}"))
+    lines.append(Line("together", sum(line.seconds for line in lines), f"{config.count} trajectories of the twin"))
+    return shown(lines)
+
+
+def _training(config: Config, data: recorded.Recorded, folder: Path) -> list[Line]:
+    """The expected time of each training, from some steps of it."""
+    lines, samples = [], recorded.samples(config, config.count)
+    for job in recorded.jobs(config, data):
+        clock = [time.perf_counter()]
+        few = dataclasses.replace(job.schedule, steps=_STEPS, warmup=0, log_every=1, checkpoint_every=_STEPS)
+        stages.run(
+            job._replace(schedule=few),
+            folder / "models" / job.name,
+            config.targets,
+            lambda *_, clock=clock: clock.append(time.perf_counter()),
+        )
+        spent = np.diff(clock)
+        each, total = float(np.median(spent[1:])), job.schedule.total(samples)
+        note = f"{each:.3g} s a step, {spent[0]:.0f} s to compile"
+        lines.append(Line(f"train {job.name}: {total} steps", spent[0] + total * each, note))
+    return lines

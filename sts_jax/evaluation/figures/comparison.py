@@ -1,0 +1,39 @@
+"""A figure that compares images of several predictors side by side."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from sts_jax.evaluation.figures import drawing
+
+
+def comparison(
+    path: Path, groups: Sequence[Mapping[str, np.ndarray]], labels: Sequence[str], *, title: str, heads: Sequence[str]
+) -> None:
+    """Draw one row of images for each trajectory, in groups of columns with a gap between them.
+
+    Args:
+        path: The PNG to write.
+        groups: In each group, the images of all trajectories by the title of their column, (n, height, width, 3) in
+            [0, 1].
+        labels: Of the rows, `n` of them.
+        title: Title of the figure.
+        heads: Of the groups.
+    """
+    rows, widths = len(labels), [len(group) for group in groups]
+    figure = plt.figure(figsize=(1.5 * sum(widths) + 0.8, 1.42 * rows + 1.3))
+    parts = figure.subfigures(1, len(groups), width_ratios=widths, squeeze=False)[0]
+    for number, (part, group, head) in enumerate(zip(parts, groups, heads, strict=True)):
+        part.suptitle(head, fontsize=11, fontweight="bold")
+        axes = part.subplots(rows, len(group), squeeze=False)
+        for column, (name, images) in enumerate(group.items()):
+            axes[0, column].set_title(name, fontsize=9)
+            for row in range(rows):
+                drawing.show(axes[row, column], images[row])
+        if number == 0:
+            for row, label in enumerate(labels):
+                axes[row, 0].set_ylabel(label, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    drawing.save(figure, path)

@@ -1,0 +1,140 @@
+"""`real collect --twin`, and the sensor file of a work directory."""
+
+import math
+
+import numpy as np
+import pytest
+
+import sts_jax as sts
+from experiments import real
+from experiments.shared import collecting, simulated
+from sts_jax import hardware
+from sts_jax.hardware import twin
+
+SMALL = {"size": (160, 120), "guide": hardware.GuideConfig(empty_s=0.3, hold_s=0.3, rest_s=0.5)}
+
+
+def ends(workdir):
+    """The images of both ends by the number of the trajectory, as numbers."""
+    read = hardware.load_recordings(workdir / "dataset")
+    return {t.number: np.array([t.initial.visual.image, t.final.visual.image], float) for t in read}
+
+
+@pytest.mark.slow
+def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_path, monkeypatch, capsys):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    simulated.collect(simulated.Simulated(whole, 5, **SMALL))
+    show = simulated.Hand.show
+
+    def interrupted(self, view):
+        show(self, view)
+        if view.confirmed == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulated.Hand, "show", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        simulated.collect(simulated.Simulated(parts, 5, **SMALL))
+    monkeypatch.undo()
+    kept = {path: path.read_bytes() for path in parts.rglob("*.png")}
+    real.main(real.Collect(parts, twin=True, count=5, **SMALL))
+    assert all(path.read_bytes() == content for path, content in kept.items())
+
+    one, two = ends(whole), ends(parts)
+    assert list(one) == list(two) == [0, 1, 2, 3, 4]
+    for number, images in two.items():
+        assert np.abs(images - one[number]).mean() < 2  # the noise differs
+        others = [np.abs(images - other).mean() for name, other in one.items() if name != number]
+        assert min(others) > 2 * np.abs(images - one[number]).mean()
+
+    capsys.readouterr()
+    real.main(real.Collect(parts, twin=True, count=5, **SMALL))
+    assert "has 5 trajectories already" in capsys.readouterr().err
+    for options, message in (
+        ({"seed": 1}, "TWIN1"),
+        ({"size": (320, 240)}, "is of images of 160 x 120"),
+        ({"levels": (9, 9, 9, 9)}, "levels"),
+    ):
+        with pytest.raises(SystemExit, match=message):
+            real.main(real.Collect(parts, twin=True, count=6, **{**SMALL, **options}))
+
+
+@pytest.mark.slow
+def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
+    config = simulated.Simulated(tmp_path, 1, size=(320, 240))
+    with simulated.started(config, 0) as device:
+        sensor, empty = simulated.commissioned(config, device)
+        pair = sensor.read()
+        device.command("hold")
+        held, pose = sensor.read(), device.state.pose
+    made = hardware.Device.load(tmp_path)
+    assert sts.Sensor.load(tmp_path / "sensor.json").constants() == sts.Sensor().constants()
+    assert (made.width, made.height, made.leds, made.lens_from) == (320, 240, "TWIN0", "ideal")
+    for shot in (pair.visual, pair.tactile):
+        background = made.background(tmp_path, shot.stream)
+        assert np.abs(background - shot.image.astype(float)).mean() < 2
+    assert np.abs(empty.visual - sts.hardware.settling.thumbnail(pair.visual.image)).mean() < 1
+    # The object's middle, seen through the lens of the file, lies at the place of its pose.
+    dark = np.abs(made.background(tmp_path, "visual") - held.visual.image.astype(float)).mean(-1)
+    view = hardware.rectified(made.lens, sts.Sensor().camera, (255 * (dark > 30)).astype(np.uint8)[..., None], (96, 96))
+    rows, columns = np.nonzero(view.reshape(96, 96) > 127)
+    side = 2 * float(sts.Sensor().camera.distance) * 0.75
+    middle = (np.array([columns.mean(), rows.mean()]) + 0.5) / 96 * side - side / 2
+    assert math.dist(middle, pose[:2]) < 0.035
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"camera": "/dev/video0"}, "--camera is /dev/video0, but --twin has no devices: leave out --camera or --twin"),
+        ({"leds": "/dev/ttyACM0"}, "--leds is /dev/ttyACM0"),
+        ({"count": 0}, "count must be >= 1, got 0"),
+        ({"size": (0, 480)}, "at least 1 pixel"),
+    ],
+)
+def test_bad_options_of_the_twin_are_named(tmp_path, options, message):
+    with pytest.raises(SystemExit, match=message):
+        real.main(real.Collect(tmp_path, twin=True, **options))
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A sensor file of a real device, with backgrounds."""
+    device = hardware.Device(
+        camera="/dev/v4l/by-id/camera",
+        fps=30.0,
+        leds="0123",
+        lens=hardware.Lens.ideal(32, 24),
+        settle_on_s=0.1,
+        settle_off_s=0.1,
+        levels=(255, 255, 255, 255),
+        commissioned="2026-05-31",
+    )
+    images = {stream: np.full((24, 32, 3), level, np.uint8) for stream, level in (("visual", 40), ("tactile", 90))}
+    device.save(tmp_path / "bench.json", sts.Sensor().constants(), **images)
+    return tmp_path / "bench.json"
+
+
+def test_a_work_directory_keeps_its_sensor_file(file, tmp_path):
+    workdir = tmp_path / "run"
+    workdir.mkdir()
+    for _ in range(2):
+        collecting.keep(file, workdir)
+        file_content = file.read_bytes()
+        assert (workdir / "sensor.json").read_bytes() == file_content
+        assert hardware.Device.load(workdir).background(workdir, "tactile").mean() == 90
+    image = np.full((24, 32, 3), 91, np.uint8)
+    hardware.Device.load(file).save(file, sts.Sensor().constants(), tactile=image)
+    with pytest.raises(ValueError, match=r"sensor\.json differs from .*bench\.json.*choose another --workdir"):
+        collecting.keep(file, workdir)
+    assert hardware.Device.load(workdir).background(workdir, "tactile").mean() == 90
+
+
+def test_a_work_directory_of_a_device_is_not_continued_by_the_twin(file, tmp_path):
+    workdir = tmp_path / "run"
+    workdir.mkdir()
+    collecting.keep(file, workdir)
+    with (
+        twin.Twin(twin.Picture(np.zeros((24, 32, 3)), np.ones((24, 32, 3)))) as device,
+        pytest.raises(hardware.WrongDeviceError, match="LED controller TWIN0"),
+    ):
+        simulated.commissioned(simulated.Simulated(workdir, size=(32, 24)), device)

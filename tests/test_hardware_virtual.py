@@ -1,0 +1,223 @@
+"""Pairs and collections of the digital twin on its virtual clock. The twin's log decides which light an image shows."""
+
+import random
+import zlib
+
+import numpy as np
+import pytest
+
+from sts_jax import hardware
+from sts_jax.hardware import Settling, twin
+from sts_jax.hardware.twin import photometry
+
+SIZE = (120, 160)
+GUIDE = hardware.GuideConfig(empty_s=0.3, hold_s=0.3, rest_s=0.5, pairs=3)
+MOVED = 60  # pixels, between the ends of a trajectory
+
+
+class Spots(twin.Scene):
+    """A dark spot under both lights. Trajectory n starts in a column of its own, and its object moves to the right."""
+
+    def __init__(self, *, unseen=(), unmoved=(), first=0):
+        self.unseen, self.unmoved = unseen, unmoved
+        self.events = [(-np.inf, twin.Phase.EMPTY, first - 1)]
+
+    @staticmethod
+    def start(number):
+        return 20 + 12 * number
+
+    def column(self, seen):
+        moved = seen.phase is twin.Phase.STILL and seen.trajectory not in self.unmoved
+        return self.start(seen.trajectory) + MOVED * moved
+
+    def at(self, time_s):
+        _, phase, number = [event for event in self.events if event[0] <= time_s][-1]
+        return twin.Seen(phase, number, 0, None)
+
+    def command(self, command, time_s):
+        number = self.events[-1][2]
+        phase = {"hold": twin.Phase.HELD, "release": twin.Phase.STILL, "clear": twin.Phase.EMPTY}[command]
+        self.events.append((time_s, phase, number + (command == "hold")))
+
+    def ends(self, seen, blender):
+        visual, tactile = np.full((*SIZE, 3), 0.4), np.full((*SIZE, 3), 0.8)
+        if seen.phase is not twin.Phase.EMPTY:
+            column = self.column(seen)
+            visual[40:70, column - 12 : column + 12] = 0.1
+            if seen.trajectory not in self.unseen:
+                tactile[40:70, column - 12 : column + 12] = 0.2
+        return blender.ends(visual, tactile)
+
+
+def column_of(image):
+    """Column of the spot's middle, or None if there is no spot."""
+    columns = np.flatnonzero(image[45:65].mean(axis=(0, 2)) < 0.75 * image[5:30].mean(axis=(0, 2)))
+    return None if len(columns) < 10 else columns.mean() + 0.5
+
+
+def picture(tactile=0.8):
+    return twin.Picture(np.full((*SIZE, 3), 0.4), np.full((*SIZE, 3), tactile))
+
+
+@pytest.fixture
+def logged(tmp_path):
+    """Makes twins, and looks the truth about an image up in their logs, by the checksum of the image."""
+
+    class Logged:
+        def make(self, scene, **options):
+            files = {"log": tmp_path / "log.jsonl", "record": tmp_path / "record.mjpeg"}
+            return twin.Twin(scene, **files, **options)
+
+        def truth(self):
+            _, *parts = (tmp_path / "record.mjpeg").read_bytes().split(b"\xff\xd8\xff")
+            images = [photometry.decode(b"\xff\xd8\xff" + part) for part in parts]
+            log = twin.read_log(tmp_path / "log.jsonl")
+            found = {zlib.crc32(image.tobytes()): row for image, row in zip(images, log, strict=True)}
+            assert len(found) == len(log)
+            return found
+
+    return Logged()
+
+
+def assert_of_one_light(shots, truth):
+    for shot in shots:
+        exposure = truth[zlib.crc32(shot.image.tobytes())]
+        wanted = 1.0 if shot.stream == "tactile" else 0.0
+        assert abs(exposure.lowest - wanted) + abs(exposure.highest - wanted) < 1e-6
+        assert exposure.due_s == pytest.approx(shot.time_s)
+        assert shot.before.acknowledged_s < exposure.start_s < exposure.end_s < shot.time_s <= shot.until_s
+
+
+@pytest.mark.parametrize("lag_s", [0.015, 0.12])
+@pytest.mark.parametrize(("rate", "exposure_s"), [(15, 0.06), (60, 0.016)])
+def test_no_image_is_of_a_wrong_or_mixed_light(logged, lag_s, rate, exposure_s):
+    constants = twin.Imperfections(lag_s=lag_s, exposure_s=exposure_s, jitter_s=0.01)
+    chance = random.Random(0)
+    with logged.make(picture(), rate=rate, imperfections=constants) as made:
+        sensor = twin.VirtualSensor(made)
+        assert lag_s < sensor.settling.tactile_s < lag_s + exposure_s + 0.01 + 2 / rate
+        shots = []
+        for _ in range(30):
+            made.step(chance.uniform(0, 2 / rate))
+            called_s = made.now_s
+            pair = sensor.read()
+            assert min(pair.visual.time_s, pair.tactile.time_s) > called_s
+            shots += [pair.visual, pair.tactile]
+    assert_of_one_light(shots, logged.truth())
+
+
+def test_a_settling_that_is_too_short_is_noticed_by_the_log(logged):
+    constants = twin.Imperfections(lag_s=0.1, exposure_s=0.06)
+    with logged.make(picture(), rate=15, imperfections=constants) as made:
+        sensor = twin.VirtualSensor(made, settling=Settling(visual_s=0.01, tactile_s=0.01))
+        shots = [shot for pair in (sensor.read() for _ in range(3)) for shot in (pair.visual, pair.tactile)]
+    with pytest.raises(AssertionError):
+        assert_of_one_light(shots, logged.truth())
+
+
+def test_an_image_whose_light_went_off_is_not_returned(logged, monkeypatch):
+    with logged.make(picture(), rate=15) as made:
+        sensor = twin.VirtualSensor(made)
+        capture, calls = made.capture, []
+
+        def rebooting():
+            calls.append(made.state.levels)
+            if len(calls) in (2, 3):  # the first images of the tactile stream
+                made.inject(twin.Fault("reboot"))
+            return capture()
+
+        monkeypatch.setattr(made, "capture", rebooting)
+        pairs = [sensor.read() for _ in range(2)]
+    assert len(calls) == 6
+    assert_of_one_light([shot for pair in pairs for shot in (pair.visual, pair.tactile)], logged.truth())
+
+
+def test_lights_that_never_stay_on_are_an_error(logged, monkeypatch):
+    with logged.make(picture(), rate=15) as made:
+        sensor = twin.VirtualSensor(made, settling=Settling(visual_s=0.1, tactile_s=2.0))
+        with pytest.raises(hardware.LightError, match="lower the settling time of 2 s"):
+            sensor.read()
+
+
+def test_bad_sensors_are_refused():
+    with twin.Twin(picture()) as made, pytest.raises(ValueError, match=r"at least one above 0, got \(0, 0, 0, 0\)"):
+        twin.VirtualSensor(made, levels=(0, 0, 0, 0))
+    with twin.Twin(picture(tactile=0.4)) as made, pytest.raises(hardware.NoContrastError, match="wiring"):
+        twin.VirtualSensor(made)
+    with twin.Twin(picture()) as made:
+        made.run_on(lambda: 0.0)
+        with pytest.raises(RuntimeError, match="real clock"):
+            twin.VirtualSensor(made)
+
+
+def collected(scene, folder, count, hand=twin.Hand, **options):
+    """Collect by the ordinary loop."""
+    with twin.Twin(scene, rate=15) as made:
+        sensor = twin.VirtualSensor(made)
+        with hardware.Session.open(folder, sensor.origin, settling=sensor.settling) as session:
+            person = hand(made, session, **options)
+            hardware.collect(sensor, session, person, config=GUIDE, trusted=True, count=count)
+
+
+def assert_spots(folder, numbers, scene):
+    """The pairs show the spots of the trajectories with the numbers of the session, at both ends."""
+    read = hardware.load_recordings(folder)
+    assert read.numbers == tuple(numbers)
+    for trajectory in read:
+        for pair, phase in ((trajectory.initial, twin.Phase.HELD), (trajectory.final, twin.Phase.STILL)):
+            wanted = scene.column(twin.Seen(phase, trajectory.number, 0, None))
+            for shot in (pair.visual, pair.tactile):
+                assert abs(column_of(shot.image) - wanted) <= 1
+
+
+def test_the_hand_moves_the_object_as_the_guide_asks(tmp_path):
+    scene = Spots(unmoved=(1,))
+    collected(scene, tmp_path, 3)
+    assert_spots(tmp_path, range(3), scene)
+    phases = [phase for _, phase, _ in scene.events[1:]]
+    assert [str(phase) for phase in phases[:6]] == ["held", "still", "empty"] * 2
+
+
+def test_a_collection_is_continued_with_the_next_trajectory(tmp_path):
+    class Interrupted(twin.Hand):
+        def show(self, view):
+            super().show(view)
+            if view.number == 1 and view.initial is not None:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        collected(Spots(), tmp_path, 4, Interrupted)
+    first = hardware.next_recording(tmp_path)
+    assert first == 2  # 1 has an initial pair only
+    scene = Spots(first=first)
+    collected(scene, tmp_path, 3)
+    assert_spots(tmp_path, [0, 2, 3], scene)
+
+
+def test_a_disk_that_is_busy_after_each_trajectory_delays_the_hand_only(tmp_path, monkeypatch):
+    answers = iter(["the disk is too slow"] * 40)  # 8 s, longer than the hand waits for a contact
+
+    def busy(self):
+        if self.confirmed and (problem := next(answers, None)) is not None:
+            raise hardware.SessionError(problem)
+
+    monkeypatch.setattr(hardware.Session, "check_ready", busy)
+    scene = Spots()
+    collected(scene, tmp_path, 2)
+    assert next(answers, None) is None
+    assert_spots(tmp_path, range(2), scene)
+
+
+def test_a_pose_without_contact_is_left_out_with_its_number(tmp_path):
+    scene = Spots(unseen=(1,))
+    collected(scene, tmp_path, 3)
+    assert_spots(tmp_path, [0, 2, 3], scene)
+
+
+def test_a_guide_that_waits_for_ever_ends_with_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"Place the object.*\(contact: False, still: True\): its thresholds do not"):
+        collected(Spots(unseen=range(20)), tmp_path / "unseen", 1)
+    with pytest.raises(ValueError, match=r"Take everything.* after 0.\d s .*its thresholds do not suit"):
+        collected(Spots(), tmp_path / "impatient", 1, patience_s=0.1)
+    with pytest.raises(ValueError, match="patience_s must be > 0, got 0"):
+        collected(Spots(), tmp_path / "none", 1, patience_s=0.0)
