@@ -313,10 +313,6 @@ def main(config: Config) -> None:
                     reach = "only this computer" if page.is_local else "EVERY computer that reaches this address"
                     say(f"open {page.url} in a browser. The page listens on {config.host}: {reach} can watch")
                 follow(config, source, predictor, page)
-        except (hardware.CameraError, hardware.LightError, hardware.NoContrastError) as error:
-            if config.debug:
-                raise
-            raise SystemExit(f"error: {error}") from None
         except KeyboardInterrupt:
             raise SystemExit("stopped") from None
 
