@@ -10,8 +10,8 @@
 
 The page shows both streams in the view of the sensor, the predicted images at rest, the probabilities of the outcomes,
 contact, and the rate and the latency of the predictions. The models of the library were trained on simulated images of
-other scenarios, so on a twin or a real sensor they show little more than the place of the object. At its first start, a twin compiles for about two minutes and
-the model for half a minute.
+other scenarios, so on a twin or a real sensor they show little more than the place of the object. At its first start, a
+twin compiles for about two minutes and the model for half a minute.
 """
 
 import collections
