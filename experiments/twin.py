@@ -10,6 +10,7 @@ Prints how to connect and runs until Ctrl-C. The first start compiles for about 
 import dataclasses
 import math
 import signal
+import sys
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +44,7 @@ class Config:
     http_port: int = 0  # 0: a free one
     log: Path | None = None  # file for the truth about each frame, as JSON lines
     record: Path | None = None  # file for all frames, as motion JPEG
+    attached: bool = False  # end with the standard input, and so with a program that holds its other end
 
 
 def make(config: Config) -> twin.Twin:
@@ -94,7 +96,14 @@ def main(config: Config) -> None:
             signal.signal(number, lambda *_: stop.set())
         with twin.Served(device, link=config.port, host=config.host, http_port=config.http_port) as served:
             print(f"{served.description}\nCtrl-C ends it.", flush=True)
+            if config.attached:
+                threading.Thread(target=_until_end_of_input, args=(stop,), daemon=True).start()
             stop.wait()
+
+
+def _until_end_of_input(stop: threading.Event) -> None:
+    sys.stdin.read()
+    stop.set()
 
 
 if __name__ == "__main__":

@@ -47,6 +47,7 @@ from sts_jax.hardware.ports import (
     WrongVersionError,
     find_controllers,
 )
+from sts_jax.hardware.recorder import Recorder
 from sts_jax.hardware.recordings import (
     Entry,
     Images,
@@ -59,6 +60,7 @@ from sts_jax.hardware.recordings import (
     next_recording,
     restore_recording,
 )
+from sts_jax.hardware.replay import Replay
 from sts_jax.hardware.sensor_file import Background, Device, SensorFileError, WrongDeviceError
 from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
@@ -119,7 +121,9 @@ __all__ = [
     "PortNotFoundError",
     "PortPermissionError",
     "RecordedTrajectory",
+    "Recorder",
     "Recordings",
+    "Replay",
     "SensorFileError",
     "SensorView",
     "Session",

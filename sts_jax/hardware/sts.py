@@ -1,9 +1,10 @@
 """`STS`: camera and lights as one sensor. Every image is proven to be of one light."""
 
 import dataclasses
+import itertools
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -319,10 +320,7 @@ class STS:
             ValueError: An argument is out of range.
             LightError, LedError, CameraError: As in `read`, at each image.
         """
-        if not 0 <= duty <= 1:
-            raise ValueError(f"duty must be in [0, 1], got {duty}")
-        if dwell < 1:
-            raise ValueError(f"dwell must be >= 1, got {dwell}")
+        stream_order(duty, dwell)
         self._stop_background()
         return self._images(duty, dwell)
 
@@ -344,22 +342,7 @@ class STS:
             LightError, LedError, CameraError: As in `read`.
         """
         self._stop_background()
-        deadline, first = time.monotonic() + timeout_s, None
-        look, change, allowed = None, 0.0, _STILL
-        for shot in self._images(0.0, 1):
-            now = thumbnail(shot.image)
-            changes = np.zeros(1) if look is None else np.abs(now - look)
-            change, allowed = float(changes.max()), max(_STILL, _NOISE * float(np.median(changes)))
-            if first is None or look is None or change > allowed or shot.epoch != first.epoch:
-                first, look = shot, now
-            elif shot.time_s - first.time_s >= window_s:
-                return shot
-            if time.monotonic() > deadline:
-                break
-        raise NotStillError(
-            f"the view still changes after {timeout_s:g} s, by {change:.0f} of 255 in one block (allowed are "
-            f"{allowed:.0f}): wait longer, or check the room's light."
-        )
+        return first_still(self._images(0.0, 1), timeout_s, window_s)
 
     def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 1.0) -> Settling:
         """Measure how long after an acknowledgement frames with the former light arrive, and use the result.
@@ -385,13 +368,8 @@ class STS:
         self.disconnect()
 
     def _images(self, duty: float, dwell: int) -> Iterator[Shot]:
-        """As `stream`. The streams follow each other so that the share of tactile images is as near as possible."""
-        number = tactile = 0
-        while True:
-            stream: Stream = "tactile" if tactile + 0.5 < duty * (number + 1) + 1e-9 else "visual"
-            number, tactile = number + 1, tactile + (stream == "tactile")
-            for _ in range(dwell):
-                yield self._connected.shot(stream, time.monotonic() + self._timeout_s)
+        for stream in stream_order(duty, dwell):
+            yield self._connected.shot(stream, time.monotonic() + self._timeout_s)
 
     def _limit_s(self, timeout_ms: float | None, images: int) -> float:
         if timeout_ms is None:
@@ -420,6 +398,61 @@ class STS:
         if background is not None:
             background.stop()
             self._connected.resume()
+
+
+def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
+    """The streams of successive images, so that the share of tactile ones is as near to `duty` as possible.
+
+    Args:
+        duty: Share of tactile images, 0 to 1.
+        dwell: Images of one stream before the other may follow.
+
+    Raises:
+        ValueError: An argument is out of range.
+    """
+    if not 0 <= duty <= 1:
+        raise ValueError(f"duty must be in [0, 1], got {duty}")
+    if dwell < 1:
+        raise ValueError(f"dwell must be >= 1, got {dwell}")
+
+    def order() -> Iterator[Stream]:
+        number = tactile = 0
+        while True:
+            stream: Stream = "tactile" if tactile + 0.5 < duty * (number + 1) + 1e-9 else "visual"
+            number, tactile = number + 1, tactile + (stream == "tactile")
+            yield from itertools.repeat(stream, dwell)
+
+    return order()
+
+
+def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Shot:
+    """The first image at which nothing has moved during a window, see `STS.wait_until_still`.
+
+    Args:
+        shots: Successive images of the visual stream.
+        timeout_s: Longest time from the first image (s).
+        window_s: Length of the window (s).
+
+    Raises:
+        NotStillError: Something still moves.
+    """
+    started_s: float | None = None
+    first, look, change, allowed = None, None, 0.0, _STILL
+    for shot in shots:
+        now = thumbnail(shot.image)
+        changes = np.zeros(1) if look is None else np.abs(now - look)
+        change, allowed = float(changes.max()), max(_STILL, _NOISE * float(np.median(changes)))
+        started_s = shot.time_s if started_s is None else started_s
+        if first is None or look is None or change > allowed or shot.epoch != first.epoch:
+            first, look = shot, now
+        elif shot.time_s - first.time_s >= window_s:
+            return shot
+        if shot.time_s - started_s > timeout_s:
+            break
+    raise NotStillError(
+        f"the view still changes after {timeout_s:g} s, by {change:.0f} of 255 in one block (allowed are "
+        f"{allowed:.0f}): wait longer, or check the room's light."
+    )
 
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:

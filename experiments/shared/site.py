@@ -1,0 +1,209 @@
+"""A small web server for one page with live images, which other sites in the same browser can neither see nor use."""
+
+import abc
+import contextlib
+import http.server
+import ipaddress
+import json
+import threading
+import time
+import urllib.parse
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+_WIDEST = 820  # pixels, to which images are reduced
+_QUALITY = 80  # of JPEG
+_INTERVAL_S = 0.1  # between two images of a stream
+_OPEN_S = 2.0  # s since the last question of a page after which it counts as closed
+_LAST_S = 0.4  # s for open pages to ask once more at the end
+_LARGEST = 1000  # bytes of a request
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+
+class Site(abc.ABC):
+    """A page in a browser. The server listens on one address only.
+
+    Requests under another name than the address are refused, and so are actions without the page's own header. Another
+    page that is open in the same browser can therefore neither see the images nor press the buttons.
+    """
+
+    def __init__(self, host: str, port: int, document: Path, streams: tuple[str, ...]):
+        """Listen.
+
+        Args:
+            host: Address or name, such as 127.0.0.1.
+            port: 0: a free one.
+            document: The HTML file.
+            streams: Names of the live images. The page shows them as `NAME.mjpg`.
+
+        Raises:
+            OSError: The address cannot be used. The message names it and the remedy.
+        """
+        self.document, self.streams = document, streams
+        self._changed = threading.Condition()
+        self._number = 0  # of changes
+        self._ended = False
+        self._asked_s = -float("inf")  # when a page last asked for the facts
+        site = self
+
+        class Handler(_Handler):
+            owner = site
+
+        try:
+            self._server = http.server.ThreadingHTTPServer((host, port), Handler)
+        except (OSError, OverflowError) as error:
+            raise OSError(
+                f"the page cannot be served at {host}:{port} ({error}): give another --host or --port, or --headless."
+            ) from error
+        self._server.daemon_threads = True
+        self.host, self.port = host, self._server.server_port
+        self._thread = threading.Thread(target=self._server.serve_forever, name="page", daemon=True)
+        self._thread.start()
+
+    @abc.abstractmethod
+    def facts(self) -> dict[str, Any]:
+        """What the page shows besides images, as JSON. `ended` states that there will be no more."""
+
+    @abc.abstractmethod
+    def image(self, stream: str) -> Image | None:
+        """The newest image of a stream, the same object as before if it has not changed."""
+
+    def still(self, path: str) -> Image | None:
+        """The image at a path such as `end/initial/visual.jpg`, or None."""
+        return None
+
+    def pressed(self, content: Any) -> bool:
+        """Take over an action. False: it does not fit."""
+        return False
+
+    @property
+    def url(self) -> str:
+        """The address of the page."""
+        return f"http://{self.host}:{self.port}/"
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs of this computer can reach the page."""
+        with contextlib.suppress(ValueError):
+            return ipaddress.ip_address(self.host).is_loopback
+        return self.host == "localhost"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a browser shows the page."""
+        return time.monotonic() - self._asked_s < _OPEN_S
+
+    def asked(self) -> dict[str, Any]:
+        """The facts for a page that asks."""
+        self._asked_s = time.monotonic()
+        return self.facts()
+
+    def wait(self, last: int) -> int | None:
+        """Wait for a change after the one with a number. None: there will be no more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ended or self._number > last)
+            return None if self._ended else self._number
+
+    def close(self) -> None:
+        """Show in the open pages that the program has ended, and stop."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+        if self.is_open:
+            time.sleep(_LAST_S)
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    """Requests of a page."""
+
+    owner: Site
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
+    def do_GET(self) -> None:
+        """Answer with the page, the facts, an image or a stream."""
+        path = self.path.partition("?")[0].removeprefix("/")
+        with contextlib.suppress(OSError):  # the browser has left
+            if not self._own_name():
+                self.send_error(403, "Open the page under the address that the program has printed")
+            elif path == "":
+                self._send("text/html; charset=utf-8", self.owner.document.read_bytes())
+            elif path == "view":
+                self._send("application/json", json.dumps(self.owner.asked()).encode())
+            elif path.endswith(".mjpg") and path.removesuffix(".mjpg") in self.owner.streams:
+                self._stream(path.removesuffix(".mjpg"))
+            elif (image := self.owner.still(path)) is not None:
+                self._send("image/jpeg", _jpeg(image))
+            else:
+                self.send_error(404)
+
+    def do_POST(self) -> None:
+        """Take over an action."""
+        length = self.headers.get("Content-Length", "")
+        with contextlib.suppress(OSError):
+            if not self._own_name() or self.path != "/action" or self.headers.get("X-Collect") != "1":
+                self.send_error(403)
+                return
+            if not length.isdecimal() or int(length) > _LARGEST:
+                self.send_error(400)
+                return
+            try:
+                content = json.loads(self.rfile.read(int(length)))
+            except ValueError:
+                self.send_error(400)
+                return
+            self.send_response(204 if self.owner.pressed(content) else 409)
+            self.end_headers()
+
+    def _own_name(self) -> bool:
+        """Whether the browser asks for the address on which the server listens, and not for another site's name."""
+        name = ""
+        with contextlib.suppress(ValueError):
+            name = urllib.parse.urlsplit("//" + self.headers.get("Host", "")).hostname or ""
+        if name == self.owner.host or (self.owner.is_local and name in ("localhost", "127.0.0.1", "::1")):
+            return True
+        with contextlib.suppress(ValueError):  # all addresses of this computer
+            return self.owner.host in ("0.0.0.0", "::") and bool(ipaddress.ip_address(name))
+        return False
+
+    def _send(self, kind: str, data: bytes) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        self.wfile.write(data)
+
+    def _stream(self, stream: str) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        number, shown = 0, None
+        while (changed := self.owner.wait(number)) is not None:
+            number, image = changed, self.owner.image(stream)
+            if image is None or image is shown:
+                continue
+            shown, data = image, _jpeg(image)
+            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+            self.wfile.write(head.encode() + data + b"\r\n")
+            time.sleep(_INTERVAL_S)
+
+
+def _jpeg(image: Image) -> bytes:
+    """An image, reduced and encoded."""
+    height, width = image.shape[:2]
+    if width > _WIDEST:
+        image = cv2.resize(image, (_WIDEST, round(height * _WIDEST / width)), interpolation=cv2.INTER_AREA)
+    parameters = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), parameters)[1].tobytes()

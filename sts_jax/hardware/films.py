@@ -1,0 +1,269 @@
+"""The recorded images of both streams, from a recording of `Recorder` or from two plain video files."""
+
+import abc
+import json
+import math
+import os
+import zlib
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from sts_jax import _files
+from sts_jax._files import TornFileError
+from sts_jax.hardware import protocol
+from sts_jax.hardware.camera_config import CameraConfig
+from sts_jax.hardware.camera_errors import CameraOpenError
+from sts_jax.hardware.capture import Capture
+from sts_jax.hardware.leds import Lit
+from sts_jax.hardware.recorder import FORMAT, FRAMES, HEAD, video_name
+from sts_jax.hardware.shots import Stream
+
+_AGAIN = "copy the recording again"
+_RATE = 30.0  # frames per second of a video whose header states no rate
+_UNEQUAL = 1  # frames by which two videos may differ in length
+
+Image = UInt8[np.ndarray, "height width 3"]
+
+
+class Still(NamedTuple):
+    """An image of a film, without its pixels. The fields are those of `Shot`, on the clock of the recording."""
+
+    stream: Stream
+    time_s: float
+    sequence: int
+    epoch: int
+    before: Lit
+    until_s: float
+
+
+class Film(abc.ABC):
+    """Recorded images in the order of their times."""
+
+    stills: tuple[Still, ...]
+
+    @abc.abstractmethod
+    def image(self, index: int) -> Image:
+        """The RGB pixels of a still. Films are read in the direction of time at least as fast as in any other."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Close the files."""
+
+
+class _Place(NamedTuple):
+    """The place of an encoded image in its file."""
+
+    offset: int
+    size: int
+    crc32: int
+
+
+class RecordedFilm(Film):
+    """The film of a recording."""
+
+    def __init__(self, folder: Path):
+        """Open a recording and compare its lines with its video files.
+
+        Raises:
+            FileNotFoundError: There is no recording, or a file of it is missing.
+            TornFileError: A file is damaged or truncated.
+            ValueError: The recording has no image, or was written by another version of the format.
+        """
+        self._folder = folder
+        self._check_head()
+        found = _lines(folder / FRAMES)
+        self.stills = tuple(still for still, _ in found)
+        self._places = tuple(place for _, place in found)
+        self._files: dict[str, BinaryIO] = {}
+        try:
+            for stream in sorted({still.stream for still in self.stills}):
+                self._open(stream)
+        except BaseException:
+            self.close()
+            raise
+
+    def _check_head(self) -> None:
+        path = self._folder / HEAD
+        try:
+            head = _files.read_json(path, _AGAIN)
+        except (FileNotFoundError, NotADirectoryError):
+            raise FileNotFoundError(
+                f"{self._folder} holds no recording ({HEAD} is missing): give the folder of one, or two video files."
+            ) from None
+        if not isinstance(head, dict) or head.get("format") != FORMAT:
+            found = head.get("format") if isinstance(head, dict) else None
+            raise ValueError(f"{path} has format {found!r}, but this version of sts_jax reads format {FORMAT}.")
+
+    def _open(self, stream: str) -> None:
+        """Open the video of a stream, and compare its size with the lines."""
+        path = self._folder / video_name(stream)
+        places = [place for still, place in zip(self.stills, self._places, strict=True) if still.stream == stream]
+        try:
+            self._files[stream] = path.open("rb")
+        except OSError as error:
+            raise type(error)(
+                f"{path} cannot be read ({error}), but {FRAMES} lists {len(places)} images of it."
+            ) from error
+        size = path.stat().st_size
+        there = sum(place.offset + place.size <= size for place in places)
+        if there < len(places):
+            raise TornFileError(
+                f"{path} is truncated: it has {there} images, but {FRAMES} lists {len(places)}. {_AGAIN.capitalize()}, "
+                f"or remove the last {len(places) - there} lines of the {stream} stream from {FRAMES}."
+            )
+
+    def image(self, index: int) -> Image:
+        """As in `Film`.
+
+        Raises:
+            TornFileError: The image is damaged.
+        """
+        still, place = self.stills[index], self._places[index]
+        file = self._files[still.stream]
+        file.seek(place.offset)
+        data = file.read(place.size)
+        if zlib.crc32(data) != place.crc32:
+            raise TornFileError(
+                f"image {index + 1} of {self._folder} is damaged, because its checksum differs: {_AGAIN}, or remove "
+                f"line {index + 1} of {FRAMES}."
+            )
+        image = cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        return np.asarray(image)
+
+    def close(self) -> None:
+        """As in `Film`."""
+        while self._files:
+            self._files.popitem()[1].close()
+
+
+def _lines(path: Path) -> list[tuple[Still, _Place]]:
+    """The complete lines of a file of frames. A last line without its end was interrupted, and is left out."""
+    try:
+        lines = path.read_bytes().split(b"\n")[:-1]
+    except OSError as error:
+        raise type(error)(f"{path} cannot be read ({error}): {_AGAIN}.") from error
+    found: list[tuple[Still, _Place]] = []
+    for number, line in enumerate(lines, 1):
+        try:
+            values = json.loads(line)
+            found.append((_still(values), _Place(values["offset"], values["bytes"], values["crc32"])))
+        except (ValueError, KeyError, TypeError) as error:
+            raise TornFileError(
+                f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): {_AGAIN}, or remove this line."
+            ) from error
+        if number > 1 and found[-1][0].time_s < found[-2][0].time_s:
+            raise TornFileError(f"{path}, line {number}, is of an earlier time than the line before: {_AGAIN}.")
+    if not found:
+        raise ValueError(f"{path} lists no image: make a new recording.")
+    return found
+
+
+def _still(values: dict[str, Any]) -> Still:
+    if values["stream"] not in ("visual", "tactile"):
+        raise ValueError(f"stream is {values['stream']!r}")
+    lit = Lit(**{**values["before"], "levels": tuple(values["before"]["levels"])})
+    still = Still(
+        values["stream"], float(values["time_s"]), values["sequence"], values["epoch"], lit, float(values["until_s"])
+    )
+    if not math.isfinite(still.time_s):
+        raise ValueError(f"time_s is {still.time_s}")
+    return still
+
+
+class VideoFilm(Film):
+    """The film of two videos of equal length, one per stream. Nothing proves their light."""
+
+    def __init__(self, visual: str | os.PathLike, tactile: str | os.PathLike, fps: float | None = None):
+        """Open both videos.
+
+        Args:
+            visual: Video of the visual stream.
+            tactile: Video of the tactile stream.
+            fps: Frames per second. None: by the header of the visual video.
+
+        Raises:
+            CameraError: A file is missing, damaged or no video.
+            ValueError: Their lengths differ by more than one frame, or `fps` is not positive.
+        """
+        if fps is not None and not (fps > 0 and math.isfinite(fps)):
+            raise ValueError(f"fps must be > 0 and finite, got {fps}")
+        self._videos: dict[Stream, _Video] = {}
+        try:
+            self._videos["visual"] = _Video(visual)
+            self._videos["tactile"] = _Video(tactile)
+            counts = {stream: video.count for stream, video in self._videos.items()}
+            if abs(counts["visual"] - counts["tactile"]) > _UNEQUAL:
+                raise ValueError(
+                    f"{visual} has {counts['visual']} frames, but {tactile} has {counts['tactile']}: cut both to the "
+                    "same moments, so that frames of equal number belong together."
+                )
+        except BaseException:
+            self.close()
+            raise
+        period_s = 1 / (fps or self._videos["visual"].rate or _RATE)
+        unproven: dict[Stream, Lit] = {
+            "visual": Lit(protocol.DARK, 0, 0, math.nan, math.nan),
+            "tactile": Lit((255, 255, 255, 255), 0, 0, math.nan, math.nan),
+        }
+        self.stills = tuple(
+            Still(stream, number * period_s, number, 0, lit, math.nan)
+            for number in range(min(counts.values()))
+            for stream, lit in unproven.items()
+        )
+
+    def image(self, index: int) -> Image:
+        """As in `Film`.
+
+        Raises:
+            CameraOpenError: The video is truncated or damaged.
+        """
+        still = self.stills[index]
+        return self._videos[still.stream].frame(still.sequence)
+
+    def close(self) -> None:
+        """As in `Film`."""
+        while self._videos:
+            self._videos.popitem()[1].capture.release()
+
+
+class _Video:
+    """A video file that is read forwards, and opened again to go back."""
+
+    def __init__(self, path: str | os.PathLike):
+        self._config = CameraConfig(Path(path), None, None)
+        if self._config.kind != "file":
+            raise ValueError(f"{path} is no video file: give the path of one.")
+        self._reopen()
+        assert self.capture.frame_count is not None  # Capture refuses a file without
+        self.count, self.rate = self.capture.frame_count, self.capture.rate
+
+    def _reopen(self) -> None:
+        self.capture = Capture(self._config)
+        self._next = 0  # number of the frame that is read next
+        self._last: tuple[int, Image] | None = None
+
+    def frame(self, number: int) -> Image:
+        if self._last is not None and self._last[0] == number:
+            return self._last[1]
+        if number < self._next:
+            self.capture.release()
+            self._reopen()
+        while self._next <= number:
+            if not self.capture.grab():
+                raise self._truncated()
+            self._next += 1
+        image = self.capture.retrieve()
+        if image is None:
+            raise self._truncated()
+        self._last = number, image
+        return image
+
+    def _truncated(self) -> CameraOpenError:
+        return CameraOpenError(
+            f"{self._config.name} ends or is damaged at frame {self._next}, but its header states {self.count} frames: "
+            "copy or record it again, or cut both videos before this frame."
+        )

@@ -1,0 +1,266 @@
+"""`experiments.live`: what is shown, at which rate, and from which images."""
+
+import dataclasses
+import http.client
+import json
+import threading
+import time
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from led_simulator import WAIT_S
+from recording_writer import ORIGIN, SIZE, shot
+
+import sts_jax as sts
+from experiments import live
+from experiments.shared.live import SIDE, Backgrounds, Live, Seen, Views
+from experiments.shared.live_page import LivePage
+from experiments.shared.live_panel import PanelFile, panel
+from sts_jax import hardware
+
+LENS = hardware.Lens.ideal(SIZE[1], SIZE[0])
+PINHOLE = sts.Sensor().camera
+EMPTY = {"visual": 100, "tactile": 180}  # grey values of the empty pad
+
+
+def grey(level, size=SIZE):
+    return np.full((*size, 3), level, np.uint8)
+
+
+def views(divided=True):
+    return Views(LENS, PINHOLE, Backgrounds(grey(EMPTY["visual"]), grey(EMPTY["tactile"]), divided))
+
+
+class StubPredictor:
+    """Predicts the image that it was given, mirrored, and keeps all inputs."""
+
+    def __init__(self, seconds=0.0, modalities=("visual", "tactile"), condition=0):
+        self.modalities, self.seconds, self.calls = modalities, seconds, []
+        self.preprocessing = SimpleNamespace(resolution=(16, 16))
+        self.empty = {"visual": np.full((16, 16, 3), 0.6, np.float32), "tactile": np.full((16, 16, 3), 0.7, np.float32)}
+        self.model = SimpleNamespace(config=SimpleNamespace(condition=condition))
+
+    def __call__(self, *, visual, tactile, condition, present):
+        self.calls.append((visual, tactile, condition, present))
+        if self.seconds and len(self.calls) > 1:
+            time.sleep(self.seconds)
+        return SimpleNamespace(visual=visual[:, ::-1], tactile=visual, outcome_probability=np.array([0.75, 0.25]))
+
+
+def pair(visual=None, tactile=None, number=0):
+    """A visual and a tactile image. None: of the empty pad."""
+    made = []
+    for stream, image in (("visual", visual), ("tactile", tactile)):
+        pixels = grey(EMPTY[stream]) if image is None else image
+        made.append(dataclasses.replace(shot(number), image=pixels, stream=stream, time_s=time.monotonic()))
+    return made
+
+
+def predicted(predictor, *shots, **options):
+    """The prediction from one pair."""
+    done = threading.Event()
+    with Live(predictor, views(), ("rests", "fell off"), (), done.set, **options) as running:
+        running.offer(*shots)
+        assert done.wait(WAIT_S)
+        return running.newest
+
+
+def spotted(level):
+    image = grey(level)
+    cv2.circle(image, (SIZE[1] // 2 + 4, SIZE[0] // 2), 10, (20, 20, 20), -1)
+    return image
+
+
+def test_backgrounds_become_the_untouched_sensor_of_the_model():
+    predictor = StubPredictor()
+    assert predicted(predictor, *pair()).occupied is False
+    visual, tactile, _, present = predictor.calls[-1]
+    inside = np.s_[4:12, 4:12]
+    np.testing.assert_allclose(visual[inside], 0.6, atol=1e-6)
+    np.testing.assert_allclose(tactile[inside], 0.7, atol=1e-6)
+    assert not present["tactile"]
+    kept = views(divided=False).prepared(grey(100), grey(180), predictor.empty)
+    np.testing.assert_allclose(kept.visual[inside], 100 / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("visual", "tactile", "contact", "occupied"),
+    [(None, None, False, False), (100, None, False, True), (100, 180, True, True), (None, 180, True, True)],
+)
+def test_contact_and_occupation(visual, tactile, contact, occupied):
+    predictor = StubPredictor()
+    shots = pair(visual and spotted(visual), tactile and spotted(tactile))
+    found = predicted(predictor, *shots)
+    assert (found.contact, found.occupied) == (contact, occupied)
+    assert bool(predictor.calls[-1][3]["tactile"]) == contact  # a touch without contact does not count
+    assert found.outcomes == [("rests", 0.75), ("fell off", 0.25)]
+    assert found.visual.shape == (SIDE, SIDE, 3)
+
+
+def test_without_a_sensor_file_contact_is_unknown():
+    done, predictor = threading.Event(), StubPredictor(modalities=("visual",))
+    with Live(predictor, Views(LENS, PINHOLE, None), (), (), done.set) as running:
+        running.offer(*pair())
+        assert done.wait(WAIT_S)
+        found = running.newest
+    assert (found.contact, found.occupied) == (None, None)
+    assert predictor.calls[-1][1] is None  # the model takes no touch
+    assert [name for name, _ in found.outcomes] == ["outcome 0", "outcome 1"]
+
+
+def test_images_are_dropped_and_never_queued():
+    """While one prediction is made, ten pairs come: only the last of them is predicted from next."""
+    started, shown = threading.Semaphore(0), threading.Semaphore(0)
+    predictor, gate = StubPredictor(), threading.Event()
+    real = predictor.__class__.__call__
+
+    class Slow(StubPredictor):
+        def __call__(self, **inputs):
+            if len(self.calls) == 1:  # the first one after the compilation
+                started.release()
+                assert gate.wait(WAIT_S)
+            return real(self, **inputs)
+
+    predictor = Slow()
+    with Live(predictor, views(), ("rests", "fell off"), (), shown.release) as running:
+        running.offer(*pair(grey(100)))
+        assert started.acquire(timeout=WAIT_S)
+        for level in range(110, 120):
+            running.offer(*pair(grey(level)))
+        gate.set()
+        for _ in range(2):
+            assert shown.acquire(timeout=WAIT_S)
+        assert running.offered == 11
+    levels = [float(call[0][8, 8, 0]) for call in predictor.calls[1:]]
+    assert levels == pytest.approx([0.6, 0.6 * 119 / 100], abs=0.01)
+
+
+def test_an_error_of_the_thread_reaches_the_caller():
+    class Broken(StubPredictor):
+        def __call__(self, **inputs):
+            if self.calls:
+                raise RuntimeError("broken")
+            return super().__call__(**inputs)
+
+    with Live(Broken(), views(), (), (), lambda: None) as running:
+        running.offer(*pair())
+        running._thread.join(WAIT_S)
+        with pytest.raises(RuntimeError, match="broken"):
+            running.offer(*pair())
+
+
+def test_unfit_models_are_refused():
+    with pytest.raises(ValueError, match="takes no visual images"):
+        Live(StubPredictor(modalities=("tactile",)), views(), (), (), lambda: None)
+    with pytest.raises(ValueError, match=r"condition has 2 numbers, but .* needs 3"):
+        Live(StubPredictor(condition=3), views(), (), (1.0, 2.0), lambda: None)
+
+
+def seen(level=90, **changes):
+    found = SimpleNamespace(
+        visual=grey(level + 1, (SIDE, SIDE)),
+        tactile=grey(level + 2, (SIDE, SIDE)),
+        outcomes=[("rests", 0.9), ("fell off", 0.1)],
+        contact=True,
+        occupied=True,
+    )
+    image = grey(level, (SIDE, SIDE))
+    return Seen(image, image, time.monotonic(), 15.0, found, 12.0, 0.08, 7, "held")._replace(**changes)
+
+
+def ask(page, path, host=None):
+    connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
+    try:
+        connection.request("GET", path, headers={"Host": host or f"127.0.0.1:{page.port}"})
+        answer = connection.getresponse()
+        return answer.status, answer.read()
+    finally:
+        connection.close()
+
+
+def test_the_page_shows_a_state_and_only_to_its_own_name():
+    page = LivePage("127.0.0.1", 0, title="A twin")
+    try:
+        assert b"<title>Live prediction</title>" in ask(page, "/")[1]
+        assert json.loads(ask(page, "/view")[1]) == {"title": "A twin", "waiting": True, "ended": False}
+        page.show(seen())
+        facts = json.loads(ask(page, "/view")[1])
+        expected = {"rate": 12.0, "latency_ms": 80.0, "contact": True, "occupied": True, "recorded": 7, "note": "held"}
+        assert {name: facts[name] for name in expected} == expected
+        assert facts["outcomes"] == [["rests", 0.9], ["fell off", 0.1]]
+        assert ask(page, "/view", "evil.example")[0] == 403
+        assert ask(page, "/other.mjpg")[0] == 404
+        connection = http.client.HTTPConnection(page.host, page.port, timeout=WAIT_S)
+        connection.request("GET", "/predicted_tactile.mjpg")
+        answer = connection.getresponse()
+        page.show(seen())
+        size = int([answer.readline() for _ in range(4)][2].split(b":")[1])
+        image = cv2.imdecode(np.frombuffer(answer.read(size), np.uint8), cv2.IMREAD_COLOR)
+        assert abs(float(image.mean()) - 92) < 1
+        connection.close()
+    finally:
+        page.close()
+
+
+def test_files_of_panels(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("experiments.shared.live_panel.time.monotonic", lambda: now[0])
+    height, width = panel(seen()).shape[:2]
+    for name, count in (("a.png", 6), ("b.mp4", 100)):
+        file = PanelFile(tmp_path / name)
+        for _ in range(200):  # 10 s
+            file.add(seen())
+            now[0] += 0.05
+        file.add(seen(rate=0.0))
+        assert file.close()
+        if name == "a.png":
+            assert cv2.imread(str(tmp_path / name)).shape == (count * height, width, 3)
+        else:
+            video = cv2.VideoCapture(str(tmp_path / name))
+            assert abs(video.get(cv2.CAP_PROP_FRAME_COUNT) - count) <= 2
+    assert not PanelFile(tmp_path / "c.png").close()
+    with pytest.raises(ValueError, match=r"save is .*\.txt, but its suffix must be one of .png"):
+        PanelFile(tmp_path / "a.txt")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        PanelFile(tmp_path / "none" / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"twin": True, "replay": ("a",)}, "--twin and --replay exclude each other"),
+        ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
+        ({"sensor": "none"}, "sensor is none, but there is no sensor file: give another one, or write it with"),
+        ({"replay": ("a", "b", "c")}, "replay has 3 paths, but it takes a folder, or a visual and a tactile video"),
+        ({"camera": "http://127.0.0.1/"}, "both --camera and --leds are needed"),
+        ({"seconds": 0.0}, "seconds must be > 0, got 0"),
+        ({"dwell": 0}, "dwell must be >= 1, got 0"),
+        ({"replay": ("a",), "record": "b"}, "--record and --replay exclude each other"),
+    ],
+)
+def test_bad_options(options, match):
+    with pytest.raises(ValueError, match=match):
+        live.check(live.Config(**options))
+
+
+@pytest.mark.slow
+def test_a_replay_with_a_model_of_the_library(tmp_path, capsys):
+    """The whole command. The recording is of a grey pad with a dark spot, so the images are far from any training."""
+    folder = tmp_path / "made"
+    device = hardware.Device("http://127.0.0.1:1/camera", 30.0, "LEDS", LENS, 0.1, 0.1, (255,) * 4, "2026-05-31")
+    device.save(tmp_path, sts.Sensor().constants(), visual=grey(100), tactile=grey(180))
+    with hardware.Recorder(folder, ORIGIN, file=tmp_path) as recorder:
+        for number in range(40):
+            recorder.add(dataclasses.replace(shot(number), image=spotted(180 if number % 2 else 100)))
+    picture = tmp_path / "live.png"
+    config = live.Config(replay=(folder,), headless=True, save=picture, speed=0.5, loop=True, seconds=6.0, debug=True)
+    live.main(config)
+    printed = capsys.readouterr()
+    assert "predictions in 6" in printed.err
+    assert "contact, rolls 0." in printed.out
+    assert str(picture) in printed.out
+    assert cv2.imread(str(picture)).shape[1] == panel(seen()).shape[1]
+    live.main(dataclasses.replace(config, save=None, loop=False, seconds=None, speed=20.0))
+    assert "has ended after 40 images" in capsys.readouterr().err
