@@ -16,12 +16,10 @@ from experiments.shared.duration import Line, shown
 from experiments.shared.progress import say
 from experiments.shared.recorded import Config
 from experiments.shared.simulated import Simulated
-from sts_jax import _files, hardware
+from sts_jax import _files
 
 _FEW = 2, recorded.LEAST  # trajectories that are measured: at first, and in all
 _STEPS = 4  # gradient steps that are measured
-# The twin's object can stand on a corner, whose imprint covers a single block of the guide.
-_GUIDE = hardware.GuideConfig(contact_blocks=1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +75,7 @@ def collect(config: Config, workdir: Path) -> None:
     if not count:
         return
     say(f"collect: {count} trajectories of the digital twin into {workdir / 'dataset'}")
-    simulated.collect(Simulated(workdir, config.count, config.size, guide=_GUIDE))
+    simulated.collect(Simulated(workdir, config.count, config.size))
 
 
 def plan(config: Config, missing: int) -> str:
@@ -90,7 +88,7 @@ def plan(config: Config, missing: int) -> str:
     with tempfile.TemporaryDirectory() as name:
         workdir, clock = Path(name), [time.perf_counter()]
         for count in _FEW:
-            simulated.collect(Simulated(workdir, count, config.size, guide=_GUIDE))
+            simulated.collect(Simulated(workdir, count, config.size))
             clock.append(time.perf_counter())
         first, rest = np.diff(clock)
         each = rest / (_FEW[1] - _FEW[0])
