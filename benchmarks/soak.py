@@ -54,7 +54,9 @@ class Args:
 
     def __post_init__(self) -> None:
         if not 0 <= self.first_block * BLOCK < max(self.num, 1):
-            raise ValueError(f"--first-block is {self.first_block}, but must be 0 to {(self.num - 1) // BLOCK}")
+            raise ValueError(
+                f"--first-block is {self.first_block}, but it must be from 0 to {max(self.num - 1, 0) // BLOCK}"
+            )
 
 
 def excess_energy(

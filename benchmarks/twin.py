@@ -1,9 +1,10 @@
-"""Frames per second of the digital twin at both sizes.
+"""Frame rates of the digital twin at 640x480 and at 1640x1232.
 
     python -m benchmarks.twin
 
-Prints the time of each step of a frame, the frames per second that a second process receives through OpenCV while the
-light is on half of the time, and those of the virtual clock. Values are medians. The processes run on one CPU core.
+Prints the time of each step of a frame whose light is on for half of the exposure. Then it prints the frames per second
+that a second process receives through OpenCV, and the frames per second on the virtual clock, both with the light off.
+All values are medians, and all processes run on one CPU core.
 """
 
 import dataclasses
@@ -67,7 +68,7 @@ def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.Obje
 
 
 def served(size: tuple[int, int], number: int) -> float:
-    """Median rate over windows of frames that a second process receives (frames/s)."""
+    """Rate at which a second process receives frames (frames/s), the median over windows of `WINDOW` frames."""
     device, _ = held(size, 1 / RATE)
     device.scene.prepare("hold", device.blender)
     with device, twin.Served(device) as server:

@@ -34,12 +34,15 @@ def jpeg(image: Image) -> bytes:
 
 
 class MotionJpeg:
-    """The server. `mode` is read before each frame.
+    """A server of a motion JPEG stream, whose faults `mode` selects.
 
-    live: numbered frames. skip: numbered frames, without those in `skipped`. repeat: the last frame again. black,
-    small: black or smaller frames. damaged: incomplete frames. stall: none. held: frames are taken, but sent all at
-    once as soon as the mode changes. close: the connection is closed. hang, missing, text: requests get no answer,
-    status 404, or a text.
+    These modes apply before each frame. live: it sends numbered frames. skip: it leaves out the numbers in `skipped`.
+    repeat: it sends the last frame again. black: it sends black frames. small: it sends frames of half the width and
+    height. damaged: it sends incomplete frames. stall: it sends nothing and keeps the connection open. held: it keeps
+    the frames back, and sends them all at once when the mode changes. close: it closes the connection.
+
+    These modes apply to requests. hang: it does not answer. missing: it answers with status 404. text: it answers with
+    a text instead of the stream.
     """
 
     def __init__(self, fps: float = 50, colour: tuple[int, int, int] | None = None, size: tuple[int, int] = SIZE):

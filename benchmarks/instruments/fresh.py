@@ -1,4 +1,4 @@
-"""Calls in fresh processes, for the time of a first call and for the memory of a process."""
+"""Call functions in new processes, to measure the time of a first call and the memory of a process."""
 
 import json
 import os

@@ -45,16 +45,16 @@ def survey_meshes(
         folder: See `objects.library`.
         scenario: The scenario that the objects are for.
         classes: The classes to use, see `mesh_classes`. Empty means all.
-        scale: Length of one unit of the files (m). None takes ShapeNetSem's table, or 1 m for other files.
-        up: The files' axis that becomes +z. None takes ShapeNetSem's table, or y for glTF and z for other files.
+        scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
+        up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
         parts: Whether objects whose hull fits badly collide as convex parts.
         cache: Folder that keeps the processed objects.
         progress: Called with a line for each object.
 
     Returns:
         The usable objects, and a listing of them and of the objects that were left out, with the reasons. Files with
-        the same mesh, under any names and in any formats, count as one object. Otherwise a mesh could be in two parts
-        of the split.
+        the same mesh count as one object, whatever their names and formats, so that no mesh is in two parts of the
+        split.
 
     Raises:
         FileNotFoundError: The folder does not exist.

@@ -229,7 +229,7 @@ class Device:
             Raw RGB image, shape (height, width, 3), uint8.
 
         Raises:
-            SensorFileError: the device has no such image, or it is missing or damaged.
+            SensorFileError: no background is recorded for this stream, or its image file is missing or damaged.
         """
         background = self._named(stream)
         if background is None:

@@ -227,7 +227,7 @@ class Session:
                 return
             names = ", ".join(job.name for job in self._jobs)
             cause = self._error or "the disk is too slow."
-        raise SessionError(f"not on disk after {timeout_s:g} s: {names}. Cause: {cause}")
+        raise SessionError(f"these changes were not on disk after {timeout_s:g} s: {names}. Cause: {cause}")
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Write everything and release the folder.

@@ -64,7 +64,7 @@ class Shape(NamedTuple):
     def above(
         self, place: Float[Array, "2"], quat: Float[Array, "4"], height: Float[Array, ""] | float
     ) -> Float[Array, "7"]:
-        """The pose with an orientation, its origin above a place of the pad (m) and its lowest point at a height (m).
+        """The pose with a given orientation, its origin above a given place, and its lowest point at a given height.
 
         Args:
             place: m, x and y of the origin of the mesh frame.

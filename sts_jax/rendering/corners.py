@@ -22,7 +22,10 @@ class Corners(NamedTuple):
 def weights(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> tuple[list[Int[Array, "h w"]], tuple[Float[Array, "h w"], ...]]:
-    """Vertex indices and weights of the winning face's three corners. Where there is none, those of face 0."""
+    """Vertex indices and weights of the three corners of the face that wins each pixel.
+
+    Pixels in which no face wins get those of face 0.
+    """
     of_face = corners.faces[jnp.maximum(winner, 0)]
     indices = [of_face[..., k] for k in range(3)]
     return indices, optics.barycentrics([(corners.column[k], corners.row[k]) for k in indices], column, row)

@@ -26,8 +26,8 @@ class Trained(NamedTuple):
 def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
     """Draw visual skill on held-out objects against the number of training trajectories and against training time.
 
-    The left panel joins the models of one name and number of gradient steps, the right panel those of one name and
-    number of trajectories.
+    In the left panel, a line joins the models that share a name and a number of gradient steps. In the right panel, it
+    joins those that share a name and a number of trajectories.
 
     Args:
         path: The PNG to write.

@@ -316,12 +316,12 @@ class Twin:
                 return made.exposure, photometry.decode(made.jpeg)
 
     def set(self, levels: Sequence[int]) -> Lit:
-        """Set the lights on the virtual clock, as `Leds.set` does on the real one. It takes `ANSWER_S`."""
+        """Set the lights, as `Leds.set` does. It advances the virtual clock by `ANSWER_S`."""
         first, second, third, fourth = levels
         return self._request(protocol.Set(self._next_sequence(), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
-        """The levels that are applied now, as from `Leds.ping`, on the virtual clock. It takes `ANSWER_S`."""
+        """Ask for the levels that are applied now, as `Leds.ping` does. It advances the virtual clock by `ANSWER_S`."""
         return self._request(protocol.Ping(self._next_sequence()))
 
     def close(self) -> None:

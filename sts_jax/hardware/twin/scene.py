@@ -178,7 +178,7 @@ class ObjectScene(Scene):
 
     @property
     def scenario(self) -> physics.Scenario:
-        """Of the trajectories."""
+        """The scenario that the trajectories follow."""
         return self._scenario
 
     def outcome(self, trajectory: int) -> str:
