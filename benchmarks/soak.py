@@ -54,9 +54,8 @@ class Args:
 
     def __post_init__(self) -> None:
         if not 0 <= self.first_block * BLOCK < max(self.num, 1):
-            raise ValueError(
-                f"--first-block is {self.first_block}, but it must be from 0 to {max(self.num - 1, 0) // BLOCK}"
-            )
+            last = max(self.num - 1, 0) // BLOCK
+            raise ValueError(f"--first-block is {self.first_block}, but it must be from 0 to {last}")
 
 
 def excess_energy(

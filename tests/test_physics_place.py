@@ -136,7 +136,7 @@ def test_errors_name_bodies_that_cannot_be_placed(bodies):
     outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
     with pytest.raises(ValueError, match="the body rests on no face"):
         physics.place(outside, sts.Sensor())
-    with pytest.raises(ValueError, match="hulls spans no volume"):
+    with pytest.raises(ValueError, match="hulls span no volume"):
         physics.place(dataclasses.replace(bodies[0], hulls=jnp.zeros((1, 64, 3))), sts.Sensor())
     with pytest.raises(ValueError, match="vertices has 1 values that are not finite"):
         physics.place(dataclasses.replace(bodies[0], vertices=bodies[0].vertices.at[3, 1].set(jnp.nan)), sts.Sensor())

@@ -67,9 +67,7 @@ def stable_faces(
     com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
     if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
-        raise ValueError(
-            "the points of the body's hulls span no volume: give at least four points that are not in one plane"
-        )
+        raise ValueError("the points of the body's hulls span no volume: give at least four that are not in one plane")
     ups, shares = objects.rest_poses(points, com)
     order = np.argsort(-shares, kind="stable")
     return StableFaces(ups[order], shares[order])
