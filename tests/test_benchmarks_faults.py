@@ -28,6 +28,7 @@ def check(counts, number):
         assert counts[kind].images >= 4 * counts[kind].injected, kind  # a pair before and after each fault
 
 
+@pytest.mark.slow
 def test_ten_short_faults():
     counts = faults.measure(faults.Args(number=10, seed=4, long=0.0, only=SHORT))  # this seed has a short lag
     check(counts, 10)

@@ -15,7 +15,7 @@ import sts_jax as sts
 from benchmarks.instruments.led_peer import Peer
 from benchmarks.instruments.sensor_peer import DARK, LIT, Lights, SeenController, SeenLights
 from experiments import commission
-from experiments.shared import boards
+from experiments.shared import backgrounds, boards
 from sts_jax import hardware
 from sts_jax.hardware import Device, capture
 
@@ -116,7 +116,7 @@ def measure_briefly(monkeypatch):
     brief = functools.partialmethod(hardware.STS.measure_settling, 3, watch_s=0.5)
     monkeypatch.setattr(hardware.STS, "measure_settling", brief)
     monkeypatch.setattr(hardware.Leds, "connect", functools.partial(hardware.Leds.connect, timeout_s=1.0))
-    monkeypatch.setattr(commission, "BACKGROUNDS", 5)
+    monkeypatch.setattr(backgrounds, "PAIRS", 5)
 
 
 def hands(peer, monkeypatch, *, stop_at=None):

@@ -40,6 +40,7 @@ def content(folder):
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_a_shipped_model_is_loaded_by_its_name_and_replaced_by_the_next(models, workdir):
     line = ship.ship(workdir, "falls")
     assert re.fullmatch(

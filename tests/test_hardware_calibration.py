@@ -306,6 +306,7 @@ def test_parallel_boards_are_refused(rays, printed):
         calibrate(views, BOARD)
 
 
+@pytest.mark.slow
 def test_a_tilted_or_turned_board_on_the_pad_is_refused(images, rays, printed):
     tilted = calibration_images.board_view(rays, *printed, (0.7, 0.0, 0.0), (0.0, 0.0, 0.15))
     with pytest.raises(CalibrationError, match=r"board of image 1 is tilted against the image plane by 40 degrees"):

@@ -311,6 +311,7 @@ def held():
     return body, twin.ObjectScene(body, resolution=(24, 32), seed=2)
 
 
+@pytest.mark.slow
 def test_object_is_held_moves_and_lies_still_as_simulated(held):
     body, scene = held
     phases, frames = [], []

@@ -438,6 +438,7 @@ def test_a_state_space_model_predicts_samples_and_outcomes(state_predictor):
     )
 
 
+@pytest.mark.slow
 def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
     pose, condition = measurement(2)["pose"], CONDITION
     want = state_predictor(pose=pose, condition=condition)
@@ -555,7 +556,13 @@ def test_a_model_of_the_library_is_loaded_by_its_name(compact, predictor, tmp_pa
 
 
 # experiments.ship wrote them and checked their size.
-@pytest.mark.parametrize("name", sorted(path.parent.name for path in MODELS.glob("*/config.json")))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "freefall" else pytest.mark.slow)
+        for name in sorted(path.parent.name for path in MODELS.glob("*/config.json"))
+    ],
+)
 def test_each_model_of_the_library_predicts_from_vision(name, tmp_path, monkeypatch):
     assert sum(path.stat().st_size for path in (MODELS / name).rglob("*") if path.is_file()) <= 12e6
     monkeypatch.chdir(tmp_path)

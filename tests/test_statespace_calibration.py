@@ -123,6 +123,7 @@ def test_fitted_power_recovers_the_power_of_drawn_outcomes():
     assert abs(calibration._fitted(final, code, pose, jnp.asarray(outcome))[0] - 0.6) < 0.06
 
 
+@pytest.mark.slow
 def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
     """Items whose masks differ give the same density as if each were alone."""
     given, empty = arrays(), {}
@@ -153,6 +154,7 @@ def test_calibration_is_at_the_minimum_and_other_subsets_stay(folder):
         assert (row == 1).all() == (touched or number == 0), number
 
 
+@pytest.mark.slow
 def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
     before = sts.Predictor.load(folder)
     training.save_calibration(
