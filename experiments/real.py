@@ -5,17 +5,18 @@
     python -m experiments.real --preset smoke     # a little of everything, for tests
     python -m experiments.real --plan             # seconds per stage, measured on a little of each
 
-    python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # opens a page for the browser
-    python -m experiments.real collect --sensor runs/commission/sensor.json --leds /dev/ttyACM0 --count 500
-    python -m experiments.real collect --camera http://127.0.0.1:8080/video --leds PATH --headless --automatic
-    python -m experiments.real collect --twin --count 100   # the digital twin, on a virtual clock
+    python -m experiments.real collect --sensor bench --count 500   # opens a page for the browser
+    python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # not yet for training
+    python -m experiments.real collect --twin --workdir runs/twin   # the digital twin, on a virtual clock
     python -m experiments.real review                       # lists the trajectories
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17
 
 Without a sub-command, it is `train`: VAE visual, VAE tactile and MVAE without pose learn to predict the resting images
 from those of the held object, on the trajectories in `WORKDIR/dataset`. Results go to `WORKDIR/table2`. Trajectories of
-a device are never mixed with those of the twin.
+a device are never mixed with those of the twin, so give the twin a `--workdir` of its own.
+
+`--sensor` is the file of `experiments.commission`. Training needs its lens and its images of the empty pad.
 
 `collect` guides a person through trajectories: place the object in an unstable pose, hold it, release it, wait until it
 rests. The initial and the final pair of images are saved as they happen, raw and uncropped, into `WORKDIR/dataset`. An

@@ -184,7 +184,7 @@ def told_apart(
         from threadpoolctl import threadpool_limits
     except ImportError as error:
         raise ImportError(
-            "the classifier needs the package scikit-learn, which is not installed: pip install 'sts_jax[bench]'"
+            "the classifier needs the package scikit-learn, which is not installed: pip install -e '.[bench]'"
         ) from error
     _matched(real, simulated, real_group, simulated_group, least=FOLDS)
     x, group = np.concatenate([real, simulated]), np.r_[real_group, simulated_group]

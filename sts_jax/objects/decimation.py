@@ -26,7 +26,7 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
     except ImportError as error:
         raise ImportError(
             f"{path}: has {len(surface.faces):,} faces, and decimation needs the package fast-simplification, which is "
-            "not installed: pip install 'sts_jax[meshes]'"
+            "not installed: pip install -e '.[meshes]'"
         ) from error
     # Slivers can block the decimation. If so, vertices are welded first, on a grid of 1/1000 of the size or coarser.
     for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):

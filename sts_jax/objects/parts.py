@@ -42,7 +42,7 @@ def convex_parts(
         import coacd
     except ImportError as error:
         raise ImportError(
-            "convex parts need the package coacd, which is not installed: pip install 'sts_jax[meshes]'"
+            "convex parts need the package coacd, which is not installed: pip install -e '.[meshes]'"
         ) from error
     coacd.set_log_level("off")
     try:
