@@ -1,12 +1,14 @@
 """The gap between real and simulated images of the same object, as numbers and as a figure.
 
-    python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/twin/dataset --simulated-sensor runs/twin --match none
+    python -m experiments.gap --real runs/real/dataset --sensor bench --match none \\
+        --simulated runs/twin/dataset --simulated-sensor runs/twin
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
 A side is a session of `experiments.real collect`. The simulated side may also be the dataset of an experiment that was
-run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file. Prints differences per pixel, a distance of both distributions in
-a feature space, and the accuracy of a classifier that tells both sides apart. Writes the same text and a figure of both
-sides to `--out`. Takes about a minute for 40 trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
+run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file. Prints differences per
+pixel, a distance of both distributions in a feature space, and the accuracy of a classifier that tells both sides
+apart. Writes the same text and a figure of both sides to `--out`. Takes about a minute for 40 trajectories. The
+classifier needs scikit-learn (`pip install -e '.[bench]'`).
 """
 
 import dataclasses
@@ -99,7 +101,9 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
     """
     data = dataset.load(folder)
     if data.collection["crop"]:
-        raise ValueError(f"{folder} has crop=True, but real images show the whole pad: collect with --collection.no-crop")
+        raise ValueError(
+            f"{folder} has crop=True, but real images show the whole pad: collect with --collection.no-crop"
+        )
     own = tuple(data.collection["resolution"])
     if resolution is not None and resolution != own:
         raise ValueError(f"resolution is {resolution}, but the images of {folder} have {own}: leave it out")
