@@ -19,7 +19,7 @@ from experiments import twin
 from experiments.shared.live import Backgrounds, Views
 from sts_jax import hardware
 
-MODELS = ("freefall", "inclined", "perturbed")
+MODELS = ("freefall", "inclined", "perturbed", "released")
 LIT, DARK = (255, 255, 255, 255), (0, 0, 0, 0)
 SETTLED_S = 0.2  # s, after a switch of the light
 MOVES_S = 4.0  # s, from the release to the images at rest

@@ -1,8 +1,8 @@
-"""Show the predicted resting state beside the live images, ten times a second or more.
+"""Show the predicted resting state beside the live images, about ten times a second.
 
     python -m experiments.live                                            # starts a digital twin and opens a page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
-    python -m experiments.live --camera URL --leds PORT --sensor bench    # its devices under other names
+    python -m experiments.live --camera URL --leds PORT --sensor bench    # names the devices of the file
     python -m experiments.live --sensor bench --record runs/monday        # and records both streams
     python -m experiments.live --replay runs/monday --loop                # plays them back, with predictions
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
