@@ -5,7 +5,7 @@
 A hand holds the object in an unstable pose and lets go. Each model predicts the images at rest from the images of the
 held object, as `experiments.live` does. The skill of an image is 0 for the mean image at rest of the other trajectories
 and 1 for the true image, by the mean squared error over all trajectories. The models know neither the twin's noise,
-vignetting and leakage, nor its scenario, `Released`.
+vignetting and leakage. Only `released` knows its scenario, `Released`, and the class of its object.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from experiments import twin
 from experiments.shared.live import Backgrounds, Views
 from sts_jax import hardware
 
-MODELS = ("freefall", "inclined", "perturbed")
+MODELS = ("freefall", "inclined", "perturbed", "released")
 LIT, DARK = (255, 255, 255, 255), (0, 0, 0, 0)
 SETTLED_S = 0.2  # s, after a switch of the light
 MOVES_S = 4.0  # s, from the release to the images at rest

@@ -1,17 +1,16 @@
-"""Show the predicted resting state beside the live images, ten times a second or more.
+"""Show the predicted resting state beside the live images, about ten times a second.
 
     python -m experiments.live                                            # starts a digital twin and opens a page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
-    python -m experiments.live --camera URL --leds PORT --sensor bench    # its devices under other names
+    python -m experiments.live --camera URL --leds PORT --sensor bench    # names the devices of the file
     python -m experiments.live --sensor bench --record runs/monday        # and records both streams
     python -m experiments.live --replay runs/monday --loop                # plays them back, with predictions
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
 The page shows both streams in the view of the sensor, the predicted images at rest, the probabilities of the outcomes,
-contact, and the rate and the latency of the predictions. The models of the library were trained on simulated images of
-other scenarios, so on a twin or a real sensor they show little more than the place of the object. At its first start, a
-twin compiles for about two minutes and the model for half a minute.
+contact, and the rate and the latency of the predictions. The default model was trained on simulated cameras that are
+held and released. At its first start, a twin compiles for about two minutes and the model for half a minute.
 """
 
 import collections
@@ -55,8 +54,8 @@ class Config:
     replay: tuple[Path, ...] = ()  # folder of a recording, or two videos: visual and tactile
     twin: bool = False  # start a digital twin. Default if no other source is given
 
-    # inclined, freefall or perturbed, which come with the library, or a model's folder. docs/hardware/live.md compares
-    model: str = "inclined"
+    # released, inclined, freefall or perturbed, which come with the library, or a model's folder
+    model: str = "released"
     scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None  # of a model's folder, for names
     condition: tuple[float, ...] = ()  # of the model, SI units (default: zeros)
     flat: bool = True  # divide out the backgrounds of the sensor file, such as vignetting

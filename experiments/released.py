@@ -1,7 +1,7 @@
 """A small camera, held in an unstable pose and let go: from the first moment to the images and the pose at rest.
 
-    python -m experiments.released                    # not run to its end yet, as large as experiments.perturbed
-    python -m experiments.released --preset long      # likewise, can be stopped and started again
+    python -m experiments.released                    # 26 minutes on one CPU core beside other work
+    python -m experiments.released --preset long      # not run to its end yet, can be stopped and started again
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
     python -m experiments.released --preset smoke     # a few minutes, for tests
     python -m experiments.released --preset paper     # the paper's counts and schedule: hours, a GPU helps

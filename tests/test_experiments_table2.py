@@ -146,7 +146,7 @@ def test_the_models_are_trained_judged_and_resumed_on_a_device_without_adding_tr
     real.main(Train(TINY, work))
     assert (work / "table2" / "metrics.json").stat().st_mtime_ns == written
     (work / "table2" / "table.md").unlink()
-    assert table2.evaluate(TINY, images, work / "table2") in table
+    assert table2.evaluate(TINY, images, work, work / "table2") in table
     assert identities == {name: results.identity(work / "table2" / "models" / name) for name in recorded.NAMES}
 
     hardware.discard_recording(work / "dataset", 2)

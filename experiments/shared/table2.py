@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import sts_jax as sts
-from experiments.shared import results
+from experiments.shared import results, transfer
 from experiments.shared.config import TITLES
 from experiments.shared.judging import read_log
 from experiments.shared.progress import say
@@ -19,7 +19,7 @@ MVAE = "mvae-without-pose"
 FLOOR = "the truth itself (entropy)"
 
 
-def evaluate(config: Config, data: Recorded, folder: Path) -> str:
+def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str:
     """Judge the models on the validation trajectories and return the table.
 
     Writes `metrics.json`, `table.md` and `figures/`. Nothing is done again while the checksums in `metrics.json` hold.
@@ -27,18 +27,23 @@ def evaluate(config: Config, data: Recorded, folder: Path) -> str:
     Args:
         config: The experiment.
         data: The trajectories.
+        workdir: The folder from which they were read.
         folder: The folder of the results.
     """
     done, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
     inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
-    inputs |= {f"models/{name}": results.identity(path) for name, path in models.items()}
+    judged = {**models, transfer.NAME: transfer.FOLDER}
+    inputs |= {f"models/{name}": results.identity(path) for name, path in judged.items()}
     reason = results.stale(done, inputs)
     if reason is None:
         return table.read_text()
     if done.exists():
         say(f"evaluate: again, because {reason}")
     predicted = predictions(models, data)
+    simulated = transfer.predictions(config, data, workdir)
+    if simulated is not None:
+        predicted[transfer.TITLE] = simulated
     summary = evaluation.image_summary(
         {**evaluation.image_baselines(data.train, data.validation), **predicted}, data.validation
     )
@@ -77,16 +82,22 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
     def guess(name: str, stream: str) -> np.ndarray:
         return getattr(predicted[TITLES[name]], stream)[: len(labels)]
 
+    def simulated(stream: str) -> dict[str, np.ndarray]:
+        own = predicted.get(transfer.TITLE)
+        return {} if own is None else {"simulated training": getattr(own, stream)[: len(labels)]}
+
     groups = [
         {"visual": truth("visual", 0), "tactile": truth("tactile", 0)},
         {
             "VAE visual only": guess("vae-visual", "visual"),
             "MVAE": guess(MVAE, "visual"),
+            **simulated("visual"),
             "truth": truth("visual", 1),
         },
         {
             "VAE tactile only": guess("vae-tactile", "tactile"),
             "MVAE": guess(MVAE, "tactile"),
+            **simulated("tactile"),
             "truth": truth("tactile", 1),
         },
     ]
@@ -137,6 +148,9 @@ def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, l
             *lines,
             "",
             f"Gradient steps: {steps}, batch {config.training.batch_size}.",
+            "",
+            f"{transfer.TITLE}: the library's model `{transfer.NAME}` from both held images. It has seen no image of "
+            "this sensor, and its training objects are other cameras.",
             "",
         ]
     )

@@ -66,7 +66,7 @@ def learn(args: Train) -> None:
         if args.only in (None, "train"):
             recorded.train(args.config, data, folder)
         if args.only in (None, "evaluate"):
-            print(table2.evaluate(args.config, data, folder))
+            print(table2.evaluate(args.config, data, args.workdir, folder))
 
 
 def collect(config: Config, workdir: Path) -> None:
@@ -102,7 +102,7 @@ def plan(config: Config, missing: int) -> str:
         lines.append(Line(f"read: {config.count} trajectories", config.count * reading, f"{reading:.2g} s each"))
         lines += _training(config, data, workdir)
         begin = time.perf_counter()
-        table2.evaluate(config, data, workdir)
+        table2.evaluate(config, data, workdir, workdir)
         lines.append(Line("evaluate and draw", time.perf_counter() - begin, f"of {len(data.validation.number)}"))
     lines.append(Line("together", sum(line.seconds for line in lines), f"{config.count} trajectories of the twin"))
     return shown(lines)
