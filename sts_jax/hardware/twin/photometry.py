@@ -18,7 +18,7 @@ class Imperfections:
     """The differences between the twin's camera and lights and ideal ones. All defaults are our choice."""
 
     exposure_s: float = 0.012  # s, time during which the camera integrates the light of one frame
-    lag_s: float = 0.04  # s, from the end of the exposure to the delivery of the frame. Real cameras: perhaps 0.015 to 0.12
+    lag_s: float = 0.04  # s, from the end of the exposure to the delivery of the frame. Assumed range: 0.015 to 0.12
     jitter_s: float = 0.0  # s, largest random addition to the lag
     rise_s: float = 0.0005  # s, time constant of the LEDs
     leakage: float = 0.005  # share of the tactile light that remains when the LEDs are off
