@@ -69,7 +69,7 @@ def test_the_error_names_the_missing_package(tmp_path, monkeypatch):
     painted_ball(tmp_path / "ball.ply")
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     listed = objects.library(tmp_path)
-    with pytest.raises(ImportError, match=r"ball\.ply.*fast-simplification.*sts_jax\[meshes\]"):
+    with pytest.raises(ImportError, match=r"ball\.ply.*fast-simplification.*install -e '\.\[meshes\]'"):
         objects.bodies(listed)
     with pytest.raises(ImportError, match="fast-simplification"):
         objects.survey(listed)

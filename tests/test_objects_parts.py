@@ -115,7 +115,7 @@ def test_distance_from_a_hull_of_many_points_at_once():
 def test_the_error_names_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "coacd", None)
     mesh = corner_piece()
-    with pytest.raises(ImportError, match=r"coacd.*sts_jax\[meshes\]"):
+    with pytest.raises(ImportError, match=r"coacd.*install -e '\.\[meshes\]'"):
         convex_parts(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
