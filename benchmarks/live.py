@@ -32,7 +32,7 @@ Pair = tuple[np.ndarray, np.ndarray]  # raw images, visual and tactile
 class Args:
     """Number of trajectories."""
 
-    trajectories: int = 24
+    trajectories: int = 100
     seed: int = 0
 
 
