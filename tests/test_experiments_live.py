@@ -259,7 +259,7 @@ def test_a_replay_with_a_model_of_the_library(tmp_path, capsys):
     live.main(config)
     printed = capsys.readouterr()
     assert "predictions in 6" in printed.err
-    assert "contact, rolls 0." in printed.out
+    assert "contact, topples 0." in printed.out
     assert str(picture) in printed.out
     assert cv2.imread(str(picture)).shape[1] == panel(seen()).shape[1]
     live.main(dataclasses.replace(config, save=None, loop=False, seconds=None, speed=20.0))
