@@ -5,7 +5,7 @@
 A hand holds the object in an unstable pose and lets go. Each model predicts the images at rest from the images of the
 held object, as `experiments.live` does. The skill of an image is 0 for the mean image at rest of the other trajectories
 and 1 for the true image, by the mean squared error over all trajectories. The models know neither the twin's noise,
-vignetting and leakage. Only `released` knows its scenario, `Released`, and the class of its object.
+vignetting and leakage. Only `released` was trained on the scenario `Released` and on objects of this class.
 """
 
 import dataclasses

@@ -6,7 +6,7 @@
 
 A side is a session of `experiments.real collect`. The simulated side may also be the dataset of an experiment that was
 run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file. Prints differences per
-pixel, a distance of both distributions in a feature space, and the accuracy of a classifier that tells both sides
+pixel, a distance of both distributions in a feature space, and the accuracy of a classifier that tells the two sides
 apart. Writes the same text and a figure of both sides to `--out`. Takes about a minute for 40 trajectories. The
 classifier needs scikit-learn (`pip install -e '.[bench]'`).
 """

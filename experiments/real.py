@@ -89,7 +89,7 @@ def main(config: Train | Collect | Review) -> None:
 
 
 def _terminated(*_: object) -> None:
-    raise KeyboardInterrupt  # so that what was taken is written, as after Ctrl+C
+    raise KeyboardInterrupt  # so that pending images are written, as after Ctrl+C
 
 
 if __name__ == "__main__":

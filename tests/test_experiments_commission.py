@@ -64,7 +64,7 @@ class SeenBoards(SeenLights):
 
 
 class BoardPeer:
-    """Both devices. `url` and `path` are what a host connects to."""
+    """Both devices. A host connects to the camera at `url` and to the controller at `path`."""
 
     def __init__(self, path, pictures):
         lights = Lights()

@@ -121,7 +121,7 @@ class SeenLights(MotionJpeg):
 
 
 class SensorPeer:
-    """Both devices. `url` and `path` are what a host connects to."""
+    """Both devices. A host connects to the camera at `url` and to the controller at `path`."""
 
     def __init__(
         self,

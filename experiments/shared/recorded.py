@@ -144,7 +144,7 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
     device = hardware.Device.load(path)
     if device.background_visual is None or device.background_tactile is None:
         raise ValueError(
-            f"{path} names no background images, which show what a contact is: run `python -m "
+            f"{path} names no background images, and contacts are found by comparison with them: run `python -m "
             "experiments.commission` again, and copy the sensor file and its images into the work directory"
         )
     return device, sts.Sensor.load(path)

@@ -159,7 +159,7 @@ def energy_distance(
 def told_apart(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray
 ) -> Estimate:
-    """Accuracy of a classifier that tells real from simulated images of groups that it was not fitted to.
+    """Cross-validated accuracy of a classifier of real and simulated images. No group is in both fit and test.
 
     A logistic regression on standardised features, in five cross-validations of five folds. All images of a group are
     in the same fold, those of both sides if they are matched. The accuracy is the mean over both sides, so 0.5 is

@@ -284,7 +284,7 @@ class Grabber:
                 self._set_problem(_Problem(CameraLostError, self._lost()))
                 self._stop.wait(FIRST_WAIT_S)
                 return True
-            # The number is given under the lock. A reader that comes later knows that this frame is too old for it.
+            # The lock covers time and number, so a reader that starts later sees that this frame arrived before it.
             with self._changed:
                 time_s, sequence = time.monotonic(), self._next
                 self._next += 1

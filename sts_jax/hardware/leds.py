@@ -124,7 +124,7 @@ class Leds:
             timeout_s: Longest time until the device on a port answers (s).
 
         Raises:
-            PortNotFoundError: It is on none of the ports. The message lists them with what was found.
+            PortNotFoundError: No port has this controller. The message lists the ports and the device on each.
         """
         tried = {}
         candidates = [port for port in ports.find_controllers() if port.vendor is not None]

@@ -24,7 +24,7 @@ _RETRY_S = 1.0  # between attempts to write while the disk is full
 
 
 class SessionError(OSError):
-    """A session cannot be written. The message states what is not on disk, the cause and the remedy."""
+    """A session cannot be written. The message lists the changes that are not on disk, the cause and the remedy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,7 +220,7 @@ class Session:
         """Wait until everything is on disk.
 
         Raises:
-            SessionError: That took too long. The message names what is missing.
+            SessionError: Writing took too long. The message names the changes that are not on disk.
         """
         with self._changed:
             if self._changed.wait_for(lambda: not self._jobs, timeout_s):
