@@ -62,6 +62,16 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
     return empty, held, rest
 
 
+def seen(
+    views: Views, predictor: sts.Predictor, pairs: list[Pair], index: int, size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """One stream of some pairs as a model takes it, `(n, height, width, 3)`, reduced to a size by block means."""
+    images = np.stack([views.prepared(*pair, predictor.empty)[index] for pair in pairs])
+    height, width = size or images.shape[1:3]
+    step = images.shape[1] // height
+    return images.reshape(len(pairs), height, step, width, step, 3).mean((2, 4)).astype(np.float32)
+
+
 def skill(found: np.ndarray, truth: np.ndarray) -> float:
     """Skill of images `(n, side, side, 3)`."""
     others = (truth.sum(0) - truth) / (len(truth) - 1)
@@ -81,24 +91,16 @@ def main(args: Args) -> None:
         word = "divided out" if divided else "kept"
         for name in MODELS:
             predictor = sts.Predictor.load(name)
-            resolution = predictor.preprocessing.resolution
-
-            def seen(pairs: list[Pair], index: int, size: tuple[int, int]) -> np.ndarray:
-                flat = [views.prepared(*pair, predictor.empty)[index] for pair in pairs]  # noqa: B023
-                step = resolution[0] // size[0]  # noqa: B023
-                images = np.stack(flat).reshape(len(pairs), size[0], step, size[1], step, 3)
-                return images.mean((2, 4)).astype(np.float32)
-
-            truth = [seen(rest, index, size) for index in (0, 1)]
+            truth = [seen(views, predictor, rest, index, size) for index in (0, 1)]
             if name == MODELS[0]:
-                copied = [skill(seen(held, index, size), truth[index]) for index in (0, 1)]
+                copied = [skill(seen(views, predictor, held, index, size), truth[index]) for index in (0, 1)]
                 print(f"| {word} | copy of the input | both | {copied[0]:.3f} | {copied[1]:.3f} | |")
             width_ = predictor.model.config.condition
             condition = np.zeros((len(held), width_), np.float32) if width_ else None
             for touch in (False, True) if "tactile" in predictor.modalities else (False,):
                 found = predictor(
-                    visual=seen(held, 0, resolution),
-                    tactile=seen(held, 1, resolution) if touch else None,
+                    visual=seen(views, predictor, held, 0),
+                    tactile=seen(views, predictor, held, 1) if touch else None,
                     condition=condition,
                 )
                 assert found.visual is not None
