@@ -7,14 +7,14 @@ from sts_jax.hardware.shots import LightError, Pair
 
 
 class Background:
-    """Takes pairs in a thread and keeps the newest one."""
+    """A thread that takes pairs and keeps the newest one."""
 
     def __init__(self, take: Callable[[], Pair], interrupt: Callable[[], None]):
         """Start the thread.
 
         Args:
-            take: Takes one pair.
-            interrupt: Makes a call of `take` that is under way end soon, by any error.
+            take: Function that takes one pair.
+            interrupt: Function that makes a running call of `take` raise an error soon.
         """
         self._take, self._interrupt = take, interrupt
         self._changed = threading.Condition()
@@ -22,7 +22,7 @@ class Background:
         self._fresh = False
         self._error: BaseException | None = None
         self._stopped = False
-        self.reported = False  # whether the thread has ended with an error and the error has been raised
+        self.reported = False  # True if the thread has ended with an error, and a caller has seen this error
         self._thread = threading.Thread(target=self._run, name="pairs of the sensor", daemon=True)
         self._thread.start()
 
@@ -30,7 +30,7 @@ class Background:
         while not self._stopped:
             try:
                 pair = self._take()
-            except Exception as error:  # raised by the next call of the user
+            except Exception as error:  # `latest` or `next` raises it in the caller's thread
                 with self._changed:
                     self._error = error
                     self._changed.notify_all()
@@ -40,23 +40,32 @@ class Background:
                 self._changed.notify_all()
 
     def latest(self) -> Pair | None:
-        """The newest pair, or None. Raises the thread's error."""
+        """Return the newest pair, or None before the first pair. Raises the error with which the thread has ended."""
         with self._changed:
             self._raise()
             return self._pair
 
     def next(self, limit_s: float) -> Pair:
-        """The newest pair that was not returned by this method yet. Raises the thread's error."""
+        """Wait for a pair that this method has not returned yet, and return the newest one.
+
+        Args:
+            limit_s: Longest wait (s).
+
+        Raises:
+            LightError: No pair was taken in time. The error with which the thread has ended is raised too.
+        """
         with self._changed:
             if not self._changed.wait_for(lambda: self._fresh or self._error is not None, limit_s):
-                raise LightError(f"no pair was taken within {limit_s:g} s: call read() to see the reason.")
+                raise LightError(
+                    f"no pair was taken within {limit_s:g} s: raise timeout_ms, or call read() to see the reason."
+                )
             self._raise()
             self._fresh = False
             assert self._pair is not None
             return self._pair
 
     def stop(self) -> None:
-        """End the thread."""
+        """Interrupt the thread, and wait for its end."""
         self._stopped = True
         self._interrupt()
         self._thread.join()

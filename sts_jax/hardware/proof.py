@@ -1,4 +1,4 @@
-"""`ProvenFrames`: switches the lights, and takes frames that are proven to be of one light."""
+"""`ProvenFrames`: switches the lights, and selects frames that are proven to show the lights of one stream."""
 
 import contextlib
 import time
@@ -23,20 +23,20 @@ from sts_jax.hardware.settling import (
 )
 from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
 
-_DEPARTED = 0.5  # of the effect of the light, by which most of a frame must differ from that before the switch
-_KEPT = 0.5  # of the effect of the light, which must be left of it for the last images to replace earlier ones
-_AGAIN_S = 1.0  # s, after which a switch that does not show is repeated
-_ATTEMPTS = 3  # to measure the settling
-_PHASE = 0.618  # of a period, by which the phase of the measured switches advances
-_CHECK_S = 0.1  # s, least time between two questions to the controller while frames show another light
-_GRACE_S = 0.2  # s, by which a wait for the camera may exceed a limit, so that the cause of a delay is the one reported
+_DEPARTED = 0.5  # share of the lights' effect that the median value of a frame must show after a switch
+_KEPT = 0.5  # share of the lights' effect that the last images must show to replace the stored effect
+_AGAIN_S = 1.0  # s after the settling time. A switch that no frame shows by then is repeated
+_ATTEMPTS = 3  # attempts to measure the settling times
+_PHASE = 0.618  # share of the camera's period by which the phase advances from one measured switch to the next
+_CHECK_S = 0.1  # s, shortest time between two requests to the controller while frames do not show the switch
+_GRACE_S = 0.2  # s by which the wait for a frame may exceed the deadline, so that a lost camera raises its own error
 
 
 class ProvenFrames:
-    """The lights and the frames of a connected sensor.
+    """Switches the lights of a connected sensor, and selects frames that show the lights of one stream.
 
-    The state is that of the last switch: the controller's answer to it, the last frame before it, and the number of
-    frames that have shown it. One thread may use it at a time, except `stop`.
+    The attributes describe the last switch of the lights: the controller's answer, the last frame before the switch,
+    and the number of frames that show its effect. One thread takes the images. Other threads may only call `stop`.
     """
 
     def __init__(
@@ -49,49 +49,59 @@ class ProvenFrames:
         timeout_s: float,
         reconnect_s: float,
     ):
-        """Keep the devices, which are open. `measure_settling` or `see_both` must precede the first image.
+        """Keep the open devices. Call `measure_settling` or `see_both` before the first image.
 
         Args:
-            camera: The camera.
-            leds: The LED controller.
-            levels: As in `STS`.
-            exposures: As in `STS`.
-            timeout_s: Longest wait for one frame while the settling is measured (s).
-            reconnect_s: As in `STS`.
+            camera: The connected camera.
+            leds: The open LED controller.
+            levels: Duty cycles of the four channels in the tactile stream, 0 to 255.
+            exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. They are
+                set only if they differ. None: not changed.
+            timeout_s: Longest wait for one frame while the frames after a switch are collected (s).
+            reconnect_s: Longest search for a controller that was lost (s).
         """
         self._camera, self._leds = camera, leds
         self._levels, self._exposures = levels, exposures
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
-        self._settling: Settling | None = None  # in use
-        self._lit: Lit | None = None  # the last answer of the controller about lights that this object has set
-        self._effect: Thumbnail | None = None  # of the light on the image, the lit one minus the dark one
-        self._looks: dict[Stream, Thumbnail] = {}  # of the last image of each stream
-        self._black: dict[Stream, bool] = {}  # whether this image was black
-        self._previous: Captured | None = None  # the last frame of the camera
-        self._reference: Thumbnail | None = None  # of the last frame before the switch
-        self._departed = 0  # successive frames since the switch that show the new light, 2 and more: all are of it
-        self._doubtful = False  # whether the lights may have switched without an answer, so late frames may show it
-        self._stopping = False  # whether the thread that takes images is to end
-        self.stream: Stream = "visual"  # whose light is on
-        self.discarded = 0  # frames that could not be proven to be of one light
+        self._settling: Settling | None = None
+        self._lit: Lit | None = None  # answer to the last switch. None: the state of the lights is unknown
+        self._effect: Thumbnail | None = None  # effect of the lights: the tactile image minus the visual image
+        self._looks: dict[Stream, Thumbnail] = {}  # last image of each stream
+        self._black: dict[Stream, bool] = {}  # True if the last image of the stream was black
+        self._previous: Captured | None = None  # last frame of the camera
+        self._reference: Thumbnail | None = None  # last frame before the switch
+        self._departed = 0  # successive frames since the switch that show its effect. From 2 on, none is compared
+        self._doubtful = False  # True if the lights may have switched without an answer, which late frames could show
+        self._stopping = False  # True if `shot` must end in the thread that takes images
+        self.stream: Stream = "visual"  # stream for which the lights were set last
+        self.discarded = 0  # frames that `shot` did not return
 
     def stop(self) -> None:
-        """Make a call of another thread that is under way end soon, with an error. `resume` must follow."""
+        """Make `shot` or `pair` in another thread end soon with an error. Call `resume` before the next image."""
         self._stopping = True
 
     def resume(self) -> None:
-        """Allow images after `stop`."""
+        """Allow new images after `stop`."""
         self._stopping = False
 
     def measure_settling(self, switches: int, watch_s: float) -> Settling:
-        """Measure the settling times, and use them. See `STS.measure_settling`."""
+        """Measure the settling times in up to three attempts, and use them from now on.
+
+        Args:
+            switches: Number of switches in each direction.
+            watch_s: Time for which frames are collected after the first switch in each direction (s).
+
+        Raises:
+            NoContrastError: The lights do not change the image.
+            LightError: The image was still changing at the end of each attempt.
+        """
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(LightError):
                 return self._measured(switches, watch_s)
         return self._measured(switches, watch_s)
 
     def _measured(self, switches: int, watch_s: float) -> Settling:
-        """One attempt of `measure_settling`, which a movement or a delay of the computer can spoil."""
+        """Measure the settling times once. A movement or a delay of the computer can spoil the measurement."""
         self._lit = None
         period_s = self._period_s()
         self._watched("visual", watch_s)
@@ -99,7 +109,7 @@ class ProvenFrames:
         found = self._settled(on, off, period_s, watch_s)
         shorter_s = min(3 * max(found.visual_s, found.tactile_s) + 3 * period_s, watch_s)
         for number in range(1, switches):
-            phase_s = period_s * (_PHASE * number % 1)  # a watch ends just after a frame
+            phase_s = period_s * (_PHASE * number % 1)  # the collection of frames ends just after a frame
             time.sleep(phase_s)
             on.append(self._watched("tactile", shorter_s))
             time.sleep(phase_s)
@@ -109,13 +119,13 @@ class ProvenFrames:
         return found
 
     def _begin(self, settling: Settling, dark: Thumbnail, lit: Thumbnail) -> None:
-        """Use settling times, and keep images without and with the light, with which later ones are compared."""
+        """Use settling times from now on, and store one image of each stream to compare later frames with."""
         self._settling = settling
         check_contrast(difference(dark, lit))
         self._effect, self._looks = lit - dark, {"visual": dark, "tactile": lit}
 
     def see_both(self, settling: Settling) -> None:
-        """Use settling times that are known. Takes an image of each light, with which later ones are compared."""
+        """Use known settling times from now on, and take one image of each stream to compare later frames with."""
         lit = self._watched("tactile", 2 * settling.tactile_s).thumbnails[-1]
         dark = self._watched("visual", 2 * settling.visual_s).thumbnails[-1]
         self._begin(settling, dark, lit)
@@ -125,13 +135,24 @@ class ProvenFrames:
         slowest_s = max(found.visual_s, found.tactile_s)
         if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image still changes {slowest_s:.2f} s after a switch: keep the scene at rest, lock the camera's "
-                f"exposure, or watch for longer than {watch_s:.2f} s."
+                f"the image still changes {slowest_s:.2f} s after a switch of the lights, but frames were collected "
+                f"for only {watch_s:.2f} s: keep the scene at rest, lock the camera's exposure, or call "
+                "measure_settling with a larger watch_s."
             )
         return found
 
     def pair(self, deadline: float) -> Pair:
-        """An image of each stream. Both arrive after the call. The stream whose light is on comes first."""
+        """Take an image of each stream. Both arrive after the call.
+
+        The first image is of the stream for which the lights are already set.
+
+        Args:
+            deadline: Latest time on the clock `time.monotonic` (s). A reconnection extends it only for the image that
+                is being taken.
+
+        Raises:
+            LightError, LedError, CameraError: The causes are those of `STS.read`.
+        """
         first = self.stream
         second: Stream = "tactile" if first == "visual" else "visual"
         while True:
@@ -141,15 +162,23 @@ class ProvenFrames:
                 return Pair(one, two) if first == "visual" else Pair(two, one)
 
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
-        """An image of one stream that arrives after a time.
+        """Take an image of one stream.
 
-        With `then`, the lights are switched to that stream afterwards, and the answer to this switch is the proof.
+        Args:
+            stream: The stream.
+            deadline: Latest time on the clock `time.monotonic` (s). A reconnection extends it.
+            after_s: Earliest arrival of the frame on the same clock (s).
+            then: Stream to which the lights are switched after the frame. The controller's answer to a switch from
+                visual to tactile proves the image, which saves a request. None: the lights stay.
+
+        Raises:
+            LightError, LedError, CameraError: The causes are those of `STS.read`.
         """
         while True:
             try:
                 if self._doubtful:
-                    # Late frames may show the former light and then a mixed one. After a frame of the other light, all
-                    # frames that still come are of a single switch.
+                    # Late frames may show two switches of the lights. After a frame that shows the lights of the other
+                    # stream, all later frames can show only one switch.
                     self._frame("visual" if stream == "tactile" else "tactile", deadline, 0.0)
                     self._doubtful = False
                 before, frame = self._frame(stream, deadline, after_s)
@@ -168,13 +197,13 @@ class ProvenFrames:
             self._doubtful = True
 
     def _follow(self) -> None:
-        """Let the effect of the light follow the last images, unless it would vanish, as with lights that failed."""
+        """Update the stored effect of the lights from the last images, unless it is too weak, as with failed lights."""
         effect = self._looks["tactile"] - self._looks["visual"]
         if self._effect is not None and np.abs(effect).mean() > _KEPT * np.abs(self._effect).mean():
             self._effect = effect
 
     def _frame(self, stream: Stream, deadline: float, after_s: float) -> tuple[Lit, Captured]:
-        """A frame that arrives when the light has settled, and the answer of the controller before it."""
+        """Return a frame that arrives after the lights have settled, and the controller's answer to their switch."""
         lit, checked_s = self._switched(stream), 0.0
         assert self._settling is not None, "call measure_settling or see_both first"
         settled_s = self._settling.visual_s if stream == "visual" else self._settling.tactile_s
@@ -197,29 +226,29 @@ class ProvenFrames:
                 return lit, frame
             self.discarded += 1
             if self._departed == 0 and late_s >= 0 and time.monotonic() >= checked_s + _CHECK_S:
-                if not self._leds.ping().unchanged_since(lit):  # the controller has turned its lights off
+                if not self._leds.ping().unchanged_since(lit):  # the watchdog or a restart has turned the lights off
                     lit = self._set(stream)
                 elif frame.time_s > lit.acknowledged_s + settled_s + _AGAIN_S:
-                    # The scene may have changed at the switch. It is repeated, and compared with a newer frame.
+                    # The scene may have changed at the switch. The repeated switch is compared with a newer frame.
                     self._watched("tactile" if stream == "visual" else "visual", settled_s)
                     lit = self._set(stream)
                 checked_s = time.monotonic()
         raise LightError("the thread that takes pairs was stopped.")
 
     def _light_error(self, stream: Stream) -> LightError:
-        cause = "check that the LEDs light up, that the camera's exposure is locked, and its rate"
+        remedy = "check that the LEDs light up, that the camera's exposure is locked, and that enough frames arrive"
         if self._previous is not None and self._previous.black:
-            cause = "its frames are black now, so check the camera, or connect again if the scene has become dark"
+            remedy = "the frames are black now. Check the camera, or connect again if the scene has become dark"
         return LightError(
-            f"no frame of {self._camera.config.name} could be proven to be of the {stream} stream in time "
-            f"({self.discarded} frames were discarded so far): {cause}."
+            f"no frame of {self._camera.config.name} could be proven to show the lights of the {stream} stream in time "
+            f"({self.discarded} frames were discarded since the connection): {remedy}."
         )
 
     def _shows(self, frame: Captured, stream: Stream) -> bool:
-        """Whether most of the image has changed as the switch of the light changes it, by at least half as much.
+        """Return whether a frame shows the last switch: the median value changes by more than half of the effect.
 
-        The image is compared with the last frame before the switch. If the light before is unknown, it is compared with
-        the last image of the other stream.
+        The frame is compared with the last frame before the switch. If the lights before the switch are unknown, the
+        frame is compared with the last image of the other stream.
         """
         if self._effect is None:
             return True
@@ -230,16 +259,16 @@ class ProvenFrames:
         return switched_share(thumbnail(frame.image), before, change) > _DEPARTED
 
     def _repeats(self, frame: Captured) -> bool:
-        """Whether a frame is the one before once more, in a scene that is not free of noise."""
+        """Return whether a frame repeats the one before. With `frozen_after_s=None`, repetitions are allowed."""
         return frame.repeats > 0 and self._camera.config.frozen_after_s is not None
 
     def _in_order(self, frame: Captured) -> bool:
-        """Whether a frame is the next one after the last."""
+        """Return whether a frame directly follows the previous one."""
         last = self._previous
         return last is not None and (frame.epoch, frame.sequence) == (last.epoch, last.sequence + 1)
 
     def _switched(self, stream: Stream) -> Lit:
-        """Set the lights of a stream unless they are known to be set."""
+        """Set the lights of a stream unless they are set already, and return the controller's answer to the switch."""
         if self._lit is None or self.stream != stream:
             self._set(stream)
         assert self._lit is not None
@@ -255,19 +284,22 @@ class ProvenFrames:
         return lit
 
     def _expose(self, exposure: float) -> None:
-        """Set the exposure before the lights, so that the settling covers both."""
+        """Set the exposure. It is set before the lights, so that the settling time covers both changes."""
         if self._camera.set_exposure(exposure) is None:
             raise CameraError(
-                f"the driver of {self._camera.config.name} does not let the exposure be set to {exposure:g}: give "
-                "exposures=None."
+                f"the driver of {self._camera.config.name} does not support a manual exposure, so it cannot be set to "
+                f"{exposure:g}: pass exposures=None."
             )
 
     def _proof(self, before: Lit, then: Stream | None) -> float | None:
-        """The time until which the lights are proven to be unchanged, or None if they changed. May switch them."""
+        """Return the time until which the lights did not change since `before` (s), or None if they changed.
+
+        With `then`, the lights are switched to that stream.
+        """
         if then == self.stream:
             then = None
-        # The watchdog turns the lights off as a switch to the visual stream does, and the counter of changes would not
-        # tell one from the other.
+        # A switch to the visual stream and the watchdog both turn the lights off. The counter of changes cannot
+        # distinguish them, so a request without a switch comes first.
         if then is None or self.stream == "tactile":
             after = self._leds.ping()
             if not after.unchanged_since(before):
@@ -277,11 +309,11 @@ class ProvenFrames:
                 self._set(then)
             return after.sent_s
         after = self._set(then)
-        # Nothing but a request turns the lights on, so a single change is that of this request.
+        # Only a request turns the lights on, so a single change is due to this request.
         return after.sent_s if (after.boot, after.counter) == (before.boot, before.counter + 1) else None
 
     def _watched(self, stream: Stream, watch_s: float) -> Switch:
-        """Switch the lights and collect the frames that arrive during a time, with thumbnails."""
+        """Switch the lights, and collect the frames that arrive until `watch_s` after the switch (s)."""
         lit = self._set(stream)
         delays: list[float] = []
         looks: list[Thumbnail] = []
@@ -292,7 +324,7 @@ class ProvenFrames:
         return Switch(np.array(delays, np.float32), np.array(looks, np.float32))
 
     def _period_s(self) -> float:
-        """The time between two frames, measured from some frames if it is not known yet."""
+        """Return the time between two frames (s). Waits for enough frames to measure it."""
         while True:
             rate = self._camera.statistics.rate
             if rate is not None:

@@ -1,4 +1,4 @@
-"""`Shot` and `Pair`: images that are proven to be of one light, and the errors where none can be taken."""
+"""`Shot` and `Pair`: images that are proven to show the lights of their stream, and two errors."""
 
 import dataclasses
 from typing import Literal
@@ -12,33 +12,33 @@ Stream = Literal["visual", "tactile"]
 
 
 class LightError(RuntimeError):
-    """No image of the wanted light could be taken in time."""
+    """No image with the lights of the requested stream could be taken in time."""
 
 
 class NotStillError(TimeoutError):
-    """The view did not come to rest in time."""
+    """The visual stream still changed at the end of the wait."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shot:
     """An image of one stream.
 
-    The lights were the same without interruption from `before.acknowledged_s` until `until_s`, and the frame arrived
-    between both, later than the settling time after the former.
+    The lights did not change from `before.acknowledged_s` to `until_s`. The frame arrived between these times, and at
+    least the settling time after `before.acknowledged_s`.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only
     stream: Stream
     time_s: float  # arrival of the frame, on the clock `time.monotonic` (s)
-    sequence: int  # number of the frame
-    epoch: int  # number of the camera's connection
-    before: Lit  # the controller's answer before the frame
-    until_s: float  # time until which the controller's later answer proves the lights unchanged (s)
+    sequence: int  # number of the frame since the camera was connected
+    epoch: int  # number of the camera's connection, which changes when a lost camera is found again
+    before: Lit  # the controller's answer to the switch of the lights before the frame
+    until_s: float  # time until which the controller's next answer proves that the lights did not change (s)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pair:
-    """Both streams of one moment."""
+    """An image of each stream. `STS` takes them one after the other."""
 
-    visual: Shot
-    tactile: Shot
+    visual: Shot  # image with the lights off
+    tactile: Shot  # image with the lights on

@@ -1,4 +1,4 @@
-"""`STS`: camera and lights as one sensor. Every image is proven to be of one light."""
+"""`STS`: camera and lights as one sensor. Each image is proven to show a single state of the lights."""
 
 import dataclasses
 import itertools
@@ -24,20 +24,20 @@ from sts_jax.hardware.sensor_file import Device
 from sts_jax.hardware.settling import Settling, thumbnail
 from sts_jax.hardware.shots import NotStillError, Pair, Shot, Stream
 
-_SWITCHES = 8  # of each direction, to measure the settling
-_STILL = 6.0  # of 255, change of a thumbnail's pixel that always counts as still
-_NOISE = 8.0  # times the median change of all pixels, which counts as still too. Noise has changes of 5 times that
+_SWITCHES = 8  # number of switches in each direction that measure the settling times
+_STILL = 6.0  # change of a thumbnail's pixel that always counts as still (of 255)
+_NOISE = 8.0  # multiple of the median change that counts as still too. The noise of a camera reaches 5 times the median
 
 
 class FoundSensors(NamedTuple):
-    """Cameras and serial ports of this machine, of which sensors can consist."""
+    """The devices of this machine from which an `STS` can be made."""
 
-    cameras: list[FoundCamera]
-    ports: list[Port]
+    cameras: list[FoundCamera]  # cameras, as `find_cameras` lists them
+    ports: list[Port]  # serial ports to which an LED controller may be connected, as `find_controllers` lists them
 
 
 def find_sensors() -> FoundSensors:
-    """The cameras and serial ports of this machine. Nothing is opened."""
+    """List the cameras and serial ports of this machine. No serial port is opened."""
     return FoundSensors(find_cameras(), find_controllers())
 
 
@@ -49,13 +49,17 @@ class STS:
         pair = sensor.read()  # pair.visual.image and pair.tactile.image
     ```
 
-    A frame counts as of one light if it arrives later than the settling time after the controller's acknowledgement, if
-    two frames in a row have shown since the switch that the image has changed, and if the controller's next answer
-    proves that its lights have not changed in between. All other frames are discarded, also those of a stalled stream
-    that arrive late, those that repeat the frame before them (unless the camera's `frozen_after_s` is None), and black
-    ones of a stream that was not black.
+    The lights are off in the visual stream and on in the tactile stream. Each returned image is proven to show only the
+    lights of its stream. A frame of the camera is returned if all of these conditions hold:
 
-    One thread may use a sensor at a time.
+    - It arrived later than the settling time after the controller had acknowledged the switch of the lights.
+    - Two successive frames since the switch have shown the effect of the new lights.
+    - The controller's next answer shows that the lights have not changed since the acknowledgement.
+    - It was not delayed by a stalled stream.
+    - It differs from the frame before, unless the camera's `frozen_after_s` is None.
+    - It is not black if the last image of the same stream was not black.
+
+    All other frames are discarded. Only one thread may use a sensor at a time.
     """
 
     def __init__(
@@ -72,21 +76,24 @@ class STS:
         """Keep the configuration. `connect` opens the devices.
 
         Args:
-            camera: A camera, its configuration, or its source.
-            leds: An open controller, or the name of its port.
+            camera: A `Camera`, its `CameraConfig`, or the `source` of a `CameraConfig`: the index or path of a device,
+                or the URL of a stream.
+            leds: An open LED controller, or the name of its port. `disconnect` closes the controller in both cases.
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255. All are 0 in the visual stream.
-            settling: Times after which a switch shows, from the sensor file or an earlier connection. None: measured by
-                `connect`, which needs a scene at rest.
-            exposures: Exposure of the visual and of the tactile stream, in the unit of the camera's driver, set at each
-                switch of the lights. None: the camera's own. Needs a camera that is a device.
-            timeout_s: Longest time of one image (s), without the time of a reconnection.
-            reconnect_s: Longest search for a lost controller (s).
+            settling: Settling times of an earlier measurement with the same devices. None: `connect` measures them,
+                which needs a scene at rest.
+            exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If they
+                differ, the camera must be a device, and the exposure is set at each switch of the lights. Equal
+                exposures are not set: give such a value in `CameraConfig.exposure`. None: not changed.
+            timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
+            reconnect_s: Longest search for a controller that was lost (s).
 
         Raises:
-            ValueError: A level is out of range or all are 0, or a time or an exposure is not positive.
+            ValueError: There are not four levels in 0 to 255, all levels are 0, an exposure is not positive, or a time
+                is not positive and finite.
         """
         if exposures is not None and not min(exposures) > 0:
-            raise ValueError(f"exposures must be > 0, got {exposures}")
+            raise ValueError(f"exposures must be two numbers > 0 (visual, tactile) or None, got {exposures}")
         self._levels = checked_levels(levels)
         for name, value in (("timeout_s", timeout_s), ("reconnect_s", reconnect_s)):
             if not 0 < value < float("inf"):
@@ -102,7 +109,7 @@ class STS:
         self._exposures = exposures
         self._device: Device | None = None
         self._timeout_s, self._reconnect_s = timeout_s, reconnect_s
-        self._frames: ProvenFrames | None = None  # of the last connection
+        self._frames: ProvenFrames | None = None  # None before the first `connect`
         self._background: Background | None = None
 
     @classmethod
@@ -115,33 +122,36 @@ class STS:
         timeout_s: float = 5.0,
         reconnect_s: float = 30.0,
     ) -> "STS":
-        """The sensor of a file that `python -m experiments.commission` wrote.
+        """Make the sensor that a sensor file describes. `python -m experiments.commission` writes such files.
 
         ```python
         with STS.from_file("bench") as sensor:
             pair = sensor.read()
         ```
 
-        The camera is the one at the path or URL of the file. The LED controller is looked for on all USB ports by its
-        serial number. Size, rate, exposures, light levels and settling times are those of the file, so the scene need
-        not be at rest.
+        The file contains the path or URL of the camera, the serial number of the LED controller, the size and rate of
+        the images, the exposures, the light levels and the settling times. The settling times are not measured again,
+        so the scene need not be at rest.
 
         Args:
-            path: Path of the sensor file or of its folder.
-            camera: Source of the camera, such as its URL with a password, or its whole configuration. None: that of the
-                file.
-            leds: Port of the controller, such as a pseudo-terminal, which is not on the list of USB ports. None: found
-                by `connect`.
-            timeout_s: As in `STS`.
-            reconnect_s: As in `STS`.
+            path: Path of the sensor file or of the folder that contains it.
+            camera: Another source for the same camera, such as its URL with a password, or a whole configuration.
+                None: the configuration of the file.
+            leds: Name of the controller's port. It is needed for a port that is not a USB device, such as a
+                pseudo-terminal. None: `connect` searches all USB ports for the controller's serial number.
+            timeout_s: Longest wait for one image (s), not counting the time of a reconnection.
+            reconnect_s: Longest search for a controller that was lost (s).
 
         Returns:
-            The sensor, which is not connected yet.
+            The sensor. Call `connect` before the first image.
 
         Raises:
             FileNotFoundError: There is no such file.
+            OSError: The file cannot be read or is not JSON.
             SensorFileError: The file is damaged or describes no device.
-            WrongDeviceError: The camera is not the one of the file. `connect` raises it if the controller is not.
+            WrongDeviceError: The camera is not the one of the file. `connect` raises the same error if the controller
+                is not the one of the file.
+            ValueError: A time is not positive and finite.
         """
         device = Device.load(path)
         config = camera if isinstance(camera, CameraConfig) else device.camera_config(camera)
@@ -160,7 +170,7 @@ class STS:
 
     @property
     def device(self) -> Device | None:
-        """The content of the sensor file, or None if the sensor was not made by `from_file`."""
+        """The device that the sensor file describes, or None if the sensor was not made by `from_file`."""
         return self._device
 
     @property
@@ -186,7 +196,7 @@ class STS:
 
     @property
     def discarded(self) -> int:
-        """Number of frames since `connect` that could not be proven to be of one light."""
+        """Number of frames since `connect` that were discarded. Most arrive before the lights have settled."""
         return 0 if self._frames is None else self._frames.discarded
 
     @property
@@ -194,26 +204,31 @@ class STS:
         """The settling times that are in use.
 
         Raises:
-            CameraNotConnectedError: They were not given, and the sensor is not connected.
+            CameraNotConnectedError: No settling times were given, and `connect` has not measured them yet.
         """
         if self._settling is None:
-            raise CameraNotConnectedError("the settling times are not known yet: call connect() first.")
+            raise CameraNotConnectedError("the settling times were not measured yet: call connect() first.")
         return self._settling
 
     def connect(self, warmup_s: float = 1.0) -> "STS":
-        """Open both devices, switch the lights on and off, and measure the settling times unless they were given.
+        """Open both devices, and measure the settling times unless they were given.
+
+        The lights are switched on and off in any case, because later images are compared with one image of each stream.
 
         Args:
-            warmup_s: Time for the camera's automatic controls to settle (s).
+            warmup_s: Time for the camera's automatic exposure and white balance to settle before they are locked (s).
 
         Returns:
             This sensor.
 
         Raises:
-            LedError: The controller cannot be opened. Subclasses name the cause.
-            CameraError: The camera cannot be opened. Subclasses name the cause.
+            LedError: The controller cannot be opened, or does not answer. Subclasses name the cause.
+            CameraError: The camera cannot be opened, sends no frames, or does not accept `exposures`. Subclasses name
+                the cause.
             NoContrastError: The lights do not change the image.
+            LightError: The settling times could not be measured, because the image keeps changing.
             WrongDeviceError: The controller is not the one of the sensor file.
+            ValueError: `warmup_s` is negative or not finite.
         """
         if self._leds is None:
             if self._device is not None and not self._port:
@@ -243,7 +258,7 @@ class STS:
         return self
 
     def disconnect(self) -> None:
-        """Turn the lights off and close both devices. Without a connection, it does nothing."""
+        """Turn the lights off and close both devices. Does nothing if the sensor is not connected."""
         self._stop_background()
         leds, self._leds = self._leds, None
         if leds is not None:
@@ -251,19 +266,25 @@ class STS:
         self._camera.disconnect()
 
     def read(self, timeout_ms: float | None = None) -> Pair:
-        """Take an image of each stream. Both arrive after the call.
+        """Take one image of each stream.
 
-        A frame was exposed at most the settling time before its arrival. The stream whose light is on comes first, so
-        successive pairs need one switch each.
+        Both frames arrive after the call. A frame arrives at most the settling time after its exposure. The first image
+        is of the stream for which the lights are already set, so each pair needs only one switch of the lights.
 
         Args:
-            timeout_ms: Longest time (ms), None: two times `timeout_s`. A reconnection comes on top, and so does the
-                last request to the controller, whose time `Leds` states.
+            timeout_ms: Longest wait for the pair (ms). None: two times `timeout_s`. A reconnection to the controller
+                extends only the wait for the image that is being taken. The last request to the controller may exceed
+                the limit.
+
+        Returns:
+            The two images.
 
         Raises:
-            LightError: No frame could be proven to be of the wanted light in time.
-            LedError: The controller does not answer, or was not found again.
-            CameraError: There are no frames, for the reasons that `Camera.read` states.
+            LightError: No frame could be proven to show the lights of its stream in time.
+            LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
+            CameraError: The sensor is not connected, or the camera sends no usable frames. `Camera.read` lists the
+                subclasses.
+            ValueError: `timeout_ms` is not positive.
         """
         self._stop_background()
         return self._connected.pair(time.monotonic() + self._limit_s(timeout_ms, 2))
@@ -272,28 +293,36 @@ class STS:
         """Return the newest pair that has not been returned yet, or wait for the next one.
 
         The first call starts a thread that takes pairs continuously, until `read`, `stream`, `wait_until_still` or
-        `disconnect` is called.
+        `disconnect` is called. An error ends the thread. The next call of `async_read` or `read_latest` raises this
+        error, and the call after it starts a new thread.
 
         Args:
-            timeout_ms: Longest wait (ms), None: three times `timeout_s`.
+            timeout_ms: Longest wait (ms). None: three times `timeout_s`.
+
+        Returns:
+            The two images.
 
         Raises:
-            LightError: No pair came in time.
-            LedError: As in `read`.
-            CameraError: As in `read`.
+            LightError: No pair was taken in time.
+            LedError, CameraError, ValueError: The causes are those of `read`.
         """
         return self._started().next(self._limit_s(timeout_ms, 3))
 
     def read_latest(self, max_age_ms: float = 500.0) -> Pair:
-        """Return the newest pair of the thread of `async_read` without waiting.
+        """Return the newest pair that the thread of `async_read` has taken, without waiting.
+
+        The same pair may be returned several times. The thread is started if it is not running.
 
         Args:
-            max_age_ms: Largest allowed time since the arrival of the older of its two frames (ms).
+            max_age_ms: Largest allowed time since the arrival of the pair's older frame (ms).
+
+        Returns:
+            The two images.
 
         Raises:
-            StaleFrameError: The newest pair is older, or there is none yet.
-            LedError: As in `read`.
-            CameraError: As in `read`.
+            StaleFrameError: The newest pair is older than `max_age_ms`, or no pair has been taken yet.
+            LightError, LedError, CameraError: The thread has ended with this error. The causes are those of `read`.
+            ValueError: `max_age_ms` is not positive.
         """
         if not max_age_ms > 0:
             raise ValueError(f"max_age_ms must be > 0, got {max_age_ms}")
@@ -305,20 +334,24 @@ class STS:
         if age_ms > max_age_ms:
             raise StaleFrameError(
                 f"the newest pair is {age_ms:.0f} ms old, but at most {max_age_ms:g} ms are allowed: raise max_age_ms, "
-                "or call read()."
+                "or call read() to take a new pair."
             )
         return pair
 
     def stream(self, duty: float = 0.5, *, dwell: int = 1) -> Iterator[Shot]:
-        """Images without end, a share of which is tactile.
+        """Return an endless iterator over images of both streams.
 
         Args:
             duty: Share of tactile images, 0 to 1.
-            dwell: Images of one stream before the lights may switch. A switch costs the settling time.
+            dwell: Number of successive images of one stream, >= 1. A larger number needs fewer switches of the lights,
+                each of which costs the settling time.
+
+        Returns:
+            The iterator. Each step waits for one image, for at most the sensor's `timeout_s`.
 
         Raises:
             ValueError: An argument is out of range.
-            LightError, LedError, CameraError: As in `read`, at each image.
+            LightError, LedError, CameraError: The iterator raises them at an image. The causes are those of `read`.
         """
         stream_order(duty, dwell)
         self._stop_background()
@@ -327,34 +360,44 @@ class STS:
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
         """Wait until nothing moves in the visual stream.
 
-        The view is still if no block of the image changes by more than 6 of 255, or by more than the noise of all
-        blocks explains, during a window.
+        Each image is reduced to the means of 32 x 24 blocks. The view is still if the images of `window_s` seconds
+        differ from the first of them by at most 6 of 255 in each block. If the image is noisy, a difference of 8 times
+        the median over all blocks is allowed.
 
         Args:
-            timeout_s: Longest wait (s).
-            window_s: Length of the window (s).
+            timeout_s: Longest time from the first image to the returned one (s).
+            window_s: Time during which the view must not change (s).
 
         Returns:
-            The last image of the window.
+            The last image of this time.
 
         Raises:
-            NotStillError: Something still moves.
-            LightError, LedError, CameraError: As in `read`.
+            NotStillError: The view still changes after `timeout_s`.
+            LightError, LedError, CameraError: The causes are those of `read`.
         """
         self._stop_background()
         return first_still(self._images(0.0, 1), timeout_s, window_s)
 
     def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 1.0) -> Settling:
-        """Measure how long after an acknowledgement frames with the former light arrive, and use the result.
+        """Measure the settling times, and use them from now on. The scene must be at rest.
+
+        The settling time is the longest time from the controller's acknowledgement of a switch to the arrival of a
+        frame that does not show the new lights completely, plus one period of the camera. The lights are switched
+        several times in each direction, and the frames after each switch are compared.
 
         Args:
             switches: Number of switches in each direction.
-            watch_s: Time for which frames are watched after the first switch in each direction (s). The settling must
-                be shorter. Later switches are watched for three times the settling that the first ones show.
+            watch_s: Time for which frames are collected after the first switch in each direction (s). It must be longer
+                than the settling times. The later switches use a shorter time, which follows from the first ones.
+
+        Returns:
+            The settling times.
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image still changes at the end of a watch, three times in a row.
+            LightError: The image was still changing `watch_s` after a switch, in each of three attempts.
+            LedError: The controller does not answer.
+            CameraError: The sensor is not connected, or the camera sends no usable frames.
         """
         self._settling = self._connected.measure_settling(switches, watch_s)
         return self._settling
@@ -385,7 +428,7 @@ class STS:
         return self._frames
 
     def _started(self) -> Background:
-        """The thread in the background, a new one if the last one has failed and its error has been raised."""
+        """Return the thread that takes pairs. A new one replaces a thread whose error was raised already."""
         frames = self._connected
         if self._background is None or self._background.reported:
             self._background = Background(
@@ -401,11 +444,14 @@ class STS:
 
 
 def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
-    """The streams of successive images, so that the share of tactile ones is as near to `duty` as possible.
+    """Return an endless iterator over the streams of successive images.
 
     Args:
-        duty: Share of tactile images, 0 to 1.
-        dwell: Images of one stream before the other may follow.
+        duty: Share of tactile images, 0 to 1. The order keeps the share of the images so far as near to it as possible.
+        dwell: Number of successive images of one stream, >= 1.
+
+    Returns:
+        The iterator, whose items are "visual" or "tactile".
 
     Raises:
         ValueError: An argument is out of range.
@@ -426,15 +472,17 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
 
 
 def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Shot:
-    """The first image at which nothing has moved during a window, see `STS.wait_until_still`.
+    """Return the first image before which the view has been still for `window_s`.
+
+    `STS.wait_until_still` describes when a view is still.
 
     Args:
         shots: Successive images of the visual stream.
-        timeout_s: Longest time from the first image (s).
-        window_s: Length of the window (s).
+        timeout_s: Longest time from the first image to the returned one (s).
+        window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: Something still moves.
+        NotStillError: The view still changes after `timeout_s`.
     """
     started_s: float | None = None
     first, look, change, allowed = None, None, 0.0, _STILL
@@ -450,16 +498,17 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"the view still changes after {timeout_s:g} s, by {change:.0f} of 255 in one block (allowed are "
-        f"{allowed:.0f}): wait longer, or check the room's light."
+        f"the view still changes after {timeout_s:g} s: one block of the last image differs by {change:.0f} of 255 "
+        f"(at most {allowed:.0f} counts as still). Keep the scene at rest, raise timeout_s, or check whether the "
+        "light of the room changes."
     )
 
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:
-    """The levels of the tactile stream.
+    """Return the levels of the tactile stream as a tuple of four integers.
 
     Raises:
-        ValueError: There are not four levels of 0 to 255, or all are 0.
+        ValueError: There are not four levels in 0 to 255, or all are 0.
     """
     values = tuple(int(level) for level in levels)
     if len(values) != protocol.CHANNELS or not all(0 <= value <= 255 for value in values) or not any(values):
