@@ -1,4 +1,4 @@
-"""`Camera`: frames of a V4L2 device, a stream or a video file, each with its time."""
+"""`Camera`: reads frames from a V4L2 device, a stream or a video file, each with the time of its arrival."""
 
 import dataclasses
 import time
@@ -19,7 +19,7 @@ from sts_jax.hardware.grabber import Grabber
 
 
 class Camera:
-    """A camera, a stream or a video file.
+    """A V4L2 device, a network stream or a video file whose frames are read.
 
     ```python
     with Camera(CameraConfig("/dev/v4l/by-id/usb-Maker_Camera_0123-video-index0")) as camera:
@@ -27,29 +27,38 @@ class Camera:
     ```
 
     A thread fetches the frames continuously, so no frame grows old in the driver. If the device is lost, the thread
-    opens it again under the same path or URL, and later frames have another `epoch`. Threads may share a camera. A
-    frame is returned by `async_read` to one of them only.
+    opens it again under the same path or URL, and later frames have a larger `epoch`. Threads may share a camera.
+    `async_read` then returns each frame to only one of the threads.
     """
 
     def __init__(self, config: CameraConfig):
-        """Keep the configuration. `connect` opens the camera."""
+        """Keep the configuration. `connect` opens the camera.
+
+        Args:
+            config: Source of the frames, their size, and the locked settings.
+        """
         self.config = config
         self._grabber: Grabber | None = None
 
     def connect(self, warmup_s: float = 1.0) -> "Camera":
         """Open the camera, let its automatic controls settle, and lock them.
 
-        It takes at most `warmup_s` and four times `timeout_s`. A video file starts at its first frame, without a
-        warm-up.
+        The call lasts at most `warmup_s` plus four times `CameraConfig.timeout_s`. A video file starts at its first
+        frame, without a warm-up.
 
         Args:
-            warmup_s: time for exposure and white balance to settle (s). The frames of this time are discarded.
+            warmup_s: Time for exposure and white balance to settle (s). The frames of this time are discarded if the
+                settings of a device are locked.
 
         Returns:
             This camera.
 
         Raises:
-            CameraError: the camera is connected already, or cannot be opened. Subclasses name the cause.
+            CameraError: The camera is connected already, or cannot be opened. Subclasses name the cause.
+            ValueError: `warmup_s` is negative or not finite.
+
+        Warns:
+            UserWarning: The source did not accept a setting, or its settings cannot be locked.
         """
         if not 0 <= warmup_s < float("inf"):
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -62,7 +71,7 @@ class Camera:
             if self.config.kind != "file":
                 time.sleep(warmup_s)
                 self._lock_settings(grabber)
-        except BaseException:  # also a warning that is turned into an error
+        except BaseException:  # includes a warning that Python turns into an error
             self.disconnect()
             raise
         return self
@@ -77,92 +86,118 @@ class Camera:
             warnings.warn(f"{config.name} did not accept a setting. {text}.", stacklevel=3)
         if config.kind == "stream" and config.lock:
             warnings.warn(
-                f"{config.name} is a stream, whose AUTO_EXPOSURE and AUTO_WB cannot be turned off from here: lock them "
-                "at its server, then pass lock=False in CameraConfig.",
+                f"{config.name} is a stream, so AUTO_EXPOSURE and AUTO_WB cannot be turned off by this program: lock "
+                "exposure and white balance at the stream's server, then pass lock=False in CameraConfig.",
                 stacklevel=3,
             )
 
     def disconnect(self) -> None:
-        """Close the camera, within `timeout_s` and a second. Without a connection, it does nothing."""
+        """Close the camera. Does nothing if the camera is not connected.
+
+        The call lasts at most `CameraConfig.timeout_s` plus a second. If the driver does not return in this time, the
+        thread closes the camera later.
+
+        Warns:
+            UserWarning: The driver has not returned in time.
+        """
         grabber, self._grabber = self._grabber, None
         if grabber is not None and not grabber.stop():
             warnings.warn(
-                f"the driver of {self.config.name} does not return. The camera is closed as soon as it does.",
+                f"the driver of {self.config.name} does not respond. The camera is closed as soon as it does.",
                 stacklevel=2,
             )
 
     @property
     def is_connected(self) -> bool:
-        """Whether frames can be expected. False while the camera is lost, and after the end of a video file."""
+        """True if frames can be expected. False while the camera is lost, and after the end of a video file."""
         return self._grabber is not None and self._grabber.running
 
     @property
     def statistics(self) -> CameraStatistics:
-        """Counts since `connect`."""
+        """Counts of frames, losses and other events since `connect`."""
         return self._connected().statistics
 
     @property
     def refused(self) -> tuple[str, ...]:
-        """The settings that the driver did not accept when it was last opened."""
+        """The settings that the driver did not accept when the camera was last opened, one text each."""
         return tuple(self._connected().refused)
 
     @property
     def source(self) -> str:
-        """The camera's identity: its path, which contains its serial number if it has one, or its URL.
+        """The name that identifies the camera: the path of a device or file, or the URL of a stream.
 
-        User name and password of a URL are left out.
+        The path of a device contains the camera's serial number if `/dev/v4l/by-id` lists the camera. The user name and
+        the password of a URL are left out.
         """
         config = _with_stable_path(self.config)
         return devices.device_path(config.target) if config.kind == "device" else config.public
 
     @property
     def locked(self) -> dict[str, float]:
-        """The values of the locked settings of a device, by field of `CameraConfig`. Empty for streams and files."""
+        """The values of a device's locked settings, by field name of `CameraConfig`. Empty for streams and files."""
         return self._connected().held
 
     def set_exposure(self, exposure: float) -> float | None:
-        """Set the exposure of a device, between two frames. The frames that show it first come some frames later.
+        """Set the exposure of a device between two frames. The new exposure appears a few frames after the call.
 
         Args:
-            exposure: in the driver's unit (V4L2: 0.1 ms).
+            exposure: New exposure, > 0, in the driver's unit (V4L2: 0.1 ms).
 
         Returns:
-            The exposure that the device has now, which drivers round and limit. None: the driver does not let it be
-            set.
+            The exposure that the device has now. Drivers round and limit the given value. None: the driver does not
+            support a manual exposure.
 
         Raises:
-            CameraError: the source is no device, or no frame has arrived in time.
+            CameraError: The source is a stream or a file, the camera is not connected, or no frame has arrived in time.
+            ValueError: `exposure` is not positive.
         """
         if not exposure > 0:
             raise ValueError(f"exposure must be > 0, got {exposure}")
         if self.config.kind != "device":
-            raise CameraError(f"the exposure of {self.config.name} is not set from here: set it at its server.")
+            raise CameraError(
+                f"{self.config.name} is not a device, so its exposure cannot be set from here: set it at its server."
+            )
         return self._connected().set_exposure(exposure, self.config.timeout_s)
 
     def read(self, timeout_ms: float | None = None) -> Captured:
         """Return a frame that was exposed after the call.
 
-        The first `in_flight` frames that arrive after the call are discarded, because they may have been exposed
-        before it. Of a video file, the next frame is returned.
+        The first `CameraConfig.in_flight` frames that arrive after the call are discarded, because they may have been
+        exposed before it. From a video file, the oldest frame that has not been returned yet is read instead.
 
         Args:
-            timeout_ms: longest wait (ms), None: `timeout_s`. A call that begins while the camera is lost waits as long
-                for its return.
+            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera is lost when the call begins,
+                the wait includes the time until it is found again.
+
+        Returns:
+            The frame.
 
         Raises:
-            CameraTimeoutError: no such frame has arrived in time.
-            CameraLostError: the camera is lost.
-            FrozenCameraError: the camera has sent the same image for longer than `frozen_after_s`.
-            FrameSizeError: the camera sends frames of another size.
-            EndOfVideoError: the video file has ended.
-            CameraNotConnectedError: the camera is not connected.
+            CameraTimeoutError: No such frame has arrived in time.
+            CameraLostError: The camera was lost during the call, or was not found again in time.
+            FrozenCameraError: The camera has sent the same image for longer than `CameraConfig.frozen_after_s`.
+            FrameSizeError: The camera sends frames of another size.
+            EndOfVideoError: The video file has ended.
+            CameraNotConnectedError: The camera is not connected, or was disconnected during the call.
+            ValueError: `timeout_ms` is not positive.
         """
         return self._connected().wait(self._timeout_s(timeout_ms), exposed_now=self.config.kind != "file")
 
     def async_read(self, timeout_ms: float | None = None) -> Captured:
-        """Return the oldest of the newest `buffer` frames that has not been returned yet, or wait for the next frame.
+        """Return the oldest frame in the buffer, or wait for the next frame if the buffer is empty.
 
-        Args and errors are those of `read`.
+        The buffer contains the newest `CameraConfig.buffer` frames that have not been returned yet. A frame may have
+        been exposed before the call.
+
+        Args:
+            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`.
+
+        Returns:
+            The frame.
+
+        Raises:
+            CameraError: There is no frame. `read` lists the subclasses.
+            ValueError: `timeout_ms` is not positive.
         """
         return self._connected().wait(self._timeout_s(timeout_ms), exposed_now=False)
 
@@ -170,11 +205,15 @@ class Camera:
         """Return the newest frame without waiting. The same frame may be returned several times.
 
         Args:
-            max_age_ms: largest allowed time since the frame's arrival (ms).
+            max_age_ms: Largest allowed time since the frame's arrival (ms).
+
+        Returns:
+            The frame.
 
         Raises:
-            StaleFrameError: the newest frame is older.
-            CameraError: there are no frames at present, for the reasons that `read` states.
+            StaleFrameError: The newest frame is older than `max_age_ms`.
+            CameraError: There are no frames at present. `read` lists the subclasses.
+            ValueError: `max_age_ms` is not positive.
         """
         if not max_age_ms > 0:
             raise ValueError(f"max_age_ms must be > 0, got {max_age_ms}")
@@ -215,7 +254,10 @@ class Camera:
 
 
 def _with_stable_path(config: CameraConfig) -> CameraConfig:
-    """Replace the number of a device by its path with its serial number, under which it returns after replugging."""
+    """Replace the source of a device by its path in `/dev/v4l/by-id`, if there is one.
+
+    This path contains the camera's serial number, so it is the same after replugging.
+    """
     if config.kind != "device":
         return config
     path = devices.device_path(config.target)

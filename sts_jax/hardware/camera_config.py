@@ -16,27 +16,28 @@ class CameraConfig:
     """The configuration of a `Camera`.
 
     The source is a V4L2 device (its index or a path below `/dev`), the URL of a stream (motion JPEG over HTTP, or
-    RTSP), or a video file. Prefer paths in `/dev/v4l/by-id`, because indices change when devices are replugged.
+    RTSP), or the path of a video file. Prefer a path in `/dev/v4l/by-id` to an index, because indices change when
+    devices are replugged.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: A value is out of range.
     """
 
-    source: int | str | Path
-    width: int | None = 1640  # pixels, None: as the source has it
-    height: int | None = 1232  # pixels, None: as the source has it
-    fps: float | None = None  # frames per second, None: the device's. Of a video file: the rate at which it is played
+    source: int | str | Path  # index or path of a device, URL of a stream, or path of a video file
+    width: int | None = 1640  # width of the images (pixels), None: the width that the source sends
+    height: int | None = 1232  # height of the images (pixels), None: the height that the source sends
+    fps: float | None = None  # rate of a device, or playback rate of a video file (frames per second), None: unchanged
     fourcc: str | None = None  # pixel format of a device, such as "MJPG", None: the driver's
-    lock: bool = True  # turn off automatic exposure, white balance and focus
-    exposure: float | None = None  # in the driver's unit (V4L2: 0.1 ms), None: its value after the warm-up
-    gain: float | None = None  # in the driver's unit, None: unchanged
-    white_balance: float | None = None  # K, None: its value after the warm-up
-    focus: float | None = None  # in the driver's unit, None: its value after the warm-up
-    timeout_s: float = 5.0  # s, longest wait for the source when it is opened and for each frame
-    buffer: int = 1  # frames kept for `async_read`. When it is full, the oldest frame is discarded
-    in_flight: int = 2  # frames that exposure and transfer may hold at once. `read` discards as many
-    frozen_after_s: float | None = 1.0  # s of identical frames after which the camera is frozen, None: never
-    realtime: bool = True  # play a video file at its own rate. False: as fast as it is read, without loss
+    lock: bool = True  # turn off automatic exposure, white balance and focus of a device after the warm-up
+    exposure: float | None = None  # exposure in the driver's unit (V4L2: 0.1 ms), None: its value after the warm-up
+    gain: float | None = None  # gain in the driver's unit, None: unchanged
+    white_balance: float | None = None  # colour temperature (K), None: its value after the warm-up
+    focus: float | None = None  # focus in the driver's unit, None: its value after the warm-up
+    timeout_s: float = 5.0  # longest wait for the opening of the source and for each frame (s)
+    buffer: int = 1  # number of frames kept for `async_read`. If one more arrives, the oldest is discarded
+    in_flight: int = 2  # number of frames that may be in exposure or transfer at once. `read` discards as many frames
+    frozen_after_s: float | None = 1.0  # time of identical frames after which reading raises an error (s), None: never
+    realtime: bool = True  # play a video file in real time. False: each frame waits until it is read, and none is lost
 
     def __post_init__(self) -> None:
         if isinstance(self.source, bool) or (isinstance(self.source, int) and self.source < 0):
@@ -60,7 +61,7 @@ class CameraConfig:
 
     @property
     def target(self) -> int | str:
-        """The source as an index, a path or a URL. Digits in a string are an index."""
+        """The source as an index, a path or a URL. A string of digits is an index, unless a file has this name."""
         if isinstance(self.source, int):
             return self.source
         text = str(self.source)
@@ -68,7 +69,7 @@ class CameraConfig:
 
     @property
     def kind(self) -> Kind:
-        """Whether the source is a device, a stream or a file."""
+        """The kind of the source: a device, a stream or a video file."""
         if isinstance(self.target, int):
             return "device"
         if _URL.match(self.target):
@@ -82,7 +83,7 @@ class CameraConfig:
 
     @property
     def name(self) -> str:
-        """The source for messages. A password in a URL is hidden."""
+        """The name of the source in messages. The user name and the password of a URL are replaced by ***."""
         if isinstance(self.target, int):
             return f"camera {self.target}"
         return re.sub(r"(?<=://)[^/@]*@", "***@", self.target)

@@ -1,12 +1,12 @@
-"""Errors of the camera. Each message names the camera, the finding and the remedy."""
+"""Errors of the camera. Each message names the camera, the cause and the remedy."""
 
 
 class CameraError(RuntimeError):
-    """A camera failed. All other errors of the camera derive from this one."""
+    """A camera failed. This is the base class of all errors of the camera."""
 
 
 class CameraNotFoundError(CameraError):
-    """There is no such device, file or host. The message lists the cameras that were found."""
+    """There is no such device, file or host. For a device, the message lists the cameras that were found."""
 
 
 class CameraPermissionError(CameraError):
@@ -14,7 +14,7 @@ class CameraPermissionError(CameraError):
 
 
 class CameraBusyError(CameraError):
-    """Another process, or another part of this one, uses the camera. The message names the process."""
+    """Another process, or another part of this process, uses the camera. The message names the process."""
 
 
 class CameraOpenError(CameraError):
@@ -30,15 +30,15 @@ class CameraTimeoutError(CameraError, TimeoutError):
 
 
 class CameraLostError(CameraError):
-    """The device or the stream was lost. It is opened again in the background."""
+    """The device or the stream was lost. A thread tries to open it again."""
 
 
 class FrameSizeError(CameraError):
-    """The camera's frames have another size than the configuration."""
+    """The camera's frames have another size than the configuration or the earlier frames."""
 
 
 class FrozenCameraError(CameraError):
-    """The camera has sent the same image for too long."""
+    """The camera has sent the same image for longer than `CameraConfig.frozen_after_s`."""
 
 
 class StaleFrameError(CameraError):

@@ -32,17 +32,17 @@ _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
 
 
 class Capture:
-    """An open source.
+    """A device, a stream or a video file that is open for reading.
 
-    FFmpeg rescales frames whose size has changed, and OpenCV does not report the change. Motion JPEG is therefore
-    fetched undecoded and decoded here, which keeps the size of each frame and rejects incomplete ones.
+    FFmpeg rescales frames whose size has changed, and OpenCV does not report the change. The frames of motion JPEG
+    streams are therefore decoded by this class. It keeps the size of each frame, and rejects incomplete frames.
     """
 
     def __init__(self, config: CameraConfig):
         """Open the source of a configuration.
 
         Raises:
-            CameraError: the source cannot be opened. The message names the cause.
+            CameraError: The source cannot be opened. The message names the cause.
         """
         self._config = config
         check_source(config)
@@ -57,7 +57,7 @@ class Capture:
             raise
 
     def _set_up(self) -> list[str]:
-        """Set format and size, check the size, and return warnings."""
+        """Request format, size and rate, check the size, and return a text for each request that was not met."""
         config, warnings = self._config, []
         if config.kind == "device":
             if config.fourcc is not None:
@@ -88,30 +88,30 @@ class Capture:
 
     @property
     def frame_count(self) -> int | None:
-        """Frames of a video file by its header, or None if there is no such number."""
+        """Number of frames that the header of a video file states, or None if it states none."""
         count = self.properties.get(cv2.CAP_PROP_FRAME_COUNT)
         return round(count) if count > 0 else None
 
     @property
     def rate(self) -> float | None:
-        """Frames per second of a device or a video file. Streams do not state theirs."""
+        """Frames per second of a device or a video file, or None if unknown. The rate of a stream is unknown."""
         rate = self.properties.get(cv2.CAP_PROP_FPS) if self._config.kind != "stream" else 0.0
         return rate if rate > 0 and np.isfinite(rate) else None
 
     def stamp(self) -> float | None:
-        """The driver's time of the last frame (s), which has no jitter, or None if there is none."""
+        """Return the time that a device's driver gave the last frame (s, without jitter), or None if it gives none."""
         time_ms = self.properties.get(cv2.CAP_PROP_POS_MSEC) if self._config.kind == "device" else 0.0
         return time_ms / 1000 if time_ms > 0 else None
 
     def grab(self) -> bool:
-        """Wait for the next frame. False if there is none."""
+        """Wait for the next frame, and return whether there is one."""
         try:
             return self.properties.grab()
         except cv2.error:
             return False
 
     def retrieve(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Decode the frame that was grabbed, as RGB, or return None if it is damaged."""
+        """Decode the frame of the last `grab` and return it as RGB, or None if it is damaged."""
         try:
             complete, image = self.properties.retrieve()
             if not complete or image is None or not image.size:
@@ -140,14 +140,14 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
         return cv2.VideoCapture(config.target, cv2.CAP_ANY)
     parameters = []
     if config.kind == "stream":
-        # Several decoding threads hold back as many frames.
+        # A decoder with several threads delays the frames by as many frames.
         parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
         parameters += [cv2.CAP_PROP_N_THREADS, 1]
     return cv2.VideoCapture(str(config.target), cv2.CAP_FFMPEG, parameters)
 
 
 def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
-    """The error for frames of another size than the configuration's."""
+    """Return the error for frames of another size (pixels) than the configuration's."""
     if config.kind == "device":
         path = devices.device_path(config.target)
         remedy = (
@@ -162,7 +162,7 @@ def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
 
 
 def check_source(config: CameraConfig) -> None:
-    """Raise an error if a device or a file does not exist or may not be opened."""
+    """Raise a `CameraError` if a device or a file does not exist, is of the wrong kind, or may not be opened."""
     if config.kind == "stream" or (config.kind == "device" and sys.platform != "linux"):
         return
     path = Path(devices.device_path(config.target))
@@ -176,7 +176,7 @@ def check_source(config: CameraConfig) -> None:
         group = _group(path)
         remedy = f"add your user to the group {group} with `sudo usermod -aG {group} $USER`, then log in again"
         raise CameraPermissionError(
-            f"no permission to open {path}: {remedy if device else 'change its permissions with `chmod u+r`'}."
+            f"no permission to open {path}: {remedy if device else f'change its permissions with `chmod u+r {path}`'}."
         )
     if device and not (path.is_char_device() and os.major(path.stat().st_rdev) == _VIDEO):
         raise CameraOpenError(f"{path} is not a camera. {devices.cameras_found()}")
@@ -185,7 +185,7 @@ def check_source(config: CameraConfig) -> None:
 
 
 def _group(path: Path) -> str:
-    """The group that owns a device, or video if it is unknown."""
+    """Return the name of the group that owns a device, or "video" if the group is unknown or root."""
     with contextlib.suppress(OSError, KeyError, ImportError):
         import grp  # not on Windows
 
@@ -195,7 +195,7 @@ def _group(path: Path) -> str:
 
 
 def opening_error(config: CameraConfig) -> CameraError:
-    """The error for an existing source that OpenCV did not open."""
+    """Return the error for an existing source that OpenCV could not open."""
     if config.kind == "stream":
         return _stream_error(config)
     if config.kind == "file":
@@ -206,16 +206,17 @@ def opening_error(config: CameraConfig) -> CameraError:
     users = devices.users_of(Path(devices.device_path(config.target))) if sys.platform == "linux" else ()
     if users:
         return CameraBusyError(
-            f"{config.name} is in use by process {', '.join(map(str, users))}: end it, or choose another camera."
+            f"{config.name} is in use by process {', '.join(map(str, users))}: end this process, or choose another "
+            "camera."
         )
     return CameraOpenError(
-        f"{config.name} cannot be opened as a camera: it may carry no images, or another user's process may use it. "
-        f"{devices.cameras_found()}"
+        f"{config.name} cannot be opened as a camera: it may deliver no images, or a process of another user may use "
+        f"it. {devices.cameras_found()}"
     )
 
 
 def _stream_error(config: CameraConfig) -> CameraError:
-    """Connect to the server of a stream once more, to find out why it was not opened."""
+    """Return the error for a stream that was not opened. Connects to its server once more to find the cause."""
     name, timeout_s = config.name, min(config.timeout_s, 2.0)
     try:
         url = urllib.parse.urlsplit(str(config.target))
@@ -236,14 +237,14 @@ def _stream_error(config: CameraConfig) -> CameraError:
             content = answer.headers.get_content_type()
             if answer.status != 200:
                 return CameraOpenError(
-                    f"the server of {name} answers {answer.status} {answer.reason}: check path and password."
+                    f"the server of {name} answers {answer.status} {answer.reason}: check the path and password."
                 )
             return CameraOpenError(
                 f"{name} has content of type {content}, from which no video could be read within "
                 f"{config.timeout_s:g} s: give the URL of the video stream itself."
             )
     except ConnectionRefusedError:
-        return CameraOpenError(f"{name} refuses the connection: start its server, or check host and port.")
+        return CameraOpenError(f"{name} refuses the connection: start its server, or check the host and port.")
     except socket.gaierror as error:
         return CameraNotFoundError(f"the host of {name} is unknown ({error.strerror}): check the address.")
     except TimeoutError:
@@ -251,4 +252,4 @@ def _stream_error(config: CameraConfig) -> CameraError:
             f"{name} has not answered within {config.timeout_s:g} s: check its server, or raise timeout_s."
         )
     except (OSError, http.client.HTTPException) as error:
-        return CameraOpenError(f"{name} cannot be opened ({error}): check its server.")
+        return CameraOpenError(f"{name} cannot be opened ({error}): check the address and its server.")

@@ -1,4 +1,4 @@
-"""Cameras of this machine: finding them, the processes that use them, and one lock per camera."""
+"""The cameras of this machine: their list, the processes that use them, and one lock per camera."""
 
 import contextlib
 import dataclasses
@@ -17,17 +17,17 @@ from sts_jax.hardware.camera_errors import CameraBusyError, CameraError
 _QUERYCAP = 0x80685600  # VIDIOC_QUERYCAP
 _CAPABILITY = struct.Struct("=16s32s32s3I12x")  # struct v4l2_capability
 _CAPTURES = 0x1 | 0x1000  # V4L2_CAP_VIDEO_CAPTURE, V4L2_CAP_VIDEO_CAPTURE_MPLANE
-_OWN = 0x80000000  # V4L2_CAP_DEVICE_CAPS: the third number holds the capabilities of this node alone
+_OWN = 0x80000000  # V4L2_CAP_DEVICE_CAPS: the third number describes this device alone, and not the whole camera
 
 
 @dataclasses.dataclass(frozen=True)
 class FoundCamera:
     """A camera of this machine."""
 
-    source: str  # for `CameraConfig`: the most stable path of the device
-    device: str  # the path that `source` points to, such as /dev/video0
-    name: str  # the driver's name
-    users: tuple[int, ...]  # process ids that have opened it, as far as this user may see them
+    source: str  # most stable path of the camera, which `CameraConfig` accepts as its source
+    device: str  # path that `source` points to, such as /dev/video0
+    name: str  # name that the driver gives the camera
+    users: tuple[int, ...]  # ids of the processes that have opened it, as far as this user may see them
 
     def __str__(self) -> str:
         busy = f", in use by process {', '.join(map(str, self.users))}" if self.users else ""
@@ -35,13 +35,17 @@ class FoundCamera:
 
 
 def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
-    """List the V4L2 cameras of this machine. Linux only, elsewhere the list is empty.
+    """List the V4L2 cameras of this machine. The list is empty on other systems than Linux.
 
-    A camera is named by its path in `/dev/v4l/by-id`, which contains its serial number. A camera without one is named
-    by its USB port (`/dev/v4l/by-path`), else by its number (`/dev/video0`). Nodes that carry no images are left out.
+    The source of a camera is its path in `/dev/v4l/by-id`, which contains the serial number. If there is no such path,
+    the source is the path of its USB port (`/dev/v4l/by-path`), or else its number (`/dev/video0`). Devices that
+    deliver no images, such as those for a camera's metadata, are left out.
 
     Args:
-        root: the folder that contains `dev` and `sys`.
+        root: Folder that contains `dev` and `sys`. Tests use another one than `/`.
+
+    Returns:
+        The cameras in the order of their numbers.
     """
     names: dict[Path, Path] = {}
     for folder in ("by-id", "by-path"):
@@ -57,7 +61,7 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
 
 
 def stable_path(device: str, root: Path = Path("/")) -> str:
-    """The path in `/dev/v4l/by-id` of a device, or the given path if there is none."""
+    """Return the path of a device in `/dev/v4l/by-id`, or the given path if there is none."""
     target = Path(device).resolve()
     for link in sorted((root / "dev/v4l/by-id").glob("*")):
         if link.resolve() == target:
@@ -66,7 +70,7 @@ def stable_path(device: str, root: Path = Path("/")) -> str:
 
 
 def cameras_found() -> str:
-    """The cameras of this machine, as a sentence for messages."""
+    """Return a sentence for error messages that lists the cameras of this machine."""
     found = find_cameras()
     if found:
         return f"Cameras found: {', '.join(map(str, found))}."
@@ -74,10 +78,10 @@ def cameras_found() -> str:
 
 
 def users_of(device: Path) -> tuple[int, ...]:
-    """The ids of the processes that have opened a device. Linux only, elsewhere empty."""
+    """Return the ids of the processes that have opened a device. Empty on other systems than Linux."""
     target, users = os.path.realpath(device), []
     for folder in Path("/proc").glob("[0-9]*/fd"):
-        with contextlib.suppress(OSError):  # the process has ended, or belongs to another user
+        with contextlib.suppress(OSError):  # the process has ended, or another user runs it
             if any(_points_to(link, target) for link in folder.iterdir()):
                 users.append(int(folder.parent.name))
     return tuple(sorted(users))
@@ -85,11 +89,14 @@ def users_of(device: Path) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def locked(config: CameraConfig) -> Iterator[None]:
-    """Hold the lock of a device or a stream. Video files have none.
+    """Lock a device or a stream while the context is active. Video files are not locked.
+
+    Args:
+        config: Configuration of the camera.
 
     Raises:
-        CameraBusyError: another process, or another part of this one, holds it.
-        CameraError: the lock cannot be created.
+        CameraBusyError: Another process, or another part of this process, has locked the camera.
+        CameraError: The lock file cannot be created.
     """
     with contextlib.ExitStack() as stack:
         if config.kind != "file":
@@ -103,18 +110,19 @@ def locked(config: CameraConfig) -> Iterator[None]:
                 ) from None
             except OSError as error:
                 raise CameraError(
-                    f"cannot lock {config.name} ({error}): set XDG_RUNTIME_DIR to a folder that can be written to."
+                    f"cannot lock {config.name} ({error}): set the environment variable XDG_RUNTIME_DIR to a folder that "
+                    "can be written to."
                 ) from error
         yield
 
 
 def device_path(target: int | str) -> str:
-    """The path of a V4L2 device, given its index or path."""
+    """Return the path of a V4L2 device, given its index or its path."""
     return f"/dev/video{target}" if isinstance(target, int) else target
 
 
 def _lock_folder(config: CameraConfig) -> Path:
-    """The folder that is locked. All names of one device lead to the same folder."""
+    """Return the folder that stands for a camera in `_files.lock`. All names of one device have the same folder."""
     key = os.path.realpath(device_path(config.target)) if config.kind == "device" else str(config.target)
     base = os.environ.get("XDG_RUNTIME_DIR")
     user = os.getuid() if sys.platform != "win32" else os.environ.get("USERNAME", "user")
@@ -123,7 +131,10 @@ def _lock_folder(config: CameraConfig) -> Path:
 
 
 def _captures(device: Path, properties: Path) -> bool:
-    """Whether a node delivers images, by the driver's answer, or if it has none by the node's place in the camera."""
+    """Return whether a device delivers images.
+
+    The driver is asked. If it does not answer, only a device with index 0 or without an index is assumed to do so.
+    """
     with contextlib.suppress(OSError, ImportError):
         import fcntl  # not on Windows
 
@@ -136,7 +147,7 @@ def _captures(device: Path, properties: Path) -> bool:
 
 
 def captures(capability: bytes) -> bool:
-    """Whether a `struct v4l2_capability` describes a node that delivers images."""
+    """Return whether the bytes of a `struct v4l2_capability` describe a device that delivers images."""
     *_, whole, own = _CAPABILITY.unpack(capability)
     return bool((own if whole & _OWN else whole) & _CAPTURES)
 
@@ -148,7 +159,7 @@ def _points_to(link: Path, target: str) -> bool:
 
 
 def _text(path: Path) -> str:
-    """The content of a small file, or nothing if it cannot be read."""
+    """Return the text of a small file, or an empty string if it cannot be read."""
     with contextlib.suppress(OSError):
         return path.read_text(errors="replace").strip()
     return ""

@@ -1,4 +1,4 @@
-"""`Captured`: one frame of a camera with its time and number, and the statistics of all frames."""
+"""`Captured`: one frame of a camera with its time and number. `CameraStatistics`: counts of all frames."""
 
 import collections
 import dataclasses
@@ -8,79 +8,87 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-BLACK = 8  # largest value of an image that counts as black. The noise of dark JPEG images stays below it
-_INTERVALS = 61  # recent intervals between frames, of which the median is the period
-_FEWEST = 8  # intervals from which a period is measured
-_LONG, _SHORT = 2.5, 0.5  # periods: a frame that comes later was held back, and so were those that follow it sooner
-_MADE_UP = 4  # frames after late ones that may still be early. More would add up the error of the period
+BLACK = 8  # largest value in a black image (of 255). The noise of dark JPEG images stays below it
+_INTERVALS = 61  # number of recent intervals between frames. Their median is the period
+_FEWEST = 8  # smallest number of intervals from which the period is measured
+_LONG = 2.5  # periods. A frame after a longer interval was delayed
+_SHORT = 0.5  # periods. A frame that follows a delayed frame after a shorter interval was delayed too
+_MADE_UP = 4  # frames after the missing ones by which a gap may be corrected. More would add up the error of the period
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Captured:
     """One frame of a camera.
 
-    The clock is `time.monotonic`. Numbers that are missing between two frames belong to frames that were not fetched
-    or that were discarded as damaged.
+    A `sequence` number that is missing between two frames belongs to a frame that arrived but was not returned. It was
+    damaged, for example, or replaced by a newer frame.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, read-only, row 0 at the top
-    time_s: float  # arrival of the frame (s), before it was decoded
-    sequence: int  # number of the frame since `connect`, from 0
-    epoch: int  # number of the connection, from 0. It changes when a lost device is found again
-    dropped: int  # frames that the camera lost just before this one, estimated from the times
-    repeats: int  # frames just before this one that are identical with it
-    black: bool  # whether the image is black, see `is_black`
-    held_back: bool = False  # whether it may be older than its arrival: it came late, or together with one that did
+    time_s: float  # arrival of the frame on the clock `time.monotonic` (s), before it was decoded
+    sequence: int  # number of the frame since `connect`, starting at 0
+    epoch: int  # number of the connection, starting at 0. It increases when a lost device is found again
+    dropped: int  # frames lost just before this frame, estimated from the times, or skipped in a video file
+    repeats: int  # number of frames just before this frame that are identical to it
+    black: bool  # True if no value of the image exceeds 8 of 255
+    held_back: bool = False  # True if the frame was delayed, so it may have been exposed long before it arrived
 
 
 @dataclasses.dataclass(frozen=True)
 class CameraStatistics:
-    """Counts since `connect`."""
+    """Counts of frames, losses and other events since `connect`."""
 
-    frames: int = 0  # complete frames
-    dropped: int = 0  # frames that the camera or the driver lost, estimated from the times
-    skipped: int = 0  # complete frames that were replaced before `async_read` fetched them
+    frames: int = 0  # frames that were complete, of the right size and not frozen
+    dropped: int = 0  # frames that camera or driver lost, estimated from the times, or frames skipped in a video file
+    skipped: int = 0  # frames that were replaced by newer frames before they were read
     damaged: int = 0  # frames that could not be decoded
     wrong_size: int = 0  # frames of another size
-    repeated: int = 0  # frames identical with the one before
+    repeated: int = 0  # frames identical to the frame before
     black: int = 0  # black frames
     losses: int = 0  # losses of the device or the stream
-    rate: float | None = None  # frames per second, from the median interval of recent frames, None: not yet measured
+    rate: float | None = None  # frames per second, from the median interval of recent frames. None: not measured yet
 
 
 def is_black(image: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Whether no value of an image exceeds 8 of 255. The lights may be off, so this is no error."""
+    """Return whether an image is black: none of its values exceeds 8 of 255.
+
+    A black image is not an error, because the lights may be off.
+
+    Args:
+        image: The image.
+    """
     return bool(image.max(initial=0) <= BLACK)
 
 
 class _Gap(NamedTuple):
-    """Frames that are missing after a long interval."""
+    """A long interval between two frames, after which frames are missing."""
 
-    start_s: float  # the frame before the interval
-    frames: int  # frames since then
-    missing: int
-    limit: int  # frames after which it is final
+    start_s: float  # time of the frame before the interval
+    frames: int  # number of frames since this time
+    missing: int  # number of missing frames
+    limit: int  # number of frames after which `missing` is final
 
 
 class Pace:
-    """The period of the frames, and the frames that are missing between them.
+    """Measures the period of the frames and estimates how many frames are missing.
 
-    A gap of n + 1 periods counts as n lost frames. If the frames after the gap arrive early enough to make up for it,
-    they were only late, and `dropped` is corrected. The number that `arrived` has returned for the first of them stays.
+    An interval of n + 1 periods between two frames counts as n lost frames. If the next frames follow in quick
+    succession, the frames were late and not lost, and `dropped` is corrected. The number that `arrived` has returned
+    before is not corrected.
     """
 
     def __init__(self, nominal: float | None):
-        """Start without frames.
+        """Make an estimator that has not seen a frame yet.
 
         Args:
-            nominal: frames per second until the period is measured, or None if they are unknown.
+            nominal: Frames per second that are assumed until the period is measured. None: unknown.
         """
         self._nominal = None if nominal is None else 1 / nominal
         self._last: float | None = None
         self._gap: _Gap | None = None
         self._intervals: collections.deque[float] = collections.deque(maxlen=_INTERVALS)
         self.dropped = 0
-        self.held_back = False  # whether the last frame came after 2.5 periods or more, or together with one that did
+        self.held_back = False  # True if the last frame was delayed
 
     @property
     def rate(self) -> float | None:
@@ -88,7 +96,11 @@ class Pace:
         return 1 / statistics.median(self._intervals) if len(self._intervals) >= _FEWEST else None
 
     def arrived(self, time_s: float) -> int:
-        """Record a frame and return the estimated number of frames lost before it."""
+        """Record a frame, and return the estimated number of frames that were lost just before it.
+
+        Args:
+            time_s: Time of the frame (s). The first frame and a frame without progress of time return 0.
+        """
         last, self._last = self._last, time_s
         if last is None or time_s <= last:
             return 0
@@ -107,12 +119,12 @@ class Pace:
         return missing
 
     def _make_up(self, gap: _Gap, time_s: float, period: float) -> None:
-        """Correct a gap by the frames that came after it."""
+        """Reduce the number of missing frames if the frames after the gap arrive early."""
         frames = gap.frames + 1
         missing = min(max(round((time_s - gap.start_s) / period) - frames, 0), gap.missing)
         self.dropped -= gap.missing - missing
         self._gap = gap._replace(frames=frames, missing=missing) if missing and frames < gap.limit else None
 
     def interrupted(self) -> None:
-        """Forget the last frame, because the connection was interrupted."""
+        """Forget the last frame. Call this after an interruption of the connection."""
         self._last, self._gap, self.held_back = None, None, False

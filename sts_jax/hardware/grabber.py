@@ -1,4 +1,4 @@
-"""The thread that fetches a camera's frames, and finds the camera again when it is lost."""
+"""The thread that fetches a camera's frames, and opens the camera again after a loss."""
 
 import atexit
 import collections
@@ -22,8 +22,8 @@ from sts_jax.hardware.camera_errors import (
 from sts_jax.hardware.capture import Capture, size_error
 from sts_jax.hardware.frames import CameraStatistics, Captured, Pace, is_black
 
-FIRST_WAIT_S = 0.25  # before a lost source is opened again, doubled after each failure
-LONGEST_WAIT_S = 5.0
+FIRST_WAIT_S = 0.25  # s, wait before a lost source is opened again. It doubles after each failure
+LONGEST_WAIT_S = 5.0  # s, longest of these waits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,18 +32,18 @@ class _Problem:
 
     error: type[CameraError]
     message: str
-    final: bool = False  # the thread has ended
+    final: bool = False  # True if the thread has ended
 
     def __call__(self) -> CameraError:
         return self.error(self.message)
 
 
 class Grabber:
-    """The thread of one connection. It alone opens, reads and closes the source, and holds the lock of the camera."""
+    """The thread of one connection. Only this thread opens, reads and closes the source, and locks the camera."""
 
     def __init__(self, config: CameraConfig):
         self._config = config
-        self._changed = threading.Condition()  # guards everything below
+        self._changed = threading.Condition()  # protects all attributes below
         self._queue: collections.deque[Captured] = collections.deque()
         self._newest: Captured | None = None
         self._problem: _Problem | None = None
@@ -52,8 +52,8 @@ class Grabber:
         self._next = 0  # sequence number of the next frame
         self._epoch = -1
         self._opened = False
-        self._settle = False  # the settings are to be locked at their current values
-        self._wanted: float | None = None  # exposure that is to be set
+        self._settle = False  # True if the thread must lock the settings at their current values
+        self._wanted: float | None = None  # exposure that the thread must set
         self._held: dict[str, float] = settings.asked(config) if config.kind == "device" else {}
         self.refused: list[str] = []
         self._stop = threading.Event()
@@ -62,11 +62,14 @@ class Grabber:
     def start(self, timeout_s: float) -> None:
         """Start the thread and wait for the first frame.
 
+        Args:
+            timeout_s: Longest wait (s).
+
         Raises:
-            CameraError: the source cannot be opened, or sends no frame in time. The thread is stopped.
+            CameraError: The source cannot be opened, or sends no frame in time. The thread is stopped.
         """
         self._thread.start()
-        atexit.register(self.stop)  # a thread inside OpenCV must not outlive the interpreter
+        atexit.register(self.stop)  # a thread that is inside OpenCV must not outlive the interpreter
         with self._changed:
             ready = self._changed.wait_for(lambda: self._newest is not None or self._problem is not None, timeout_s)
             problem = self._problem
@@ -82,7 +85,11 @@ class Grabber:
             )
 
     def stop(self) -> bool:
-        """Stop the thread. False if the driver has not returned in time. The thread then ends as soon as it does."""
+        """Stop the thread, and return whether it has ended.
+
+        A driver that does not return within `timeout_s` and a second delays the end. The thread then ends by itself as
+        soon as the driver returns.
+        """
         atexit.unregister(self.stop)
         self._stop.set()
         with self._changed:
@@ -91,13 +98,16 @@ class Grabber:
         return not self._thread.is_alive()
 
     def lock_settings(self, timeout_s: float) -> list[str]:
-        """Lock the settings at their current values and discard the frames until then.
+        """Lock the settings at their current values, and discard all earlier frames.
+
+        Args:
+            timeout_s: Longest wait for the next frame, after which the settings are locked (s).
 
         Returns:
-            The settings that the driver refused.
+            The settings that the driver refused, one text each.
 
         Raises:
-            CameraError: no frame has arrived meanwhile.
+            CameraError: No frame has arrived in time.
         """
         with self._changed:
             self._settle = True
@@ -108,13 +118,17 @@ class Grabber:
             return list(self.refused)
 
     def set_exposure(self, value: float, timeout_s: float) -> float | None:
-        """Set the exposure between two frames. A lost camera is waited for.
+        """Set the exposure between two frames.
+
+        Args:
+            value: Exposure in the driver's unit.
+            timeout_s: Longest wait for the next frame (s), also while the camera is lost.
 
         Returns:
-            The exposure that the device has now, or None if it cannot be set.
+            The exposure that the device has now, or None if the driver does not set it.
 
         Raises:
-            CameraError: no frame has arrived meanwhile.
+            CameraError: No frame has arrived in time.
         """
         with self._changed:
             self._wanted = value
@@ -135,7 +149,7 @@ class Grabber:
 
     @property
     def running(self) -> bool:
-        """Whether frames can be expected."""
+        """True if the thread is running and the source is not lost."""
         with self._changed:
             lost = self._problem is not None and (self._problem.final or self._problem.error is CameraLostError)
             return self._thread.is_alive() and not self._stop.is_set() and not lost
@@ -147,11 +161,14 @@ class Grabber:
             return dataclasses.replace(self._counts, rate=self._pace.rate)
 
     def wait(self, timeout_s: float, exposed_now: bool) -> Captured:
-        """Return the oldest frame in the queue, or wait for one.
+        """Return the oldest frame in the queue, or wait for the next one.
 
         Args:
-            timeout_s: the longest wait.
-            exposed_now: skip frames that may have been exposed before this call.
+            timeout_s: Longest wait (s).
+            exposed_now: Discard frames that may have been exposed before this call.
+
+        Raises:
+            CameraError: There is no frame, for the reasons that `Camera.read` lists.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -161,11 +178,13 @@ class Grabber:
             while True:
                 while self._queue:
                     frame = self._queue.popleft()
-                    self._changed.notify_all()  # there is room for the next frame of a file
+                    self._changed.notify_all()  # the queue has room for the next frame of a file
                     if frame.sequence >= first:
                         return frame
                 if self._stop.is_set():
-                    raise CameraNotConnectedError(f"{self._config.name} was disconnected during the call.")
+                    raise CameraNotConnectedError(
+                        f"{self._config.name} was disconnected during the call: call connect() to open it again."
+                    )
                 remaining = deadline - time.monotonic()
                 if self._problem is not None and not (lost_before and self._is_lost() and remaining > 0):
                     raise self._problem()
@@ -179,7 +198,7 @@ class Grabber:
                 self._changed.wait(remaining)
 
     def latest(self) -> Captured:
-        """The newest frame."""
+        """Return the newest frame. Raises the reason why there are no frames at present."""
         with self._changed:
             ended = self._problem is not None and self._problem.error is EndOfVideoError
             if self._problem is not None and not (ended and self._newest is not None):
@@ -189,7 +208,7 @@ class Grabber:
             return self._newest
 
     def problem(self) -> CameraError | None:
-        """The reason why there are no frames at present."""
+        """Return the reason why there are no frames at present, or None if there are frames."""
         with self._changed:
             return self._problem() if self._problem is not None else None
 
@@ -197,18 +216,19 @@ class Grabber:
         return self._problem is not None and self._problem.error is CameraLostError
 
     def _timeout(self, timeout_s: float) -> CameraTimeoutError:
-        last = "none so far"
+        last = "none has arrived so far"
         if self._newest is not None:
-            last = f"the last one {time.monotonic() - self._newest.time_s:.2f} s ago"
+            last = f"the last one arrived {time.monotonic() - self._newest.time_s:.2f} s ago"
         return CameraTimeoutError(
             f"{self._config.name} has sent no usable frame within {1000 * timeout_s:.0f} ms ({last}, "
-            f"{self._counts.damaged} damaged): check the device or its server, or raise the timeout."
+            f"{self._counts.damaged} damaged frames since connect): check the device or its server, or raise the "
+            "timeout (timeout_ms or timeout_s)."
         )
 
     # The thread
 
     def _run(self) -> None:
-        """Hold the camera until `stop`."""
+        """Read the source until `stop` is called, the file ends or an error occurs. A lost source is opened again."""
         try:
             with devices.locked(self._config):
                 while not self._stop.is_set():
@@ -225,14 +245,21 @@ class Grabber:
             self._set_problem(_Problem(type(error), str(error), final=True))
         except Exception as error:
             self._set_problem(
-                _Problem(CameraError, f"{self._config.name} failed ({error!r}): connect it again.", final=True)
+                _Problem(
+                    CameraError,
+                    f"{self._config.name} failed ({error!r}): call disconnect(), then connect() again.",
+                    final=True,
+                )
             )
         finally:
             with self._changed:
                 self._changed.notify_all()
 
     def _open(self) -> Capture | None:
-        """Open the source. At the first time an error is passed on, later ones are followed by another attempt."""
+        """Open the source, or return None after `stop`.
+
+        The first opening raises the error of a failure. Later openings, after a loss, are repeated until they succeed.
+        """
         wait_s = FIRST_WAIT_S
         while not self._stop.is_set():
             try:
@@ -260,12 +287,12 @@ class Grabber:
 
     def _lost(self) -> str:
         return (
-            f"{self._config.name} was lost. It is opened again every {FIRST_WAIT_S:g} to {LONGEST_WAIT_S:g} s until it "
-            "is found or disconnected: check its cable or its server."
+            f"{self._config.name} was lost. A thread tries to open it again every {FIRST_WAIT_S:g} to "
+            f"{LONGEST_WAIT_S:g} s, until it succeeds or disconnect() is called: check its cable or its server."
         )
 
     def _stream(self, capture: Capture) -> bool:
-        """Publish frames until the source ends. True if it is to be opened again."""
+        """Publish frames until the source ends. Return True if the source must be opened again."""
         config = self._config
         playback = _Playback(config, capture) if config.kind == "file" else None
         previous: UInt8[np.ndarray, "height width 3"] | None = None
@@ -284,7 +311,7 @@ class Grabber:
                 self._set_problem(_Problem(CameraLostError, self._lost()))
                 self._stop.wait(FIRST_WAIT_S)
                 return True
-            # The lock covers time and number, so a reader that starts later sees that this frame arrived before it.
+            # Time and number are set under one lock, so a later call of `wait` sees that this frame arrived before.
             with self._changed:
                 time_s, sequence = time.monotonic(), self._next
                 self._next += 1
@@ -327,8 +354,8 @@ class Grabber:
                     _Problem(
                         FrozenCameraError,
                         f"{config.name} has sent the same image {repeats + 1} times, for {time_s - same_since:.1f} s: "
-                        "replug the camera or restart its server. If the scene can be free of noise, set "
-                        "frozen_after_s=None in CameraConfig.",
+                        "replug the camera or restart its server. If the source can send identical images "
+                        "without a fault, set frozen_after_s=None in CameraConfig.",
                     )
                 )
                 continue
@@ -339,7 +366,10 @@ class Grabber:
         return False
 
     def _turn(self, playback: "_Playback") -> bool:
-        """Wait until the next frame of a file is due, or until there is room for it. False at `stop`."""
+        """Wait until the next frame of a file may be read, and return False if `stop` was called.
+
+        In real time, this is the time at which the frame is due. Otherwise the queue must have room for the frame.
+        """
         if playback.realtime:
             return not self._stop.wait(playback.wait_s())
         with self._changed:
@@ -363,7 +393,7 @@ class Grabber:
             self._changed.notify_all()
 
     def _settle_now(self, capture: Capture) -> None:
-        """Lock the settings at their current values if this was asked for."""
+        """Lock the settings at their current values if `lock_settings` has requested it."""
         if not self._settle:
             return
         held, refusals = settings.lock(capture.properties, self._held, current=True)
@@ -374,7 +404,7 @@ class Grabber:
             self._changed.notify_all()
 
     def _expose_now(self, capture: Capture) -> None:
-        """Set the exposure if this was asked for."""
+        """Set the exposure if `set_exposure` has requested it."""
         wanted = self._wanted
         if wanted is None:
             return
@@ -393,7 +423,7 @@ class Grabber:
             self._counts = dataclasses.replace(self._counts, **totals)
 
     def _set_problem(self, problem: _Problem) -> None:
-        """Set the reason why there are no frames. Frames before a loss are discarded, those before an end are kept."""
+        """Set the reason why there are no frames. The queue is cleared, except at the end of a video file."""
         with self._changed:
             self._problem = problem
             if problem.error is not EndOfVideoError:
@@ -402,7 +432,7 @@ class Grabber:
 
 
 class _Playback:
-    """The clock of a video file."""
+    """The clock that decides when the frames of a video file are due."""
 
     def __init__(self, config: CameraConfig, capture: Capture):
         self._config = config
@@ -413,13 +443,13 @@ class _Playback:
         self.realtime = config.realtime
 
     def wait_s(self) -> float:
-        """Seconds until the next frame is due. It counts as taken."""
+        """Advance to the next frame, and return the time until it is due (s)."""
         due = self._start + self._number * self._period
         self._number += 1
         return max(due - time.monotonic(), 0.0)
 
     def late(self) -> bool:
-        """Whether the frame after the current one is due too. It then counts as taken."""
+        """Return whether the frame after the current one is due too. If so, advance to it."""
         last = self._frames is not None and self._number >= self._frames
         if not self.realtime or last or time.monotonic() < self._start + self._number * self._period:
             return False
@@ -427,15 +457,15 @@ class _Playback:
         return True
 
     def end(self) -> _Problem:
-        """The end of the file."""
+        """Return the reason for no further frames at the end of the file."""
         return _Problem(
             EndOfVideoError,
-            f"{self._config.name} has ended (its header states {self._frames} frames): connect again to play it from "
-            "its start.",
+            f"{self._config.name} has ended (its header states {self._frames} frames): call disconnect(), then "
+            "connect() to play it again from its start.",
             final=True,
         )
 
 
 def _identical(a: UInt8[np.ndarray, "..."], b: UInt8[np.ndarray, "..."]) -> bool:
-    """Whether two images are equal. The first row decides nearly always."""
+    """Return whether two images are equal. The first row is compared first, because it nearly always differs."""
     return np.array_equal(a[0], b[0]) and np.array_equal(a, b)
