@@ -296,7 +296,7 @@ def test_damaged_recordings_are_named(folder, tmp_path):
     (folder / "frames.jsonl").write_text(lines.replace('"time_s": 100.2', '"time_s": NaN', 1))
     refused(TornFileError, "line 5, is damaged .*time_s is nan")
     (folder / "frames.jsonl").write_text(lines.replace('"time_s": 100.2', '"time_s": 10.2', 1))
-    refused(TornFileError, "line 5, is of an earlier time")
+    refused(TornFileError, "line 5, has an earlier time")
     (folder / "frames.jsonl").write_text("")
     refused(ValueError, "lists no image")
     (folder / "frames.jsonl").unlink()

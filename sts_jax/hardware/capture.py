@@ -140,7 +140,7 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
         return cv2.VideoCapture(config.target, cv2.CAP_ANY)
     parameters = []
     if config.kind == "stream":
-        # A decoder with several threads delays the frames by as many frames.
+        # A decoder with n threads delays the images by n frames.
         parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, milliseconds, cv2.CAP_PROP_READ_TIMEOUT_MSEC, milliseconds]
         parameters += [cv2.CAP_PROP_N_THREADS, 1]
     return cv2.VideoCapture(str(config.target), cv2.CAP_FFMPEG, parameters)

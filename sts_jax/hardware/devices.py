@@ -110,8 +110,8 @@ def locked(config: CameraConfig) -> Iterator[None]:
                 ) from None
             except OSError as error:
                 raise CameraError(
-                    f"cannot lock {config.name} ({error}): set the environment variable XDG_RUNTIME_DIR to a folder that "
-                    "can be written to."
+                    f"cannot lock {config.name} ({error}): set the environment variable XDG_RUNTIME_DIR to a folder "
+                    "that can be written to."
                 ) from error
         yield
 

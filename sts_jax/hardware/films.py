@@ -1,4 +1,4 @@
-"""The recorded images of both streams, from a recording of `Recorder` or from two plain video files."""
+"""`Film`: the recorded images of both streams, from a folder of `Recorder` or from two plain video files."""
 
 import abc
 import json
@@ -24,30 +24,34 @@ from sts_jax.hardware.shots import Stream
 
 _AGAIN = "copy the recording again"
 _RATE = 30.0  # frames per second of a video whose header states no rate
-_UNEQUAL = 1  # frames by which two videos may differ in length
+_UNEQUAL = 1  # largest difference between the lengths of two videos (frames)
 
 Image = UInt8[np.ndarray, "height width 3"]
 
 
 class Still(NamedTuple):
-    """An image of a film, without its pixels. The fields are those of `Shot`, on the clock of the recording."""
+    """The description of a recorded image, without its pixels. All times are on the clock of the recording."""
 
     stream: Stream
-    time_s: float
-    sequence: int
-    epoch: int
-    before: Lit
-    until_s: float
+    time_s: float  # arrival of the frame (s)
+    sequence: int  # number of the frame
+    epoch: int  # number of the camera's connection
+    before: Lit  # the controller's answer to the switch of the lights before the frame
+    until_s: float  # time until which the lights are proven to be unchanged (s)
 
 
 class Film(abc.ABC):
     """Recorded images in the order of their times."""
 
-    stills: tuple[Still, ...]
+    stills: tuple[Still, ...]  # descriptions of the images, in the order of their times
 
     @abc.abstractmethod
     def image(self, index: int) -> Image:
-        """The RGB pixels of a still. Films are read in the direction of time at least as fast as in any other."""
+        """Return the RGB pixels of an image. Reading in the order of time is fastest.
+
+        Args:
+            index: Position of the image in `stills`.
+        """
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -55,23 +59,27 @@ class Film(abc.ABC):
 
 
 class _Place(NamedTuple):
-    """The place of an encoded image in its file."""
+    """The place of an encoded image in its video file."""
 
-    offset: int
-    size: int
-    crc32: int
+    offset: int  # position of the first byte
+    size: int  # number of bytes
+    crc32: int  # checksum of the bytes
 
 
 class RecordedFilm(Film):
-    """The film of a recording."""
+    """The images of a folder that `Recorder` has written."""
 
     def __init__(self, folder: Path):
-        """Open a recording and compare its lines with its video files.
+        """Open a recording, and check that its video files contain all images that `frames.jsonl` lists.
+
+        Args:
+            folder: Folder of the recording.
 
         Raises:
-            FileNotFoundError: There is no recording, or a file of it is missing.
+            FileNotFoundError: The folder contains no recording, or a file of the recording is missing.
+            OSError: A file cannot be read.
             TornFileError: A file is damaged or truncated.
-            ValueError: The recording has no image, or was written by another version of the format.
+            ValueError: The recording has no image, or has another version of the format.
         """
         self._folder = folder
         self._check_head()
@@ -96,17 +104,21 @@ class RecordedFilm(Film):
             ) from None
         if not isinstance(head, dict) or head.get("format") != FORMAT:
             found = head.get("format") if isinstance(head, dict) else None
-            raise ValueError(f"{path} has format {found!r}, but this version of sts_jax reads format {FORMAT}.")
+            raise ValueError(
+                f"{path} has format {found!r}, but this version of sts_jax reads format {FORMAT}. Use the "
+                "version that wrote the recording, or make a new recording."
+            )
 
     def _open(self, stream: str) -> None:
-        """Open the video of a stream, and compare its size with the lines."""
+        """Open the video file of a stream, and check that it contains all images that `frames.jsonl` lists."""
         path = self._folder / video_name(stream)
         places = [place for still, place in zip(self.stills, self._places, strict=True) if still.stream == stream]
         try:
             self._files[stream] = path.open("rb")
         except OSError as error:
             raise type(error)(
-                f"{path} cannot be read ({error}), but {FRAMES} lists {len(places)} images of it."
+                f"{path} cannot be read ({error}), but {FRAMES} lists {len(places)} images of it. Check "
+                "the file, or copy the recording again."
             ) from error
         size = path.stat().st_size
         there = sum(place.offset + place.size <= size for place in places)
@@ -117,7 +129,10 @@ class RecordedFilm(Film):
             )
 
     def image(self, index: int) -> Image:
-        """As in `Film`.
+        """Return the RGB pixels of an image.
+
+        Args:
+            index: Position of the image in `stills`.
 
         Raises:
             TornFileError: The image is damaged.
@@ -135,13 +150,16 @@ class RecordedFilm(Film):
         return np.asarray(image)
 
     def close(self) -> None:
-        """As in `Film`."""
+        """Close the files."""
         while self._files:
             self._files.popitem()[1].close()
 
 
 def _lines(path: Path) -> list[tuple[Still, _Place]]:
-    """The complete lines of a file of frames. A last line without its end was interrupted, and is left out."""
+    """Read the lines of a `frames.jsonl` file, one for each image.
+
+    A last line without a newline was interrupted while it was written, and is ignored.
+    """
     try:
         lines = path.read_bytes().split(b"\n")[:-1]
     except OSError as error:
@@ -156,7 +174,7 @@ def _lines(path: Path) -> list[tuple[Still, _Place]]:
                 f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): {_AGAIN}, or remove this line."
             ) from error
         if number > 1 and found[-1][0].time_s < found[-2][0].time_s:
-            raise TornFileError(f"{path}, line {number}, is of an earlier time than the line before: {_AGAIN}.")
+            raise TornFileError(f"{path}, line {number}, has an earlier time than the line before: {_AGAIN}.")
     if not found:
         raise ValueError(f"{path} lists no image: make a new recording.")
     return found
@@ -175,19 +193,23 @@ def _still(values: dict[str, Any]) -> Still:
 
 
 class VideoFilm(Film):
-    """The film of two videos of equal length, one per stream. Nothing proves their light."""
+    """The images of two video files, one per stream. Frames of the same number show the same time.
+
+    A video file has no proof of the lights. `before` and `until_s` therefore have NaN as times.
+    """
 
     def __init__(self, visual: str | os.PathLike, tactile: str | os.PathLike, fps: float | None = None):
         """Open both videos.
 
         Args:
-            visual: Video of the visual stream.
-            tactile: Video of the tactile stream.
-            fps: Frames per second. None: by the header of the visual video.
+            visual: Path of the video of the visual stream.
+            tactile: Path of the video of the tactile stream. Both videos must have the same length.
+            fps: Frames per second of both videos. None: the rate that the header of the visual video states.
 
         Raises:
-            CameraError: A file is missing, damaged or no video.
-            ValueError: Their lengths differ by more than one frame, or `fps` is not positive.
+            CameraError: A file is missing, damaged or not a video.
+            ValueError: The lengths differ by more than one frame, `fps` is not positive and finite, or a path is
+                that of a device or a stream.
         """
         if fps is not None and not (fps > 0 and math.isfinite(fps)):
             raise ValueError(f"fps must be > 0 and finite, got {fps}")
@@ -199,7 +221,7 @@ class VideoFilm(Film):
             if abs(counts["visual"] - counts["tactile"]) > _UNEQUAL:
                 raise ValueError(
                     f"{visual} has {counts['visual']} frames, but {tactile} has {counts['tactile']}: cut both to the "
-                    "same moments, so that frames of equal number belong together."
+                    "same period of time, so that frames with the same number show the same moment."
                 )
         except BaseException:
             self.close()
@@ -216,7 +238,10 @@ class VideoFilm(Film):
         )
 
     def image(self, index: int) -> Image:
-        """As in `Film`.
+        """Return the RGB pixels of an image. Going back in time opens the video again.
+
+        Args:
+            index: Position of the image in `stills`.
 
         Raises:
             CameraOpenError: The video is truncated or damaged.
@@ -225,20 +250,20 @@ class VideoFilm(Film):
         return self._videos[still.stream].frame(still.sequence)
 
     def close(self) -> None:
-        """As in `Film`."""
+        """Close the files."""
         while self._videos:
             self._videos.popitem()[1].capture.release()
 
 
 class _Video:
-    """A video file that is read forwards, and opened again to go back."""
+    """A video file that is read forwards. To go back, the file is opened again."""
 
     def __init__(self, path: str | os.PathLike):
         self._config = CameraConfig(Path(path), None, None)
         if self._config.kind != "file":
-            raise ValueError(f"{path} is no video file: give the path of one.")
+            raise ValueError(f"{path} is not a file: give the path of a video file.")
         self._reopen()
-        assert self.capture.frame_count is not None  # Capture refuses a file without
+        assert self.capture.frame_count is not None  # `Capture` raises an error for a file without a number of frames
         self.count, self.rate = self.capture.frame_count, self.capture.rate
 
     def _reopen(self) -> None:

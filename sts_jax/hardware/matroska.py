@@ -1,26 +1,26 @@
-"""A Matroska file that grows by one image at a time, and that players read at every moment."""
+"""A Matroska video file that grows by one image at a time. Players can read it at any time."""
 
 import struct
 
-CODECS = {"png": b"V_MS/VFW/FOURCC", "jpeg": b"V_MJPEG"}  # by encoding of the images
+CODECS = {"png": b"V_MS/VFW/FOURCC", "jpeg": b"V_MJPEG"}  # Matroska's name of the codec for each encoding of the images
 
-_UNKNOWN = b"\x01" + b"\xff" * 7  # size of a segment that may still grow
-_TIMESTAMP_NS = 1_000_000  # unit of times in the file
+_UNKNOWN = b"\x01" + b"\xff" * 7  # size of a segment whose length is not known yet
+_TIMESTAMP_NS = 1_000_000  # unit of the times in the file (ns)
 
 
 def header(width: int, height: int, encoding: str) -> bytes:
-    """The beginning of a file with one video track.
+    """Return the first bytes of a file with one video track.
 
     Args:
         width: Width of the images (pixels).
         height: Height of the images (pixels).
-        encoding: A key of `CODECS`.
+        encoding: Encoding of the images, a key of `CODECS`.
     """
-    # Versions, longest identifier and size
+    # Versions of EBML, length of the longest identifier and of the longest size field (bytes)
     ebml = _uint(0x4286, 1) + _uint(0x42F7, 1) + _uint(0x42F2, 4) + _uint(0x42F3, 8)
     ebml += _element(0x4282, b"matroska") + _uint(0x4287, 4) + _uint(0x4285, 2)
     information = _uint(0x2AD7B1, _TIMESTAMP_NS) + _element(0x4D80, b"sts_jax") + _element(0x5741, b"sts_jax")
-    # Number, identifier, kind (1: video), no lacing, codec
+    # Number of the track, its identifier, its kind (1: video), no lacing, codec
     track = _uint(0xD7, 1) + _uint(0x73C5, 1) + _uint(0x83, 1) + _uint(0x9C, 0) + _element(0x86, CODECS[encoding])
     if encoding == "png":  # a BITMAPINFOHEADER
         track += _element(0x63A2, struct.pack("<IiiHH4sIiiII", 40, width, height, 1, 24, b"MPNG", 0, 0, 0, 0, 0))
@@ -30,11 +30,11 @@ def header(width: int, height: int, encoding: str) -> bytes:
 
 
 def cluster(time_ms: int, image: bytes) -> bytes:
-    """One image, which ends with its encoded bytes.
+    """Return the bytes of one image in the file. They end with the encoded image.
 
     Args:
-        time_ms: Time since the start of the file (ms).
-        image: The encoded image.
+        time_ms: Time of the image since the start of the file (ms).
+        image: Bytes of the encoded image.
     """
     block = b"\x81" + struct.pack(">hB", 0, 0x80) + image  # track 1, at the cluster's time, a key frame
     return _element(0x1F43B675, _uint(0xE7, time_ms) + _element(0xA3, block))

@@ -1,4 +1,4 @@
-"""Locking of exposure, white balance and focus: set through OpenCV, read back, and compared."""
+"""Locking of exposure, gain, white balance and focus: set through OpenCV, read back, and compared."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from sts_jax.hardware.camera_config import CameraConfig
 
 @runtime_checkable
 class Properties(Protocol):
-    """The part of `cv2.VideoCapture` that holds a device's properties."""
+    """The methods of `cv2.VideoCapture` that read and set the properties of a device."""
 
     def get(self, propId: int, /) -> float: ...  # noqa: D102
 
@@ -21,9 +21,9 @@ class Properties(Protocol):
 @dataclasses.dataclass(frozen=True)
 class _Setting:
     field: str  # field of `CameraConfig`
-    name: str  # OpenCV's name, without CAP_PROP_
-    prop: int
-    automatic: tuple[str, int, float] | None  # name, property, and value that turns the automatic control off
+    name: str  # OpenCV's name of the property, without CAP_PROP_
+    prop: int  # OpenCV's number of the property
+    automatic: tuple[str, int, float] | None  # automatic control: name, number, and value that turns it off
 
 
 _MANUAL = 1.0  # V4L2_EXPOSURE_MANUAL
@@ -34,16 +34,16 @@ _SETTINGS = (
     _Setting("focus", "FOCUS", cv2.CAP_PROP_FOCUS, ("AUTOFOCUS", cv2.CAP_PROP_AUTOFOCUS, 0.0)),
 )
 _UNSUPPORTED = -1.0  # returned by OpenCV for a property that the driver lacks
-_TOLERANCE = 0.5  # drivers store whole numbers
+_TOLERANCE = 0.5  # largest difference that counts as accepted, because drivers store whole numbers
 
 
 @dataclasses.dataclass(frozen=True)
 class Refusal:
-    """A property that the driver did not set."""
+    """A property that the driver did not set to the requested value."""
 
-    name: str  # OpenCV's name, without CAP_PROP_
-    asked: float
-    found: float | None  # None: the driver lacks the property
+    name: str  # OpenCV's name of the property, without CAP_PROP_
+    asked: float  # requested value
+    found: float | None  # value after the request. None: the driver does not support the property
 
     def __str__(self) -> str:
         found = "the driver lacks it" if self.found is None else f"found {self.found:g}"
@@ -51,7 +51,7 @@ class Refusal:
 
 
 def asked(config: CameraConfig) -> dict[str, float]:
-    """The values that a configuration states, by field."""
+    """Return the settings whose values are given in a configuration, by field name of `CameraConfig`."""
     values = {setting.field: getattr(config, setting.field) for setting in _SETTINGS}
     return {field: value for field, value in values.items() if value is not None}
 
@@ -59,16 +59,17 @@ def asked(config: CameraConfig) -> dict[str, float]:
 def lock(
     capture: Properties, values: Mapping[str, float], *, current: bool = False
 ) -> tuple[dict[str, float], list[Refusal]]:
-    """Turn the automatic controls off and set values, then read both back.
+    """Turn automatic controls off and set values, then read both back.
 
     Args:
-        capture: the opened device.
-        values: the values to set, by field of `CameraConfig`.
-        current: lock the settings without a value at their current one.
+        capture: Open device.
+        values: Values to set, by field name of `CameraConfig`.
+        current: Also lock exposure, white balance and focus at their current values if `values` does not contain them.
 
     Returns:
-        The values that the device has now, and the properties that it refused. A control that the device lacks is a
-        refusal only if a value was asked for, or if its automatic control cannot be turned off.
+        The values that the device has now, by field name, and the refusals. A property that the device does not support
+        is a refusal only if a value was given for its setting, or if it controls exposure or white balance
+        automatically.
     """
     held: dict[str, float] = {}
     refused: list[Refusal] = []
@@ -89,7 +90,7 @@ def lock(
 
 
 def _set(capture: Properties, name: str, prop: int, value: float, needed: bool) -> list[Refusal]:
-    """Set one property and read it back. A property that the driver lacks is no refusal unless it is needed."""
+    """Set one property, read it back, and return a refusal or none. An unsupported property is one only if `needed`."""
     capture.set(prop, value)
     found = capture.get(prop)
     if found == _UNSUPPORTED:

@@ -1,4 +1,4 @@
-"""The time after which a switch of the lights shows in whole frames, from frames around the switch."""
+"""The settling time: the time from a switch of the lights to the first frame that shows only the new lights."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-_SIZE = 32, 24  # pixels of a thumbnail, width and height. Its pixels are means of many, so noise hardly counts
-_LEAST_CONTRAST = 2.0  # of 255, mean difference of thumbnails of both lights below which no switch is recognised
-_VISIBLE = 0.5  # of 255, least effect of the light on a value of a thumbnail, which has less noise
-_CLEAR = 0.25  # of the median visible effect, below which a value is not used
-_TOLERANCE = 0.02  # of the share of the light, within which a frame has the new light
+_SIZE = 32, 24  # width and height of a thumbnail (pixels). Each pixel is the mean of many, which averages noise out
+_LEAST_CONTRAST = 2.0  # smallest mean difference of thumbnails between lights off and on (of 255)
+_VISIBLE = 0.5  # smallest effect of the lights on a value of a thumbnail that is used (of 255). The noise is below it
+_CLEAR = 0.25  # smallest effect on a value that is used, as a share of the median visible effect
+_TOLERANCE = 0.02  # largest difference from the last share of the light at which a frame counts as settled
 
-Thumbnail = Float[np.ndarray, "24 32 3"]
+Thumbnail = Float[np.ndarray, "24 32 3"]  # a small copy of an image, 0 to 255
 
 
 class NoContrastError(RuntimeError):
@@ -22,10 +22,14 @@ class NoContrastError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Settling:
-    """Times after the controller's acknowledgement of a switch. Frames that arrive earlier are discarded."""
+    """Times for which frames are discarded after the controller has acknowledged a switch of the lights.
 
-    visual_s: float  # after the lights went off (s)
-    tactile_s: float  # after the lights went on (s)
+    Raises:
+        ValueError: A time is not between 0 and 60 s.
+    """
+
+    visual_s: float  # settling time after the lights were switched off (s)
+    tactile_s: float  # settling time after the lights were switched on (s)
 
     def __post_init__(self) -> None:
         for name in ("visual_s", "tactile_s"):
@@ -36,19 +40,19 @@ class Settling:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Switch:
-    """The frames that followed a switch of the lights, until long after it."""
+    """The frames after a switch of the lights. The last of them must show only the new lights."""
 
-    delays_s: Float[np.ndarray, "n"]  # from the acknowledgement to the arrival of each frame (s)
-    thumbnails: Float[np.ndarray, "n 24 32 3"]
+    delays_s: Float[np.ndarray, "n"]  # time from the acknowledgement to the arrival of each frame (s)
+    thumbnails: Float[np.ndarray, "n 24 32 3"]  # thumbnail of each frame, 0 to 255
 
 
 def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
-    """The means of an image's blocks, 0 to 255."""
+    """Return the means of the 32 x 24 blocks of an image, 0 to 255."""
     return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def difference(first: Thumbnail, second: Thumbnail) -> float:
-    """Mean absolute difference of two thumbnails, of 255."""
+    """Return the mean absolute difference of two thumbnails (of 255)."""
     return float(np.abs(first - second).mean())
 
 
@@ -56,41 +60,49 @@ def check_contrast(contrast: float) -> None:
     """Raise an error if the lights do not change the image.
 
     Args:
-        contrast: Difference of the images without and with the lights, of 255.
+        contrast: Mean difference of the images with the lights off and on (of 255).
 
     Raises:
         NoContrastError: The difference is too small.
     """
     if contrast < _LEAST_CONTRAST:
         raise NoContrastError(
-            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, and at least "
-            f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and whether the camera adapts its "
-            "exposure."
+            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, but at least "
+            f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and lock the camera's exposure."
         )
 
 
 def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
-    """The share of the light in an image, by least squares between images without (0) and with the light (1).
+    """Return the share `s` of the lights in an image: `look = dark + s (lit - dark)` in the least-squares sense.
 
-    Changes of parts that the light does not reach have no influence.
+    Parts of the view that the lights do not reach have no influence.
+
+    Args:
+        look: Thumbnail of the image.
+        dark: Thumbnail with the lights off.
+        lit: Thumbnail with the lights on.
+
+    Returns:
+        0 for an image like `dark`, 1 for an image like `lit`.
     """
     change = lit - dark
     return float(((look - dark) * change).sum() / (change**2).sum())
 
 
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
-    """The share of a change of the light that an image shows in comparison with an image before the switch.
+    """Return how much of the effect of a switch of the lights an image shows.
 
-    It is the median over the values on which the light has an effect, so what moves in less than half of the view has
-    no influence.
+    The share is the median of `(look - before) / change` over the values on which the lights have a clear effect. An
+    object that moves in less than half of the view therefore has no influence.
 
     Args:
-        look: The image.
-        before: The image before the switch.
-        change: The difference that the switch makes, from earlier images.
+        look: Thumbnail of the image.
+        before: Thumbnail of an image before the switch.
+        change: Difference of thumbnails that the switch causes, measured on earlier images.
 
     Returns:
-        0 for the light before the switch, 1 for the one after it, and 0 if the change has no effect anywhere.
+        0 if the image shows the lights before the switch, 1 if it shows the lights after the switch. 0 if the lights
+        have no effect on any value.
     """
     effect = np.abs(change)
     visible = effect >= _VISIBLE
@@ -101,16 +113,19 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
 
 
 def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
-    """The settling times that a number of switches show.
+    """Return the settling times that the frames after several switches of the lights show.
 
-    A frame has the new light if the share of the light in it is within 2 % of the last one of its switch. The time is
-    that of the latest frame without the new light, and one period of the camera more, because the switches sample the
-    phase of the exposure.
+    A frame is settled if its share of the lights (`light_share`) differs by at most 0.02 from the share of the last
+    frame of its switch. The settling time is the largest delay of a frame that is not settled, plus one period of the
+    camera. The period is added because the switches sample only some phases of the exposure.
 
     Args:
-        on: Switches from dark to lit. The scene must be at rest.
-        off: Switches from lit to dark.
+        on: Switches from off to on. The scene must be at rest.
+        off: Switches from on to off. The scene must be at rest.
         period_s: Time between two frames (s).
+
+    Returns:
+        The settling times.
 
     Raises:
         NoContrastError: The lights do not change the image.
@@ -124,7 +139,7 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 
 
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
-    """Delay (s) of the last frame that does not have the new light yet, at least 0."""
+    """Return the delay of the last frame that is not settled (s), at least 0. `settling` has the criterion."""
     shares = np.array([light_share(look, dark, lit) for look in switch.thumbnails])
     mixed = np.flatnonzero(np.abs(shares - shares[-1]) > _TOLERANCE)
     return max(float(switch.delays_s[mixed[-1]]), 0.0) if len(mixed) else 0.0
