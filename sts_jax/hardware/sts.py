@@ -1,4 +1,4 @@
-"""`STS`: camera and lights as one sensor. Each image is proven to show a single state of the lights."""
+"""`STS`: camera and lights as one sensor. Each image is proven to be exposed in a single state of the lights."""
 
 import dataclasses
 import itertools
@@ -49,10 +49,12 @@ class STS:
         pair = sensor.read()  # pair.visual.image and pair.tactile.image
     ```
 
-    The lights are off in the visual stream and on in the tactile stream. Each returned image is proven to show only the
-    lights of its stream. A frame of the camera is returned if all of these conditions hold:
+    The lights are off in the visual stream and on in the tactile stream. An image is returned only if it is proven that
+    the lights were in the state of its stream during the whole exposure. A frame of the camera must meet all of these
+    conditions:
 
-    - It arrived later than the settling time after the controller had acknowledged the switch of the lights.
+    - It arrived later than the settling time after the controller had acknowledged the switch of the lights. Earlier
+      frames may show the former lights.
     - Two successive frames since the switch have shown the effect of the new lights.
     - The controller's next answer shows that the lights have not changed since the acknowledgement.
     - It was not delayed by a stalled stream.
@@ -80,8 +82,8 @@ class STS:
                 or the URL of a stream.
             leds: An open LED controller, or the name of its port. `disconnect` closes the controller in both cases.
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255. All are 0 in the visual stream.
-            settling: Settling times of an earlier measurement with the same devices. None: `connect` measures them,
-                which needs a scene at rest.
+            settling: Times for which frames are discarded after a switch of the lights, from an earlier measurement
+                with the same devices. None: `connect` measures them, which needs a scene at rest.
             exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If they
                 differ, the camera must be a device, and the exposure is set at each switch of the lights. Equal
                 exposures are not set: give such a value in `CameraConfig.exposure`. None: not changed.
@@ -196,7 +198,7 @@ class STS:
 
     @property
     def discarded(self) -> int:
-        """Number of frames since `connect` that were discarded. Most arrive before the lights have settled."""
+        """Number of frames since `connect` that were discarded, such as those before the lights have settled."""
         return 0 if self._frames is None else self._frames.discarded
 
     @property
@@ -280,7 +282,7 @@ class STS:
             The two images.
 
         Raises:
-            LightError: No frame could be proven to show the lights of its stream in time.
+            LightError: No frame met the conditions in time.
             LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
             CameraError: The sensor is not connected, or the camera sends no usable frames. `Camera.read` lists the
                 subclasses.
@@ -482,7 +484,7 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: The view still changes after `timeout_s`.
+        NotStillError: The view still changes after `timeout_s`, or there are no more images.
     """
     started_s: float | None = None
     first, look, change, allowed = None, None, 0.0, _STILL
