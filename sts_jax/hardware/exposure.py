@@ -68,7 +68,7 @@ def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
             return Exposed(found, seen)
     if found is None:
         raise CameraError(
-            f"the driver of {camera.config.name} does not let the exposure be set: use the camera with its own exposure."
+            f"the driver of {camera.config.name} does not let the exposure be set: use the camera's own exposure."
         )
     time.sleep(LAG_S)
     return Exposed(found, brightness(camera.read().image))
