@@ -59,9 +59,9 @@ class Port:
 
 
 def find_controllers() -> list[Port]:
-    """List all serial ports of this machine, to any of which a controller may be connected.
+    """List the serial ports of this machine.
 
-    No port is opened, because opening a port restarts most boards.
+    The LED controller may be on any of them. No port is opened, because opening a port restarts most boards.
 
     Returns:
         The ports, those of USB devices first.

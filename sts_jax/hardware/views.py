@@ -47,7 +47,8 @@ def sensor_view(
         The rectified images. Each pixel is the mean of the raw image over the pixel's area.
 
     Raises:
-        ValueError: An image has another size than the lens, or `rectified` raises an error for another reason.
+        ValueError: An image has another size than the lens or is not uint8, `resolution` is out of range, or the view
+            contains rays beyond `Lens.largest_angle`.
     """
     images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
     return SensorView(*(image.astype(np.float32) / 255 for image in images))
