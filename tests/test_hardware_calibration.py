@@ -108,7 +108,7 @@ def test_boards_that_do_not_exist_or_fit_raise_errors(tmp_path):
         hardware.board_image(Board(square=0.025))
     with pytest.raises(ValueError, match="at most 200 mm x 237 mm fit on the page"):
         hardware.board_image(BOARD, outline=(0.21, 0.15))
-    with pytest.raises(ValueError, match=r"written as \.pdf or \.png, got .*board\.tiff"):
+    with pytest.raises(ValueError, match=r"path must end in \.pdf or \.png, got .*board\.tiff"):
         hardware.save_board(tmp_path / "board.tiff")
     with pytest.raises(ValueError, match="marker < square"):
         Board(marker=0.02)

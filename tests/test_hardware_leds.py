@@ -354,7 +354,7 @@ def test_a_vanished_port_is_named_and_found_again(peer, tmp_path):
     peer.faults = ["vanish"]
     with pytest.raises(hardware.DisconnectedError, match=r"port is gone.*reconnect\(\)"):
         leds.set(ON)
-    with pytest.raises(hardware.DisconnectedError, match=r"EMULATED was not found within 0\.2 s.*Tried: .*port"):
+    with pytest.raises(hardware.DisconnectedError, match=r"EMULATED was not found within 0\.2 s.*Ports tried: .*port"):
         leds.reconnect(limit_s=0.2)
     returned = Peer(tmp_path / "port")
     leds.reconnect(limit_s=60.0)
@@ -441,13 +441,13 @@ def test_another_version_of_the_protocol_is_named(tmp_path, monkeypatch):
 
     newer = Peer(tmp_path / "port")
     newer.controller = Newer()
-    with pytest.raises(hardware.WrongVersionError, match=r"speaks version 2 .* needs 1\. Flash.*make flash PORT"):
+    with pytest.raises(hardware.WrongVersionError, match=r"\(version 2\).* needs version 1\. Flash.*make flash PORT"):
         connect(newer.path)
     newer.controller = emulation.EmulatedController()
     monkeypatch.setattr(protocol, "VERSION", 3)
     monkeypatch.setattr(protocol.Hello.__init__, "__defaults__", (3,))
     monkeypatch.setattr(newer.controller, "_execute", refuse_version)
-    with pytest.raises(hardware.WrongVersionError, match=r"speaks protocol 1 .* needs 3"):
+    with pytest.raises(hardware.WrongVersionError, match=r"\(protocol 1\).* needs version 3"):
         connect(newer.path)
     newer.vanish()
 

@@ -138,13 +138,13 @@ def test_a_full_disk_keeps_what_was_recorded(tmp_path, monkeypatch):
 
 
 def test_a_recorder_refuses_bad_input(folder, tmp_path):
-    with pytest.raises(FileExistsError, match="is not an empty folder: give the name of a new one"):
+    with pytest.raises(FileExistsError, match="is not an empty folder: give the name of a new folder"):
         hardware.Recorder(folder, ORIGIN)
     with pytest.raises(ValueError, match="encoding must be one of png, jpeg, got 'gif'"):
         hardware.Recorder(tmp_path / "new", ORIGIN, encoding="gif")
     with (
         hardware.Recorder(tmp_path / "new", ORIGIN) as recorder,
-        pytest.raises(ValueError, match=r"has shape \(4, 4, 3\), but those of the recording have \(48, 64, 3\)"),
+        pytest.raises(ValueError, match=r"has shape \(4, 4, 3\), but the images of this recording have \(48, 64, 3\)"),
     ):
         recorder.add(dataclasses.replace(shot(0), image=np.zeros((4, 4, 3), np.uint8)))
 
@@ -197,7 +197,7 @@ def test_late_readers_miss_images(folder):
 def test_the_newest_pair_and_stale_ones(folder):
     with hardware.Replay(folder, speed=1.0, loop=True) as replay:
         replay._start_s += 1000.0
-        with pytest.raises(hardware.StaleFrameError, match="no pair has come yet"):
+        with pytest.raises(hardware.StaleFrameError, match="no pair is available yet"):
             replay.read_latest()
         replay._start_s = time.monotonic() - 4.5 * PERIOD_S  # the image 4 has come, but not its partner
         newest = replay.read_latest(60_000)
@@ -256,7 +256,7 @@ def test_a_gap_exceeds_a_timeout(tmp_path):
         recorder.add(dataclasses.replace(shot(1), time_s=1e4))
     with (
         hardware.Replay(tmp_path / "made").connect(0.5) as replay,
-        pytest.raises(hardware.LightError, match=r"comes in .* s, but timeout_ms is 500: wait longer"),
+        pytest.raises(hardware.LightError, match=r"available in .* s, but timeout_ms is 500: raise timeout_ms"),
     ):
         replay.read(500)
 

@@ -105,7 +105,7 @@ def test_another_camera_or_controller_is_refused_by_name():
     camera, leds = DEVICE.camera, DEVICE.leds
     DEVICE.check_identity()
     DEVICE.check_identity(camera=camera, leds=leds)
-    both = rf"that of camera {re.escape(camera)} and LED controller {leds}, but the connected device has "
+    both = rf"describes camera {re.escape(camera)} and LED controller {leds}, but the connected device has "
     with pytest.raises(WrongDeviceError, match=both + r"camera /dev/video3\. Load the file.*experiments\.commission"):
         DEVICE.check_identity(camera="/dev/video3", leds=leds)
     with pytest.raises(WrongDeviceError, match=both + "LED controller FFFF"):
@@ -148,7 +148,7 @@ def test_a_truncated_file_is_refused(tmp_path, size):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("leds", None, r"device\.leds is None, but it must be a text"),
+        ("leds", None, r"device\.leds is None, but it must be a string"),
         ("leds", "", "leds must not be empty"),
         ("fps", 0, "fps must be > 0"),
         ("fps", "30", "device.fps is '30', but it must be a finite number"),
@@ -210,7 +210,7 @@ def test_wrong_arguments_raise_errors(tmp_path):
     constants = sts.Sensor().constants()
     with pytest.raises(ValueError, match=r"visual background must be a raw image, uint8 of shape \(48, 64, 3\)"):
         DEVICE.save(tmp_path, constants, visual=background(0)[:-1])
-    with pytest.raises(ValueError, match="constants must be those of a sensor"):
+    with pytest.raises(ValueError, match="constants must be the constants of a simulated sensor"):
         DEVICE.save(tmp_path, {})
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(ValueError, match="fps must be > 0 and finite, got -1"):

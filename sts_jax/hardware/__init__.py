@@ -1,4 +1,4 @@
-"""The real sensor as a device. Imperative, NumPy only."""
+"""The real sensor: camera, LED controller, calibration, and recording. It uses NumPy, not JAX."""
 
 from sts_jax.hardware.calibration import (
     Board,

@@ -1,4 +1,4 @@
-"""One open port to the LED controller: requests with repetition, and the answers that belong to them."""
+"""An open port to the LED controller: sends requests, repeats them, and finds the answer to each."""
 
 import logging
 import random
@@ -11,8 +11,8 @@ import serial
 
 from sts_jax.hardware import ports, protocol
 
-REPEAT_S = 0.1  # wait for an answer before the request is repeated. A controller answers within 15 ms
-_HEARD = 400  # bytes that are kept to describe another device
+REPEAT_S = 0.1  # wait for an answer before the request is repeated (s). A controller answers within 15 ms
+_HEARD = 400  # largest number of invalid bytes that are kept for an error message
 
 _log = logging.getLogger(__name__)
 
@@ -20,21 +20,39 @@ Answer = TypeVar("Answer", protocol.Controller, protocol.State, protocol.Watchin
 
 
 class Connection:
-    """An open port. Threads may share it."""
+    """An open port to a controller. Several threads may use one connection."""
 
     def __init__(self, name: str, baud: int):
+        """Open the port. `ports.open_port` lists the errors.
+
+        Args:
+            name: Name of the device, or a URL of pyserial.
+            baud: Rate of the serial line (baud).
+        """
         self.name = name
         self.baud = baud
-        self.answered_s = time.monotonic()  # time of the last valid answer
-        self.stopped = threading.Event()
+        self.answered_s = time.monotonic()  # time of the last valid answer (s)
+        self.stopped = threading.Event()  # set by `close`
         self._serial = ports.open_port(name, baud)
         self._lock = threading.Lock()
-        self._sequence = random.randrange(protocol.LAST_SEQUENCE)  # stale answers of an earlier process differ
-        self._buffer = b""
-        self._heard = b""  # bytes of the current exchange that are no valid line
+        # Random, so that late answers to an earlier process have other sequence numbers.
+        self._sequence = random.randrange(protocol.LAST_SEQUENCE)
+        self._buffer = b""  # received bytes that are not processed yet
+        self._heard = b""  # invalid lines that arrived during the current exchange
 
     def handshake(self, timeout_s: float) -> protocol.Controller:
-        """Exchange versions. Boards restart when a port is opened, so the request is repeated until `timeout_s`."""
+        """Return the controller's description, and check that it uses the same version of the protocol.
+
+        Boards restart when a port is opened, so the request is repeated until `timeout_s` has passed.
+
+        Args:
+            timeout_s: Longest wait for the answer (s).
+
+        Raises:
+            NotALedControllerError: No valid answer arrived in time.
+            WrongVersionError: The controller uses another version of the protocol.
+            DisconnectedError: The port vanished.
+        """
         try:
             reply, _, _ = self.exchange(protocol.Hello, protocol.Controller, timeout_s=timeout_s)
         except ports.LedTimeoutError as error:
@@ -48,15 +66,22 @@ class Connection:
     def exchange(
         self, request: Callable[[int], protocol.Request], answer: type[Answer], *, timeout_s: float
     ) -> tuple[Answer, float, float]:
-        """Send a request and wait for its answer, repeating the request with the same sequence number.
+        """Send a request and wait for its answer. The request is repeated with the same sequence number.
 
         Args:
-            request: Makes the request of a sequence number.
-            answer: Type of the answer. Other lines are ignored.
-            timeout_s: Longest total time (s).
+            request: Function that makes the request from its sequence number.
+            answer: Type of the expected answer. Replies of other types are ignored, except refusals.
+            timeout_s: Longest time, with all repetitions (s).
 
         Returns:
-            The answer, the time before the first sending, and the time of the answer (s, `time.monotonic`).
+            The answer, the time just before the request was first sent, and the time at which the answer had arrived.
+            Both times are in seconds on the clock `time.monotonic`.
+
+        Raises:
+            LedTimeoutError: No valid answer arrived in time, or the port accepts no bytes.
+            WrongVersionError: The controller refused the version of the protocol.
+            LedError: The controller refused the request for another reason.
+            DisconnectedError: The port vanished or is closed.
         """
         with self._lock:
             self._sequence = self._sequence % protocol.LAST_SEQUENCE + 1
@@ -69,7 +94,7 @@ class Connection:
                 until = min(deadline, now + REPEAT_S)
                 while (reply := self._next_reply(until)) is not None:
                     if isinstance(reply, protocol.Refused) and reply.sequence in (0, self._sequence):
-                        if reply.sequence == 0:  # the request was damaged on its way
+                        if reply.sequence == 0:  # the request was damaged on its way, so it is sent again
                             break
                         raise self._refusal(reply, line)
                     if isinstance(reply, answer) and reply.sequence == self._sequence:
@@ -90,9 +115,9 @@ class Connection:
                 _log.debug("closing %s: %s", self.name, error)
 
     def _next_reply(self, until: float) -> protocol.Reply | None:
-        """The next valid line, or None if there is none until a time. Invalid lines and the watchdog's are skipped."""
+        """The next valid reply, or None if none arrives until a time. Skips invalid lines and the watchdog's lines."""
         while (line := self._next_line(until)) is not None:
-            if time.monotonic() >= until + REPEAT_S:  # a device that sends without end
+            if time.monotonic() >= until + REPEAT_S:  # the device sends without end
                 return None
             try:
                 reply = protocol.decode_reply(line)
@@ -107,7 +132,10 @@ class Connection:
         return None
 
     def _next_line(self, until: float) -> bytes | None:
-        """The next line that is not empty. Bytes without a newline are cut to pieces longer than any valid line."""
+        """The next line that is not empty, or None if none arrives until a time.
+
+        Bytes without a newline are returned once they are longer than any valid line.
+        """
         expired = False
         while True:
             line, newline, rest = self._buffer.partition(b"\n")
@@ -118,7 +146,7 @@ class Connection:
                 continue
             if expired:
                 return None
-            expired = time.monotonic() >= until  # one read more, in case this process slept meanwhile
+            expired = time.monotonic() >= until  # read once more, in case this process was suspended meanwhile
             self._buffer += self._read()
 
     def _read(self) -> bytes:
@@ -132,14 +160,15 @@ class Connection:
             self._serial.write(line)
         except serial.SerialTimeoutException as error:
             raise ports.LedTimeoutError(
-                f"{self.name} took no bytes for {ports.WRITE_S:g} s. Unplug the controller and plug it in again."
+                f"the port {self.name} accepted no bytes for {ports.WRITE_S:g} s. Unplug the LED controller and plug "
+                "it in again."
             ) from error
         except (OSError, TypeError) as error:
             raise self._vanished(error) from error
 
     def _vanished(self, error: Exception) -> ports.DisconnectedError:
         return ports.DisconnectedError(
-            f"{self.name} is gone or closed ({error}). Check the cable, then call `reconnect()`."
+            f"the port {self.name} is gone or closed ({error}). Check the cable, then call `reconnect()`."
         )
 
     def _refusal(self, reply: protocol.Refused, line: bytes) -> ports.LedError:
@@ -152,15 +181,16 @@ class Connection:
 
     def _wrong_version(self, found: str) -> ports.WrongVersionError:
         return ports.WrongVersionError(
-            f"the LED controller on {self.name} speaks {found} of the protocol, and this version of sts_jax needs "
-            f"{protocol.VERSION}. Flash its firmware: `make flash PORT={self.name}` in sts_jax/hardware/firmware."
+            f"the LED controller on {self.name} uses another version of the protocol ({found}), but this version of "
+            f"sts_jax needs version {protocol.VERSION}. Flash its firmware: `make flash PORT={self.name}` in "
+            "sts_jax/hardware/firmware."
         )
 
     def _description(self) -> str:
-        """A description of the bytes that are no valid answer, with their likely cause."""
+        """Sentences for an error message: the invalid bytes that were received, their likely cause and the remedy."""
         heard = self._heard + self._buffer
         if not heard:
-            return "Nothing was received. Check the cable, the port, and that the firmware is flashed."
+            return "Nothing was received. Check the cable and the name of the port, and flash the firmware."
         strange = sum(not (32 <= byte < 127 or byte in b"\t\r\n") for byte in heard)
         if 5 * strange > len(heard):
             return (

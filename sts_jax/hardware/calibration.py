@@ -1,4 +1,4 @@
-"""Calibration of a fisheye camera and of the pad's position from pictures of a printed ChArUco board."""
+"""Calibration of a fisheye lens and of the camera's pose in the sensor, from images of a printed ChArUco board."""
 
 import dataclasses
 import math
@@ -16,50 +16,57 @@ from scipy.spatial.transform import Rotation
 from sts_jax import _files
 from sts_jax.hardware.lens import Lens, distort_angle
 
-FEWEST_IMAGES = 6
-FEWEST_CORNERS = 12  # of a usable image
-LEAST_TILT = math.radians(15)  # between the two most different boards
-MOST_TILT_ON_PAD = math.radians(30)  # of the pad against the image
+FEWEST_IMAGES = 6  # least number of usable images
+FEWEST_CORNERS = 12  # least number of corners in a usable image
+LEAST_TILT = math.radians(15)  # least angle between the two boards that differ most (rad)
+MOST_TILT_ON_PAD = math.radians(30)  # largest angle between the board on the pad and the image (rad)
 
-_STARTS = np.radians(np.arange(60, 221, 10))  # rad, fields of view across the diagonal from which the fit may start
-_WIDEST = math.radians(80)  # rad, corners beyond it do not take part in the first estimate of a pose
-# Pixels per unit of k. Without it, k is arbitrary beyond the corners' largest angle. With an error of 0.1 pixels of the
-# corners, the standard deviations are 0.2, 0.1, 0.05 and 0.02. The equidistant, stereographic, equisolid and
-# orthographic projections have absolute values of at most 0.17, 0.01, 0.001 and 0.0001.
+_STARTS = np.radians(np.arange(60, 221, 10))  # fields of view across the diagonal that the first estimate tries (rad)
+_WIDEST = math.radians(80)  # corners beyond this angle are not used in the first estimate of a pose (rad)
+# Weights of k1 to k4 as additional residuals of the fit (pixels per unit of k). They act as a prior with mean 0, which
+# is needed because the corners do not determine k beyond their largest angle. If the corners have errors of 0.1 pixels,
+# the prior's standard deviations are 0.2, 0.1, 0.05 and 0.02. In the equidistant, stereographic, equisolid and
+# orthographic projections, k1 to k4 have absolute values of at most 0.17, 0.01, 0.001 and 0.0001.
 _PRIOR = np.array([0.5, 1.0, 2.0, 5.0])
-_PAGE = (210, 297)  # mm, A4
+_PAGE = (210, 297)  # width and height of A4 (mm)
 _PIXELS_PER_MM = 10
-_RULER = 100  # mm
+_RULER = 100  # length of the printed ruler (mm)
 
 
 class CalibrationError(ValueError):
-    """The images do not determine the lens. The message names the images and the remedy."""
+    """Raised if the images do not determine the lens. The message names the images and the remedy."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Board:
-    """A ChArUco board: a chessboard with a marker in each white square.
+    """A ChArUco board: a chessboard with an ArUco marker in each white square.
 
-    Its frame has the origin at the board's centre, x to the right and y to the bottom of the print, z into the paper.
+    The board's frame has its origin at the board's centre. x points to the right of the print, y to its bottom, and z
+    into the paper.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: A value is out of range.
     """
 
-    columns: int = 9  # squares
-    rows: int = 9  # squares
-    square: float = 0.016  # m, side of a square
-    marker: float = 0.012  # m, side of a marker
-    dictionary: str = "DICT_4X4_50"  # name of OpenCV's set of markers
+    columns: int = 9  # number of squares in a row, at least 4
+    rows: int = 9  # number of squares in a column, at least 4
+    square: float = 0.016  # side of a square (m)
+    marker: float = 0.012  # side of a marker (m)
+    dictionary: str = "DICT_4X4_50"  # name of one of OpenCV's predefined dictionaries of markers
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):
             if getattr(self, name) < 4:
                 raise ValueError(f"{name} must be >= 4, got {getattr(self, name)}")
         if not 0 < self.marker < self.square < 1:
-            raise ValueError(f"0 < marker < square < 1 m must hold, got {self.marker} and {self.square}")
+            raise ValueError(
+                f"a board needs 0 < marker < square < 1 m, got marker={self.marker} and square={self.square}"
+            )
         if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
-            raise ValueError(f"dictionary must be a name of OpenCV such as 'DICT_4X4_50', got {self.dictionary!r}")
+            raise ValueError(
+                f"dictionary must be a name of OpenCV's predefined dictionaries such as 'DICT_4X4_50', got "
+                f"{self.dictionary!r}"
+            )
         known = len(self._markers().bytesList)
         if self.columns * self.rows // 2 > known:
             raise ValueError(
@@ -69,17 +76,17 @@ class Board:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Width and height (m)."""
+        """Width and height of the board (m)."""
         return self.columns * self.square, self.rows * self.square
 
     @property
     def corners(self) -> NDArray[np.float64]:
-        """The inner corners of the chessboard in the board's frame (m), shape (n, 3)."""
+        """Inner corners of the chessboard in the board's frame (m), shape (n, 3)."""
         middle = np.array([*self.size, 0.0]) / 2
         return np.asarray(self.opencv().getChessboardCorners(), np.float64) - middle
 
     def opencv(self) -> "cv2.aruco.CharucoBoard":
-        """This board as an object of OpenCV, whose origin is the top left corner."""
+        """Return the board as an object of OpenCV. The origin of its frame is the top left corner of the board."""
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._markers())
 
     def _markers(self) -> "cv2.aruco.Dictionary":
@@ -88,35 +95,35 @@ class Board:
 
 @dataclasses.dataclass(frozen=True)
 class FoundCorners:
-    """The corners of a board that an image shows."""
+    """The corners of a board that were found in an image."""
 
-    numbers: NDArray[np.int64]  # (n,) rows of `Board.corners`
-    pixels: NDArray[np.float64]  # (n, 2) raw pixel coordinates
+    numbers: NDArray[np.int64]  # row of each corner in `Board.corners`, shape (n,)
+    pixels: NDArray[np.float64]  # raw pixel coordinates (column, row) of each corner, shape (n, 2)
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """A calibrated lens, and the evidence for it."""
+    """A calibrated lens and measures of its quality."""
 
     lens: Lens
-    errors: tuple[float | None, ...]  # pixels, root mean square of each image's reprojection errors, None: not used
+    errors: tuple[float | None, ...]  # root mean square of each image's reprojection errors (pixels), None: not used
     corners: tuple[int, ...]  # number of corners found in each image
-    largest_angle: float  # rad, of all corners from the optical axis. Beyond it, the lens is extrapolated
+    largest_angle: float  # largest angle of a corner from the optical axis, beyond which the lens is extrapolated (rad)
 
 
 def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)) -> NDArray[np.uint8]:
-    """A page of A4 with the board, its dimensions, a frame to cut along, and a ruler of 100 mm.
+    """Draw an A4 page with the board, its dimensions, a frame to cut along, and a ruler of 100 mm.
 
     Args:
-        board: the board.
-        outline: width and height of the frame around the board (m). If it equals the pad, the sheet lies in the middle
-            of the pad when their edges match.
+        board: The board to draw.
+        outline: Width and height of the frame around the board (m). Choose the size of the pad: if the edges of the
+            cut sheet lie on the edges of the pad, the board is centred on the pad.
 
     Returns:
-        Grey image with 10 pixels per mm, shape (2970, 2100).
+        Grey image with 10 pixels per mm, shape (2970, 2100), uint8.
 
     Raises:
-        ValueError: the board does not fit into the frame, or the frame does not fit on the page.
+        ValueError: The board does not fit into the frame, or the frame does not fit on the page.
     """
     frame = [round(1000 * side * _PIXELS_PER_MM) for side in outline]
     pixels = [round(1000 * side * _PIXELS_PER_MM) for side in board.size]
@@ -155,21 +162,21 @@ def save_board(
     *,
     outline: tuple[float, float] = (0.15, 0.15),
 ) -> None:
-    """Write `board_image` to a file that prints at its true size.
+    """Write the page of `board_image` to a file that prints at its true size.
 
     Args:
-        path: path of a PDF or PNG file.
-        board: the board.
-        outline: see `board_image`.
+        path: Path of the file, ending in .pdf or .png.
+        board: The board to draw.
+        outline: Width and height of the frame around the board (m).
 
     Raises:
-        ValueError: the path ends in neither .pdf nor .png, or see `board_image`.
-        OSError: the file cannot be written.
+        ValueError: The path has another ending, or the board does not fit into the frame or the frame on the page.
+        OSError: The file cannot be written.
     """
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in (".pdf", ".png"):
-        raise ValueError(f"the board can be written as .pdf or .png, got {path}")
+        raise ValueError(f"path must end in .pdf or .png, got {path}")
     page = Image.fromarray(board_image(board, outline=outline))
     dots_per_inch = 25.4 * _PIXELS_PER_MM
 
@@ -186,11 +193,11 @@ def find_board(image: NDArray[np.uint8], board: Board = Board()) -> FoundCorners
     """Find the corners of a board in a raw image.
 
     Args:
-        image: raw image, RGB or grey, uint8.
-        board: the printed board.
+        image: Raw image, shape (height, width, 3) for RGB or (height, width) for grey, uint8.
+        board: The printed board.
 
     Returns:
-        The corners that were found, or none.
+        The corners that were found. There may be none.
     """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     parameters = cv2.aruco.DetectorParameters()
@@ -209,28 +216,30 @@ def calibrate(
     on_pad: int = 0,
     largest_error: float = 1.0,
 ) -> Calibration:
-    """Calibrate a lens and its place in the sensor from images of a board.
+    """Calibrate a lens and the camera's pose in the sensor from images of a board.
 
-    In one image the board lies on the gel's outer face with its print towards the camera, centred on the pad and with
-    its edges parallel to the pad's. Which of its edges is at the top does not matter. In the other images the board has
-    different distances, places and tilts.
+    In one image, the board must lie on the gel's outer face with its print towards the camera. It must be centred on
+    the pad, with its edges parallel to the edges of the pad. Any of its four edges may be at the top. In the other
+    images, the board must have different distances, positions and tilts.
 
-    The fit minimises the sum of squared distances (with a soft L1 loss) between the corners that were found and their
-    projections, over the lens and one pose of the board per image.
+    The fit determines the lens and the pose of the board in each image. It minimises a soft L1 loss of the differences
+    between the pixel coordinates of the corners that were found and of their projections. A weak prior keeps the
+    coefficients k of the lens small.
 
     Args:
-        images: raw images of one camera, RGB or grey, uint8, all of one size.
-        board: the printed board.
-        on_pad: index of the image in which the board lies on the pad.
-        largest_error: largest root mean square of the reprojection errors of an image (pixels).
+        images: Raw images of one camera, all of one size, shape (height, width, 3) for RGB or (height, width) for grey,
+            uint8. At least 6 must show at least 12 corners of the board.
+        board: The printed board.
+        on_pad: Index in `images` of the image in which the board lies on the pad.
+        largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Returns:
-        The lens, whose pose is that of the pad, and the errors of each image.
+        The lens with the camera's pose relative to the pad, and the errors of each image.
 
     Raises:
-        CalibrationError: too few images show the board, the board on the pad is not found or not parallel to the image,
-            the boards are too similar, or the error of an image is too large.
-        ValueError: the images have different sizes or are not uint8, or `on_pad` is no index of an image.
+        CalibrationError: Too few images show the board, the board on the pad is not found or not parallel to the image,
+            the boards are nearly parallel in all images, or the error of an image is too large.
+        ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
     """
     height, width = _common_size(images)
     found = [find_board(image, board) for image in images]
@@ -245,21 +254,22 @@ def fit_lens(
     on_pad: int = 0,
     largest_error: float = 1.0,
 ) -> Calibration:
-    """The part of `calibrate` that follows `find_board`, for corners that were found while the images were taken.
+    """Calibrate a lens as `calibrate` does, but from corners that `find_board` has found already.
 
     Args:
-        found: the corners of each image.
-        size: width and height of the raw images (pixels).
-        board: see `calibrate`.
-        on_pad: see `calibrate`.
-        largest_error: see `calibrate`.
+        found: Corners of the board in each image.
+        size: Width and height of the raw images (pixels).
+        board: The printed board.
+        on_pad: Index in `found` of the image in which the board lies on the pad.
+        largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Returns:
-        See `calibrate`.
+        The lens with the camera's pose relative to the pad, and the errors of each image.
 
     Raises:
-        CalibrationError: see `calibrate`.
-        ValueError: `on_pad` is no index of an image.
+        CalibrationError: Too few images show the board, the board on the pad is not found or not parallel to the image,
+            the boards are nearly parallel in all images, or the error of an image is too large.
+        ValueError: `on_pad` is not the index of an image.
     """
     width, height = size
     if not 0 <= on_pad < max(1, len(found)):
@@ -288,12 +298,12 @@ def fit_lens(
 
 @dataclasses.dataclass(frozen=True)
 class _Views:
-    """The corners of all usable images in one list."""
+    """The corners of all usable images, concatenated."""
 
-    image: NDArray[np.int64]  # (n,) index of the usable image
-    points: NDArray[np.float64]  # (n, 3) board frame (m)
-    pixels: NDArray[np.float64]  # (n, 2)
-    number: int  # usable images
+    image: NDArray[np.int64]  # index of each corner's image among the usable images, shape (n,)
+    points: NDArray[np.float64]  # position of each corner in the board's frame (m), shape (n, 3)
+    pixels: NDArray[np.float64]  # raw pixel coordinates of each corner, shape (n, 2)
+    number: int  # number of usable images
 
     @classmethod
     def of(cls, found: list[FoundCorners], board: Board) -> "_Views":
@@ -308,21 +318,23 @@ class _Views:
 
 @dataclasses.dataclass(frozen=True)
 class _Fit:
-    """A lens and the poses of the boards, as the unknowns of the fit."""
+    """A lens and the pose of the board in each image, with the residuals of the corners."""
 
-    focal: tuple[float, float]  # pixels per radian
-    center: tuple[float, float]  # pixels
-    k: tuple[float, float, float, float]
-    poses: NDArray[np.float64]  # (images, 6) rotation vector and translation from the board to the camera
-    residuals: NDArray[np.float64]  # (n, 2) pixels
-    largest_angle: float  # rad
+    focal: tuple[float, float]  # fx and fy (pixels per radian)
+    center: tuple[float, float]  # cx and cy (pixels)
+    k: tuple[float, float, float, float]  # k1 to k4 of the lens
+    poses: NDArray[np.float64]  # rotation vector (rad) and translation (m) from board to camera, shape (images, 6)
+    residuals: NDArray[np.float64]  # projections minus found corners (pixels), shape (n, 2)
+    largest_angle: float  # largest angle of a corner from the optical axis (rad)
 
     @property
     def unknowns(self) -> NDArray[np.float64]:
+        """Focal lengths, centre, k and poses as one vector, shape (8 + 6 images,)."""
         return np.concatenate([self.focal, self.center, self.k, self.poses.ravel()])
 
     @classmethod
     def of(cls, views: _Views, unknowns: NDArray[np.float64]) -> "_Fit":
+        """Project the corners with a vector of unknowns and compute the residuals."""
         fx, fy, cx, cy, k1, k2, k3, k4 = unknowns[:8].tolist()
         poses = unknowns[8:].reshape(-1, 6)
         matrices = Rotation.from_rotvec(poses[:, :3]).as_matrix()[views.image]
@@ -336,7 +348,7 @@ class _Fit:
 
 
 def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
-    """The best equidistant lens among those of several fields of view, with a pose for each board."""
+    """The equidistant lens of the field of view in `_STARTS` that fits best, with a pose of the board in each image."""
     best: _Fit | None = None
     for field_of_view in _STARTS:
         focal, middle = math.hypot(width, height) / field_of_view, ((width - 1) / 2, (height - 1) / 2)
@@ -361,13 +373,15 @@ def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
                 best = fit
     if best is None:
         raise CalibrationError(
-            "no pose of the boards fits their corners. Check that the board's numbers of squares and its dictionary "
-            "are those of the print, and take images with more of the board in view."
+            "no pose of the board fits the corners that were found. Check that the numbers of squares and the "
+            "dictionary of `board` are those of the printed board, and take images with more of the board in view."
         )
     return best
 
 
 def _fitted(views: _Views, start: _Fit) -> _Fit:
+    """Minimise the residuals of the corners and of the prior, beginning at `start`."""
+
     def residuals(unknowns: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.concatenate([_Fit.of(views, unknowns).residuals.ravel(), _PRIOR * unknowns[4:8]])
 
@@ -376,9 +390,9 @@ def _fitted(views: _Views, start: _Fit) -> _Fit:
 
 
 def _common_size(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int]:
-    """Height and width of all images."""
+    """Height and width of the images, or an error if they have different sizes or another type."""
     if not images:
-        raise CalibrationError("there are no images. Take some with the board in different poses.")
+        raise CalibrationError("there are no images. Take images with the board in different poses.")
     for i, image in enumerate(images):
         if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
             raise ValueError(
@@ -388,13 +402,13 @@ def _common_size(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int]:
     sizes = {image.shape[:2] for image in images}
     if len(sizes) > 1:
         names = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
-        raise ValueError(f"the images must have one size, got {names}. Take all of them with the same settings.")
+        raise ValueError(f"the images must all have one size, got {names}. Take all of them with the same settings.")
     height, width = images[0].shape[:2]
     return height, width
 
 
 def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
-    """The images that show enough of the board, among them that of the board on the pad."""
+    """The indices of the images with enough corners. Raises an error if they are too few or `on_pad` is missing."""
     used = [i for i, count in enumerate(counts) if count >= FEWEST_CORNERS]
     missing = [i for i, count in enumerate(counts) if count == 0]
     few = [f"{i} ({count} corners)" for i, count in enumerate(counts) if 0 < count < FEWEST_CORNERS]
@@ -404,46 +418,57 @@ def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
     if few:
         lacking += f" Fewer than {FEWEST_CORNERS} corners were found in {_listed(few)}."
     remedy = (
-        " Check that the board is the printed one, that it is sharp, evenly lit and not overexposed, and that most of "
-        "it is in view."
+        " Check that `board` describes the printed board, that the board is sharp, evenly lit and not overexposed, and "
+        "that most of it is in view."
     )
     if on_pad not in used:
         raise CalibrationError(
-            f"image {on_pad}, in which the board lies on the pad, shows {counts[on_pad]} of its corners, but "
+            f"image {on_pad}, in which the board lies on the pad, shows {counts[on_pad]} of its corners, but at least "
             f"{FEWEST_CORNERS} are needed.{lacking}{remedy}"
         )
     if len(used) < FEWEST_IMAGES:
         raise CalibrationError(
-            f"only {len(used)} of {len(counts)} images show enough of the board, but {FEWEST_IMAGES} are needed."
-            f"{lacking}{remedy}"
+            f"only {len(used)} of {len(counts)} images show enough of the board, but at least {FEWEST_IMAGES} are "
+            f"needed.{lacking}{remedy}"
         )
     return used
 
 
 def _check_errors(errors: list[float | None], largest: float) -> None:
+    """Raise an error if the reprojection error of an image is too large."""
     bad = [f"{i} ({error:.2f} pixels)" for i, error in enumerate(errors) if error is not None and error > largest]
     if bad:
         raise CalibrationError(
-            f"the reprojection error is larger than {largest:g} pixels in {_listed(bad)}. If these are few, leave them "
-            "out: the board moved or the image is blurred. If they are most, check that the board is flat, that its "
-            "squares measure what `Board.square` states, and that focus and image size did not change in between."
+            f"the reprojection error is larger than {largest:g} pixels in {_listed(bad)}. If only a few images are "
+            "listed, leave them out, because the board moved or the image is blurred. If most images are listed, check "
+            "that the board is flat, that its squares have the size `Board.square`, and that focus and image size were "
+            "the same for all images."
         )
 
 
 def _check_tilts(poses: NDArray[np.float64]) -> None:
+    """Raise an error if the boards are nearly parallel in all images."""
     normals = Rotation.from_rotvec(poses[:, :3]).as_matrix()[:, :, 2]
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
             f"the boards of all images are parallel within {math.degrees(spread):.0f} degrees, so the focal length is "
-            f"not determined. Hold the board with tilts of 20 to 40 degrees to different sides in some images."
+            "not determined. Hold the board with tilts of 20 to 40 degrees to different sides in some images."
         )
 
 
 def _pose_on_pad(
     pose: NDArray[np.float64], index: int
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """The sensor frame is that of the board on the pad, turned by quarters until x points to the image's right."""
+    """The rotation vector and the translation from the sensor frame to the camera frame.
+
+    The sensor frame is the frame of the board on the pad, turned by a multiple of 90 degrees so that x points to the
+    right of the image.
+
+    Args:
+        pose: Rotation vector (rad) and translation (m) from the board on the pad to the camera, shape (6,).
+        index: Index of the image, for error messages.
+    """
     board = Rotation.from_rotvec(pose[:3])
     turns = [board * Rotation.from_euler("z", quarter * math.pi / 2) for quarter in range(4)]
     sensor = max(turns, key=lambda turn: turn.as_matrix()[0, 0])
@@ -461,8 +486,10 @@ def _pose_on_pad(
 
 
 def _listed(names: Sequence[object]) -> str:
+    """A text such as "images 2, 5"."""
     return f"image{'s' if len(names) > 1 else ''} {', '.join(map(str, names))}"
 
 
 def _mm(size: Sequence[float]) -> str:
+    """A size in m as a text such as "150 mm x 150 mm"."""
     return " x ".join(f"{1000 * side:g} mm" for side in size)

@@ -1,4 +1,4 @@
-"""`collect`: sensor, guide and session together. A person, or a program in place of one, sees views and acts."""
+"""`collect`: the loop that reads a sensor, guides a person, and saves trajectories in a session."""
 
 import dataclasses
 import enum
@@ -24,61 +24,62 @@ _PASSING = (
 
 
 class Action(enum.Enum):
-    """What a person can do."""
+    """The actions of the person who collects trajectories."""
 
-    CONFIRM = "confirm"
-    DISCARD = "discard"
-    STOP = "stop"
+    CONFIRM = "confirm"  # confirm the current stage: the pad is empty, the object is released, the trajectory is good
+    DISCARD = "discard"  # discard the current trajectory
+    STOP = "stop"  # end the collection
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
-    """What a person sees."""
+    """The information that is shown to the person."""
 
-    pair: Pair | None  # the newest images, None: there are none yet
-    stage: Stage
-    instruction: str
-    contact: bool
-    still: bool
-    number: int | None  # of the current trajectory, None: its initial pair was not taken yet
-    confirmed: int  # trajectories of the session that are confirmed and on disk
-    waiting: int  # changes that are not on disk yet
-    problem: str | None  # why it does not go on
-    initial: Pair | None  # of the current trajectory
-    final: Pair | None  # of the current trajectory
+    pair: Pair | None  # newest pair of images, None: there is none yet
+    stage: Stage  # current stage of the guide
+    instruction: str  # instruction for the person, as text
+    contact: bool  # True if the last tactile image shows a contact
+    still: bool  # True if nothing moves
+    number: int | None  # number of the current trajectory, None: its initial pair was not taken yet
+    confirmed: int  # number of trajectories of the session that are confirmed and on disk
+    waiting: int  # number of changes of the session that are not on disk yet
+    problem: str | None  # message of the error that prevents collecting at present, or None
+    initial: Pair | None  # initial pair of the current trajectory, None: not taken yet
+    final: Pair | None  # final pair of the current trajectory, None: not taken yet
 
 
 @runtime_checkable
 class PairReader(Protocol):
-    """What takes pairs of images: `STS`, or the digital twin's `VirtualSensor`."""
+    """A sensor that returns pairs of images, such as `STS` or the digital twin's `VirtualSensor`."""
 
     def read(self) -> Pair:
-        """Take an image of each stream. Both arrive after the call."""
+        """Return an image of each stream. Both arrive after the call."""
 
 
 @runtime_checkable
 class Person(Protocol):
-    """Shows views and returns actions. Neither method may wait."""
+    """The interface to the person who collects, such as a web page or a terminal. Its methods must not wait."""
 
     def show(self, view: View) -> None:
-        """Show a view, about as often as pairs are taken."""
+        """Show the current view. `collect` calls this method after each attempt to read a pair."""
 
     def action(self) -> Action | None:
-        """The next action, or None. It refers to the last view."""
+        """Return the next action of the person, or None. The action refers to the last view."""
 
 
 class AutomaticPerson:
-    """Confirms every trajectory. The object must be moved by something else, such as a digital twin."""
+    """A program in place of a person, which confirms every trajectory. Something else must move the object."""
 
     def __init__(self) -> None:
+        """Create a person who has seen no view yet."""
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Note the stage."""
+        """Store the stage of the view."""
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Confirm in the review."""
+        """Return `CONFIRM` in the stage `REVIEW`, else None."""
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 
 
@@ -94,25 +95,30 @@ def collect(
     note: str = "",
     patience_s: float = 60.0,
 ) -> int:
-    """Collect trajectories until the person stops, or until there are enough.
+    """Collect trajectories until the person stops, or until the session has enough of them.
 
     Args:
-        sensor: A connected sensor.
-        session: Where the pairs are saved. It stays open.
-        person: Shows the instructions, confirms and discards.
-        config: Thresholds and times of the guide.
-        empty: The empty pad, from the backgrounds of a sensor file. None: measured at the start.
-        trusted: Whether the pad is empty at the start. Otherwise the person has to confirm it if `empty` is None.
-        count: Number of confirmed trajectories in the session, earlier ones included, after which collecting ends.
-        note: Stored with each trajectory.
-        patience_s: Longest time without images (s), during which lost devices may return. The person sees the problem.
+        sensor: Connected sensor.
+        session: Session in which the trajectories are saved. It stays open.
+        person: Interface that shows the instructions and returns the person's actions.
+        config: Thresholds and times of the guide. None: the defaults of `GuideConfig`.
+        empty: The empty pad, made with `known_pad` from the backgrounds of a sensor file. None: it is measured at the
+            beginning.
+        trusted: True if the pad is certainly empty at the beginning. If False and `empty` is None, the person has to
+            confirm that it is empty.
+        count: Number of confirmed trajectories in the session, earlier ones included, at which collecting ends. None:
+            no limit.
+        note: Text that is stored with each trajectory.
+        patience_s: Longest time without images (s). A lost camera or controller can return during this time, and the
+            person sees the error.
 
     Returns:
-        The number of trajectories that were confirmed during this call.
+        Number of trajectories that were confirmed during this call.
 
     Raises:
-        LightError, LedError, CameraError: As in `STS.read`, for longer than `patience_s`.
-        SessionError: Something cannot be written, and too much is waiting.
+        LightError, LedError, CameraError: `sensor.read` failed for longer than `patience_s`, or with an error from
+            which it cannot recover.
+        SessionError: A change of the session cannot be written, or too many changes wait.
     """
     return _Collecting(sensor, session, person, config or GuideConfig(), note).run(
         guide.start(empty, trusted=trusted), count, patience_s
@@ -120,17 +126,18 @@ def collect(
 
 
 class _Collecting:
-    """The loop of `collect`."""
+    """The state of `collect` and its loop."""
 
     def __init__(self, sensor: PairReader, session: Session, person: Person, config: GuideConfig, note: str):
         self._sensor, self._session, self._person = sensor, session, person
         self._config, self._note = config, note
-        self._pair: Pair | None = None  # the newest one
-        self._number: int | None = None
-        self._ends: dict[guide.End, Pair] = {}
-        self._confirmed = 0
+        self._pair: Pair | None = None  # the newest pair
+        self._number: int | None = None  # number of the current trajectory
+        self._ends: dict[guide.End, Pair] = {}  # pairs of the current trajectory
+        self._confirmed = 0  # trajectories that were confirmed in this loop
 
     def run(self, state: guide.State, count: int | None, patience_s: float) -> int:
+        """Run the loop, and return the number of trajectories that were confirmed in it."""
         before = self._session.confirmed
         failing_since: float | None = None
         while count is None or before + self._confirmed < count:
@@ -158,7 +165,7 @@ class _Collecting:
         return self._confirmed
 
     def _not_ready(self, state: guide.State) -> str | None:
-        """Why no trajectory can begin."""
+        """The error of the session that prevents a new trajectory, or None."""
         if state.stage not in (Stage.CLEAR, Stage.PLACE):
             return None
         try:
@@ -168,11 +175,11 @@ class _Collecting:
         return None
 
     def _observed(self, state: guide.State, pair: Pair) -> guide.State:
-        """Step the guide, and save the pair of an end that was reached."""
+        """Advance the guide by a pair, and save the previous pair if it is an initial or a final one."""
         time_s = max(pair.visual.time_s, pair.tactile.time_s)
         state, end = guide.step(self._config, state, guide.observe(time_s, pair.visual.image, pair.tactile.image))
         if end is not None:
-            assert self._pair is not None  # an end needs a window of several pairs
+            assert self._pair is not None  # the guide needs several pairs before it reports one to save
             if self._number is None:
                 self._number = self._session.begin()
             self._session.save(self._number, end, self._pair)
@@ -182,6 +189,7 @@ class _Collecting:
         return state
 
     def _acted(self, state: guide.State, action: Action) -> guide.State:
+        """Apply the person's action to the session and to the guide."""
         if action is Action.CONFIRM:
             if state.stage is Stage.REVIEW and self._number is not None:
                 self._session.confirm(self._number, self._note)
@@ -194,6 +202,7 @@ class _Collecting:
         return guide.discard(state)
 
     def _forget(self) -> None:
+        """End the current trajectory, which was confirmed, discarded or not begun."""
         self._number, self._ends = None, {}
 
     def _view(self, state: guide.State, problem: str | None) -> View:

@@ -1,4 +1,4 @@
-"""Whether a lens and its calibration cover the sensor's view."""
+"""Checks that the raw images and the calibration of a lens cover the whole view of the sensor."""
 
 import math
 from collections.abc import Sequence
@@ -8,10 +8,10 @@ import numpy as np
 from sts_jax.hardware.calibration import CalibrationError, FoundCorners
 from sts_jax.hardware.lens import Lens, Pinhole, rectification, window
 
-_RESOLUTION = 480, 640  # pixels of the view at which it is checked
-_EXTRAPOLATION = math.radians(3)  # by which the view may exceed the corners of all boards
-# Share of the image's width and height, from each border. Where a lens of 160 degrees sees the view's border. The board
-# on the pad ends before it.
+_RESOLUTION = 480, 640  # height and width of the view at which it is checked (pixels)
+_EXTRAPOLATION = math.radians(3)  # largest angle by which the view may exceed the corners of all boards (rad)
+# Share of the image's width and height that belongs to each outer part. A lens of 160 degrees shows the border of the
+# view there, and a board on the pad does not reach it.
 _OUTER = 0.2
 _ROWS = "top", "middle", "bottom"
 _COLUMNS = "left", "centre", "right"
@@ -19,7 +19,12 @@ PARTS = tuple(f"{row} {column}" for row in _ROWS for column in _COLUMNS)
 
 
 def view_angle(lens: Lens, pinhole: Pinhole) -> float:
-    """The largest angle between the optical axis of a lens and a ray of the sensor's view (rad)."""
+    """Return the largest angle between the optical axis of a lens and a ray of the sensor's view (rad).
+
+    Args:
+        lens: The lens and the pose of the camera.
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+    """
     left, top, width, height = window(pinhole, _RESOLUTION)
     corners = np.array([(x, y, 0.0) for x in (left, left + width) for y in (top, top + height)])
     seen = corners @ lens.matrix.T + np.asarray(lens.translation)
@@ -27,22 +32,24 @@ def view_angle(lens: Lens, pinhole: Pinhole) -> float:
 
 
 def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None) -> None:
-    """Raise an error unless the raw image shows the whole view, and the boards of the calibration reached its corners.
+    """Raise an error unless the raw images show the sensor's whole view and the lens is calibrated up to its corners.
 
     Args:
-        lens: the camera.
-        pinhole: the sensor's view.
-        largest_angle: `Calibration.largest_angle` (rad). The view may exceed it by 3 degrees. None: not compared.
+        lens: The lens and the pose of the camera.
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+        largest_angle: Largest angle of a corner in the calibration, `Calibration.largest_angle` (rad). The view may
+            exceed this angle by 3 degrees. None: the angles are not compared.
 
     Raises:
-        CalibrationError: a part of the view is outside of the raw image, or beyond the corners of all boards.
+        CalibrationError: A part of the view lies outside of the raw image, or the view exceeds `largest_angle` by more
+            than 3 degrees, or it contains rays beyond `Lens.largest_angle`.
     """
     needed = view_angle(lens, pinhole)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
         raise CalibrationError(
-            f"the corners of the board reach {math.degrees(largest_angle):.1f} degrees from the optical axis, but the "
-            f"corners of the sensor's view are at {math.degrees(needed):.1f} degrees. Take more pictures with the "
-            "board in the corners of the image."
+            f"in the calibration, the corners of the board reach {math.degrees(largest_angle):.1f} degrees from the "
+            f"optical axis, but the corners of the sensor's view are at {math.degrees(needed):.1f} degrees. Take more "
+            "images with the board in the corners of the image, and calibrate again."
         )
     try:
         pixels = rectification(lens, pinhole, _RESOLUTION)
@@ -60,14 +67,17 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
 
 
 def covered(found: Sequence[FoundCorners], size: tuple[int, int]) -> tuple[str, ...]:
-    """The parts of the raw image that contain corners of a board: the middle, and the outer fifths at the borders.
+    """Return the parts of the raw image in which corners of a board were found.
+
+    The image is divided into 3 x 3 parts. The outer parts are a fifth of the image wide and high, and the middle ones
+    three fifths.
 
     Args:
-        found: the corners of each image.
-        size: width and height of the raw images (pixels).
+        found: Corners of the board in each image.
+        size: Width and height of the raw images (pixels).
 
     Returns:
-        Names such as "top left", in the order of `coverage.PARTS`.
+        Names of the parts, such as "top left" or "middle centre", in reading order.
     """
     pixels = np.concatenate([np.zeros((0, 2)), *(corners.pixels for corners in found)])
     thirds = np.digitize((pixels + 0.5) / np.asarray(size), [_OUTER, 1 - _OUTER])

@@ -1,6 +1,6 @@
-"""The LED controller's behaviour without a board: lines in, lines out, on a clock that the caller chooses.
+"""A software emulation of the LED controller: it answers lines of the protocol, on a clock that the caller supplies.
 
-The tests compare it with the firmware, which runs in a simulator of its chip.
+The tests compare its answers with the answers of the firmware, which they run in a simulator of the chip.
 """
 
 from sts_jax.hardware import protocol
@@ -15,30 +15,30 @@ _TEXTS = {
 
 
 class EmulatedController:
-    """A controller of the protocol. It is neither thread-safe nor connected to a port."""
+    """An emulated LED controller. It is not connected to a port, and it is not thread-safe."""
 
     def __init__(self, *, now_s: float = 0.0, boot: int = 1, serial_number: str = "EMULATED"):
-        """Boot with all lights off.
+        """Boot the controller with all lights off.
 
         Args:
-            now_s: Time of the boot (s), on the clock of all later calls.
+            now_s: Time of the boot, on the same clock as in all later calls (s).
             boot: Number of the boot, 0 to 65535. A real controller counts its boots.
-            serial_number: At most 16 letters, digits, dots, hyphens and underscores.
+            serial_number: Serial number of the controller, at most 16 letters, digits, dots, hyphens and underscores.
         """
-        self.levels = protocol.DARK
-        self.counter = 0
+        self.levels = protocol.DARK  # levels that are applied now
+        self.counter = 0  # number of changes of the levels since the boot
         self.boot = boot
-        self.watch_ms = protocol.DEFAULT_WATCH_MS
+        self.watch_ms = protocol.DEFAULT_WATCH_MS  # period of the watchdog (ms)
         self._serial_number = serial_number
-        self._boot_s = self._valid_s = now_s
-        self._pending = b""
+        self._boot_s = self._valid_s = now_s  # times of the boot and of the last valid request (s)
+        self._pending = b""  # bytes of an incomplete line
         self._answered: tuple[bytes, bytes] | None = None  # the last request that was executed, and its answer
 
     def receive(self, data: bytes, now_s: float) -> bytes:
-        """Take bytes of the host.
+        """Process bytes from the host and return the controller's answers.
 
         Args:
-            data: Any number of bytes. An incomplete line is kept until its rest comes.
+            data: Any number of bytes. An incomplete line is kept until the rest of the line arrives.
             now_s: Current time (s).
 
         Returns:
@@ -50,13 +50,21 @@ class EmulatedController:
         return sent + b"".join(self._answer(line + b"\n", now_s) for line in lines if line)
 
     def tick(self, now_s: float) -> bytes:
-        """Let time pass. Returns the line of the watchdog if it turned the lights off, or no bytes."""
+        """Turn the lights off if the watchdog's period has passed without a valid request.
+
+        Args:
+            now_s: Current time (s).
+
+        Returns:
+            The line that reports this, or no bytes if the watchdog did nothing.
+        """
         if self.levels == protocol.DARK or now_s - self._valid_s < self.watch_ms / 1000:
             return b""
         self._apply(protocol.DARK)
         return protocol.encode_reply(protocol.TurnedOff(self.counter))
 
     def _answer(self, line: bytes, now_s: float) -> bytes:
+        """The reply to one line. A repeated line gets the same reply again and is not executed."""
         if self._answered is not None and line == self._answered[0]:
             self._valid_s = now_s
             return self._answered[1]

@@ -1,4 +1,4 @@
-"""The exposure with which a stream is bright and not saturated."""
+"""Search for the camera exposure at which the images of a stream are bright but not saturated."""
 
 import time
 from typing import NamedTuple
@@ -9,42 +9,49 @@ from jaxtyping import UInt8
 from sts_jax.hardware.camera import Camera
 from sts_jax.hardware.camera_errors import CameraError
 
-SATURATED = 250.0  # of 255, brightness from which details are lost
+SATURATED = 250.0  # brightness of 255 from which details are lost
 _PERCENTILE = 99
-_WANTED = 200.0  # of 255
-_TOLERANCE = 25.0  # of 255
-_DARKER = 0.4  # factor for a saturated image, whose true brightness is unknown
-_MOST = 4.0  # largest factor of one attempt
+_WANTED = 200.0  # wanted brightness, of 255
+_TOLERANCE = 25.0  # largest difference from the wanted brightness, of 255
+_DARKER = 0.4  # factor on the exposure of a saturated image, whose true brightness is unknown
+_MOST = 4.0  # largest factor on the exposure in one attempt
 _ATTEMPTS = 10
-LAG_S = 0.3  # s, after which frames have a new exposure
+LAG_S = 0.3  # time after which all frames have the new exposure (s)
 
 
 class Exposed(NamedTuple):
-    """An exposure and the image that it gives."""
+    """An exposure and the brightness of an image that was taken with it."""
 
-    exposure: float  # in the driver's unit
-    brightness: float  # see `brightness`
+    exposure: float  # exposure that is set, in the unit of the camera's driver
+    brightness: float  # result of the function `brightness` for this image, 0 to 255
 
 
 def brightness(image: UInt8[np.ndarray, "height width 3"]) -> float:
-    """The value that 99 % of the pixels do not exceed in their brightest channel, 0 to 255."""
+    """Return the 99th percentile of the pixels' brightest channels, 0 to 255.
+
+    Args:
+        image: RGB image.
+    """
     return float(np.percentile(image.max(axis=-1), _PERCENTILE))
 
 
 def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
-    """Set the exposure of a device so that its image is bright and not saturated.
+    """Set the exposure of a camera so that its images are bright but not saturated.
 
-    The exposure is changed in proportion until `brightness` is within 25 of 200, or until the driver goes no further.
+    The exposure is scaled until the `brightness` of an image is within 25 of 200, for at most 10 attempts. The search
+    also ends if the driver does not change the exposure any more.
 
     Args:
-        camera: The connected camera. The lights of the stream must be set.
-        longest: Largest exposure in the driver's unit. If it exceeds the time between two frames, the rate sinks.
+        camera: Connected camera whose driver can set the exposure. The lights of the stream must be on or off already.
+        longest: Largest allowed exposure, in the unit of the driver. An exposure that is longer than the time between
+            two frames lowers the frame rate.
 
     Returns:
-        The exposure that is set now. It may still be too dark, or saturated (`SATURATED`).
+        The exposure that is set now, and the brightness of its images. They may still be too dark or saturated
+        (brightness of at least 250).
 
     Raises:
-        CameraError: The driver does not let the exposure be set, or there are no frames.
+        CameraError: The driver does not allow setting the exposure, or the camera sends no frames.
     """
     found = camera.set_exposure(min(camera.locked.get("exposure") or longest, longest))
     for _ in range(_ATTEMPTS):
@@ -60,6 +67,8 @@ def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
         if found == before:
             return Exposed(found, seen)
     if found is None:
-        raise CameraError(f"the driver of {camera.config.name} does not let the exposure be set.")
+        raise CameraError(
+            f"the driver of {camera.config.name} does not let the exposure be set: use the camera's own exposure."
+        )
     time.sleep(LAG_S)
     return Exposed(found, brightness(camera.read().image))

@@ -1,8 +1,11 @@
-"""The states through which a person is guided in one trajectory: a pure function of images and time, without devices.
+"""The guide: it decides from images what a person has to do next while collecting a trajectory.
 
-An object is placed on the pad and held (`PLACE`, `HOLD`), released (`RELEASE`), and left until it rests (`STILL`). All
-decisions use the means of blocks (24 rows of 32), so that noise of single pixels hardly counts, and thresholds that
-follow the noise of these means on the empty pad.
+The guide is a pure function of a state and a pair of images, and needs no devices. The person places an object on the
+pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests (`STILL`).
+
+Each image is divided into 24 rows of 32 blocks, and all decisions use the means of these blocks, in which the noise of
+single pixels averages out. A block has changed if its mean differs by more than a threshold, which is a multiple of the
+noise of this mean on the empty pad.
 """
 
 import dataclasses
@@ -17,20 +20,20 @@ from jaxtyping import Float, UInt8
 from sts_jax.hardware.settling import thumbnail
 
 Blocks = Float[np.ndarray, "24 32 3"]  # means of an image's blocks, 0 to 255
-End = Literal["initial", "final"]
+End = Literal["initial", "final"]  # "initial": the pair of the held object, "final": the pair of the object at rest
 
-_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
-_KEPT = 16  # newest pairs of a window that are kept
+_NORMAL = 1.4826  # ratio of the standard deviation to the median absolute deviation of a normal distribution
+_KEPT = 16  # number of earlier observations that are kept in `State.window` besides its first one
 
 
 class Stage(enum.Enum):
-    """What the person has to do."""
+    """The stages of a trajectory. Each one is an instruction for the person."""
 
     CLEAR = "clear"  # take everything off the pad
     PLACE = "place"  # place the object on the pad
-    HOLD = "hold"  # hold it still
-    RELEASE = "release"  # release it
-    STILL = "still"  # wait until it rests
+    HOLD = "hold"  # hold the object still
+    RELEASE = "release"  # release the object
+    STILL = "still"  # wait until the object rests
     REVIEW = "review"  # confirm or discard the trajectory
 
 
@@ -39,19 +42,19 @@ class GuideConfig:
     """Thresholds and times of the guide.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: A value is out of range.
     """
 
-    deviations: float = 6.0  # standard deviations of a block's mean by which a change exceeds the noise
-    smallest_change: float = 3.0  # of 255, change of a block below which nothing counts, however low the noise is
-    largest_threshold: float = 24.0  # of 255, to which the noise may raise the threshold
-    contact_blocks: int = 3  # blocks of the tactile image that differ from the empty pad in a contact
-    watched: Literal["both", "tactile"] = "both"  # streams in which a movement counts
-    empty_s: float = 0.5  # s without movement after which the pad counts as empty
-    hold_s: float = 0.5  # s without movement before the initial pair is taken
-    rest_s: float = 1.0  # s without movement before the final pair is taken
-    pairs: int = 4  # smallest number of pairs in each of these times
-    hint_s: float = 10.0  # s in one stage after which a hint is shown
+    deviations: float = 6.0  # threshold of a block's change, in standard deviations of the noise of the block's mean
+    smallest_change: float = 3.0  # lower limit of the threshold of a block's change, of 255
+    largest_threshold: float = 24.0  # upper limit of the threshold of a block's change, of 255
+    contact_blocks: int = 3  # least number of blocks of the tactile image that differ from the empty pad in a contact
+    watched: Literal["both", "tactile"] = "both"  # streams in which movements are detected
+    empty_s: float = 0.5  # time without movement after which the pad counts as empty (s)
+    hold_s: float = 0.5  # time without movement before the initial pair is taken (s)
+    rest_s: float = 1.0  # time without movement before the final pair is taken (s)
+    pairs: int = 4  # least number of pairs of images in each of these times, at least 3
+    hint_s: float = 10.0  # time in one stage after which a hint is shown (s)
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -60,7 +63,7 @@ class GuideConfig:
                 raise ValueError(f"{field.name} must be > 0 and finite, got {value}")
         if self.watched not in ("both", "tactile"):
             raise ValueError(f"watched must be 'both' or 'tactile', got {self.watched!r}")
-        if self.pairs < 3:  # the pair that is taken lies between two others
+        if self.pairs < 3:  # the pair that is saved needs a pair before it and a pair after it
             raise ValueError(f"pairs must be >= 3, got {self.pairs}")
         if self.largest_threshold < self.smallest_change:
             raise ValueError(
@@ -70,60 +73,63 @@ class GuideConfig:
 
 
 class Observation(NamedTuple):
-    """A pair of images, reduced to block means."""
+    """The block means of a pair of images."""
 
-    time_s: float  # arrival of the later image, on any clock that increases (s)
-    visual: Blocks
-    tactile: Blocks
+    time_s: float  # arrival time of the later image, on any clock that increases (s)
+    visual: Blocks  # block means of the visual image
+    tactile: Blocks  # block means of the tactile image
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmptyPad:
-    """Block means of the pad without an object, and the standard deviations of their noise."""
+    """The block means of both streams when nothing is on the pad, and the noise of these means."""
 
-    visual: Blocks
-    tactile: Blocks
-    visual_noise: Blocks
-    tactile_noise: Blocks
+    visual: Blocks  # block means of the visual image
+    tactile: Blocks  # block means of the tactile image
+    visual_noise: Blocks  # standard deviations of the noise of `visual`
+    tactile_noise: Blocks  # standard deviations of the noise of `tactile`
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """State of the guide. Start with `start`."""
+    """The state of the guide. `start` makes the first one."""
 
-    stage: Stage
+    stage: Stage  # current stage
     since_s: float | None  # time of the first observation in this stage (s), None: there was none
-    now_s: float | None  # time of the last observation (s)
-    empty: EmptyPad | None  # None: not known yet
-    trusted: bool  # whether the pad is known to be empty in the stage CLEAR
-    contact: bool  # whether the tactile image of the last observation shows a contact
-    still: bool  # whether the last observation differs in nothing from the first one of the window
-    window: tuple[Observation, ...]  # since the last movement: the first observation and the newest ones
-    count: int  # observations in the window, with those that are no longer kept
-    initial: Observation | None  # the initial pair of the current trajectory
+    now_s: float | None  # time of the last observation (s), None: there was none
+    empty: EmptyPad | None  # the empty pad, None: not known yet
+    trusted: bool  # in the stage CLEAR: True if the person or the program has stated that the pad is empty
+    contact: bool  # True if the last tactile image shows a contact
+    still: bool  # True if nothing has moved between the first observation of the window and the last one
+    window: tuple[Observation, ...]  # observations since the last movement: the first one and the newest ones
+    count: int  # number of observations since the last movement, with the ones that are not kept in `window`
+    initial: Observation | None  # observation of the initial pair of the current trajectory, None: not taken yet
 
 
 def observe(
     time_s: float, visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]
 ) -> Observation:
-    """Reduce a pair of images to block means.
+    """Compute the block means of a pair of images.
 
     Args:
-        time_s: arrival of the later image (s).
-        visual: RGB image.
-        tactile: RGB image.
+        time_s: Arrival time of the later image (s).
+        visual: Raw visual image, RGB, of any size.
+        tactile: Raw tactile image, RGB, of any size.
     """
     return Observation(time_s, thumbnail(visual), thumbnail(tactile))
 
 
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
-    """Measure the empty pad from observations at rest.
+    """Measure the empty pad and its noise from several observations.
 
-    A block's noise is its own standard deviation, but at least the median one of its stream, because few observations
-    can underestimate it.
+    The noise of a block is the standard deviation of its means. Because few observations can underestimate it, it is at
+    least the median of the standard deviations of all blocks in the stream.
+
+    Args:
+        observations: At least two observations of the empty pad at rest.
 
     Raises:
-        ValueError: there are fewer than two observations.
+        ValueError: There are fewer than two observations.
     """
     if len(observations) < 2:
         raise ValueError(f"at least 2 observations are needed to measure the noise, got {len(observations)}")
@@ -134,22 +140,30 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
 
 
 def _noise(looks: Float[np.ndarray, "n 24 32 3"]) -> Blocks:
+    """The noise of each block mean, from the block means of n images."""
     deviation = looks.std(0, ddof=1)
     return np.maximum(deviation, np.median(deviation)).astype(np.float32)
 
 
 def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
-    """The empty pad from the background images of a sensor file, before its noise is measured."""
+    """Make an `EmptyPad` from the background images of a sensor file.
+
+    The noise in the result is 0, because one image does not show it. `step` measures the noise before each trajectory.
+
+    Args:
+        visual: Raw image of the empty pad without light, RGB.
+        tactile: Raw image of the empty pad with light, RGB.
+    """
     none = np.zeros_like(thumbnail(visual))
     return EmptyPad(thumbnail(visual), thumbnail(tactile), none, none)
 
 
 def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
-    """The state before the first trajectory.
+    """Make the state of the guide before the first trajectory.
 
     Args:
-        empty: the empty pad, if it is known.
-        trusted: whether the pad is empty now. Without that, and if `empty` is None, the guide waits for `confirm`.
+        empty: The empty pad, for example from `known_pad`. None: not known yet.
+        trusted: True if the pad is certainly empty now. If False and `empty` is None, the guide waits for `confirm`.
     """
     return State(Stage.CLEAR, None, None, empty, trusted, False, False, (), 0, None)
 
@@ -157,9 +171,15 @@ def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
 def step(config: GuideConfig, state: State, observation: Observation) -> tuple[State, End | None]:
     """Advance the guide by one observation.
 
+    Args:
+        config: Thresholds and times.
+        state: State after the previous observation.
+        observation: The new observation.
+
     Returns:
-        The new state, and the end of the trajectory that was reached. The pair of that end is the one before this
-        observation: it lies between others that are equal to it, so nothing moved while it was taken.
+        The new state, and "initial" or "final" if a pair of images is to be saved now, else None. The pair to save is
+        the one before `observation`. There is no movement between the pairs before and after it, so nothing moved while
+        it was taken.
     """
     moved = not state.window or not _same(config, state, state.window[0], observation)
     window = (observation,) if moved else (state.window[0], *state.window[1:][-_KEPT:], observation)
@@ -189,7 +209,7 @@ def step(config: GuideConfig, state: State, observation: Observation) -> tuple[S
 
 
 def _clear(config: GuideConfig, state: State) -> State:
-    """The stage `CLEAR`: the empty pad is measured anew each time, so that it follows slow changes of the light."""
+    """Advance the stage `CLEAR`. It measures the empty pad again each time, to follow slow changes of the light."""
     if state.empty is None and not state.trusted:
         return state
     if (state.contact and not state.trusted) or not _rested(config, state, config.empty_s):
@@ -198,9 +218,10 @@ def _clear(config: GuideConfig, state: State) -> State:
 
 
 def confirm(state: State) -> State:
-    """The person confirms: the pad is empty (`CLEAR`), the object is released (`RELEASE`), or the trajectory is good.
+    """Advance the guide after the person has confirmed.
 
-    In the other stages nothing changes.
+    A confirmation means that the pad is empty (stage `CLEAR`), that the object is released (`RELEASE`), or that the
+    trajectory is good (`REVIEW`). In the other stages, the state does not change.
     """
     match state.stage:
         case Stage.CLEAR:
@@ -213,38 +234,45 @@ def confirm(state: State) -> State:
 
 
 def discard(state: State) -> State:
-    """The person discards the current trajectory. Before the object is placed, nothing changes."""
+    """Return to the stage `CLEAR` because the person discards the trajectory. `CLEAR` and `PLACE` do not change."""
     return state if state.stage in (Stage.CLEAR, Stage.PLACE) else _enter(state, Stage.CLEAR)
 
 
 def interrupted(state: State) -> State:
-    """The devices were interrupted, so rest has to be observed anew."""
+    """Forget the observed time without movement, after images were missing because a device was interrupted."""
     return dataclasses.replace(state, window=(), count=0, still=False)
 
 
 def _enter(state: State, stage: Stage) -> State:
+    """The state at the beginning of a stage."""
     initial = None if stage in (Stage.CLEAR, Stage.PLACE) else state.initial
     return dataclasses.replace(state, stage=stage, since_s=state.now_s, window=(), count=0, initial=initial)
 
 
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
-    """Whether the tactile image shows a contact.
+    """Return True if the tactile image shows a contact.
 
-    The median difference of all blocks is subtracted, so that a change of the light as a whole is no contact.
+    A contact is a difference from the empty pad in at least `config.contact_blocks` blocks. The median difference of
+    all blocks is subtracted first, so a change of the whole image's brightness is not a contact.
+
+    Args:
+        config: Thresholds.
+        empty: The empty pad.
+        observation: The observation to test.
     """
     change = observation.tactile - empty.tactile
     change = change - np.median(change, axis=(0, 1))
-    noise = empty.tactile_noise * math.sqrt(1 + 1 / config.pairs)  # that of the mean over the empty pad comes on top
+    noise = empty.tactile_noise * math.sqrt(1 + 1 / config.pairs)  # of the image and of the mean of `pairs` empty ones
     return int((np.abs(change) > _threshold(config, noise)).any(-1).sum()) >= config.contact_blocks
 
 
 def _same(config: GuideConfig, state: State, first: Observation, second: Observation) -> bool:
-    """Whether two observations show no movement."""
+    """Return True if two observations show no movement. Before the empty pad is known, the noise is estimated."""
     streams: tuple[Literal["visual", "tactile"], ...] = ("visual", "tactile")
     for stream in streams if config.watched == "both" else streams[1:]:
         one, two = getattr(first, stream), getattr(second, stream)
         if state.empty is None:
-            # A small object in motion leaves the median unchanged.
+            # The median over all blocks is robust against a small object that moves.
             recent = [getattr(seen, stream) for seen in (*state.window[-4:], second)]
             noise = _NORMAL * np.median(np.abs(np.diff(recent, axis=0))) / math.sqrt(2)
         else:
@@ -255,10 +283,12 @@ def _same(config: GuideConfig, state: State, first: Observation, second: Observa
 
 
 def _threshold(config: GuideConfig, noise: Blocks | float | np.floating) -> Blocks | np.floating:
+    """The threshold of a change for a standard deviation of the noise."""
     return np.clip(config.deviations * np.asarray(noise), config.smallest_change, config.largest_threshold)
 
 
 def _rested(config: GuideConfig, state: State, least_s: float) -> bool:
+    """Return True if nothing has moved for a time and in enough pairs."""
     return state.count >= config.pairs and state.window[-1].time_s - state.window[0].time_s >= least_s
 
 
@@ -280,7 +310,7 @@ _HINTS = {
 
 
 def instruction(config: GuideConfig, state: State) -> str:
-    """One or two sentences for the person."""
+    """Return the instruction for the person, with a hint if the stage takes longer than `config.hint_s`."""
     if state.stage is Stage.CLEAR and state.empty is None and not state.trusted:
         return f"{_INSTRUCTIONS[Stage.CLEAR]} Then confirm."
     late = state.now_s is not None and state.since_s is not None and state.now_s - state.since_s >= config.hint_s

@@ -1,4 +1,4 @@
-"""The LED controller of the sensor: lights whose state at any time can be proven."""
+"""Control of the sensor's lights through its LED controller, with proof that they did not change meanwhile."""
 
 import contextlib
 import dataclasses
@@ -15,30 +15,34 @@ from sts_jax.hardware import _connection, ports, protocol
 
 _log = logging.getLogger(__name__)
 
-_FIRST_WAIT_S = 0.1  # between the attempts of `reconnect`, doubled after each
+_FIRST_WAIT_S = 0.1  # between the first two attempts of `reconnect`. It doubles after each attempt
 _LONGEST_WAIT_S = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Lit:
-    """The controller's answer about its lights.
+    """The controller's answer to a request: the levels of the lights, and when they were applied.
 
-    The levels were applied at some moment between `sent_s` and `acknowledged_s`, both on the clock `time.monotonic`.
+    The levels were applied at some time between `sent_s` and `acknowledged_s`, both on the clock `time.monotonic`.
     """
 
     levels: protocol.Levels  # duty cycles of the channels, 0 to 255
-    counter: int  # changes of the levels since the controller's boot
-    boot: int  # number of the controller's boot
-    sent_s: float  # before the request was first sent (s)
-    acknowledged_s: float  # after the answer had come (s)
+    counter: int  # number of changes of the levels since the controller booted
+    boot: int  # number of the controller's boot, 0 to 65535. The controller counts its boots
+    sent_s: float  # time just before the request was first sent (s)
+    acknowledged_s: float  # time at which the answer had arrived (s)
 
     def unchanged_since(self, earlier: "Lit") -> bool:
-        """Whether the levels were the same without interruption from `earlier.acknowledged_s` to `self.sent_s`."""
+        """Return True if the levels did not change between `earlier.acknowledged_s` and `self.sent_s`.
+
+        Args:
+            earlier: An earlier answer of the same controller.
+        """
         return (self.boot, self.counter, self.levels) == (earlier.boot, earlier.counter, earlier.levels)
 
 
 class Leds:
-    """An open LED controller.
+    """An open connection to the LED controller.
 
     ```python
     with Leds.connect("/dev/ttyACM0") as leds:
@@ -47,16 +51,16 @@ class Leds:
         assert leds.ping().unchanged_since(before)
     ```
 
-    Threads may share it. A thread of its own sends a request whenever a third of the watchdog's period has passed
-    without one, so the lights stay on while this process runs. If the process ends or hangs, the controller's watchdog
-    turns them off.
+    Several threads may use one `Leds`. The controller has a watchdog: it turns the lights off if no request arrives for
+    `watchdog_ms`. A background thread therefore sends a request whenever a third of this period has passed without one,
+    so the lights stay on while this process runs. If the process ends or hangs, the watchdog turns them off.
 
-    A request is repeated with the same sequence number every 0.1 s until its answer comes, and the controller executes
-    it once. Damaged lines and answers to other requests are ignored.
+    A request is repeated with the same sequence number every 0.1 s until its answer arrives. The controller executes it
+    only once. Damaged lines and answers to other requests are ignored.
 
-    A request takes at most `answer_s`, and 0.3 s more if the port takes no bytes or brings bytes without end. The first
-    one after a restart of the controller takes at most twice that time. If another thread is in a request, its time is
-    added.
+    A request takes at most `answer_s`, and 0.3 s more if the port accepts no bytes or sends bytes without end. The
+    first request after a restart of the controller takes at most twice that time. If another thread's request is in
+    progress, its time is added.
     """
 
     def __init__(self, port: str, *, baud: int, timeout_s: float, answer_s: float, watchdog_ms: int):
@@ -83,25 +87,31 @@ class Leds:
         answer_s: float = 1.0,
         watchdog_ms: int = protocol.DEFAULT_WATCH_MS,
     ) -> "Leds":
-        """Open a controller and turn its lights off.
+        """Connect to the controller on a port and turn its lights off.
 
-        Opening restarts most boards, which takes up to 2 s.
+        Opening the port restarts most boards, which takes up to 2 s.
 
         Args:
-            port: Device such as `/dev/ttyACM0`, or a URL of pyserial. `find_controllers` lists the devices.
-            baud: Rate (baud). The firmware uses 115200.
-            timeout_s: Longest time until the controller answers (s).
+            port: Name of the device, such as `/dev/ttyACM0`, or a URL of pyserial. `find_controllers` lists the
+                devices.
+            baud: Rate of the serial line (baud). The firmware uses 115200.
+            timeout_s: Longest wait for the controller's first answer (s).
             answer_s: Longest time of each later request, with all its repetitions (s).
-            watchdog_ms: Time without requests after which the controller turns its lights off (ms), 100 to 10000.
+            watchdog_ms: Time without requests after which the controller turns its lights off, 100 to 10000 (ms).
+
+        Returns:
+            The open connection. Its lights are off.
 
         Raises:
+            ValueError: `timeout_s`, `answer_s` or `watchdog_ms` is out of range.
             PortNotFoundError: There is no such port.
-            PortPermissionError: The user may not open it.
-            PortInUseError: Another process has opened it.
+            PortPermissionError: The user may not open the port.
+            PortInUseError: Another process has opened the port.
             NotALedControllerError: Another device is on the port, or the baud rate is wrong.
-            WrongVersionError: The controller speaks another version of the protocol.
-            LedTimeoutError: The controller stopped answering after the first answer.
+            WrongVersionError: The controller uses another version of the protocol.
+            LedTimeoutError: The controller stopped answering after its first answer.
             DisconnectedError: The port vanished.
+            LedError: The port cannot be opened for another reason, or the controller refused a request.
         """
         if not protocol.SHORTEST_WATCH_MS <= watchdog_ms <= protocol.LONGEST_WATCH_MS:
             raise ValueError(
@@ -114,17 +124,22 @@ class Leds:
 
     @classmethod
     def find(cls, serial_number: str, *, timeout_s: float = 5.0) -> "Leds":
-        """Open the controller with a serial number.
+        """Search the USB ports for the controller with a given serial number, and connect to it.
 
-        The controller states its number itself, so USB ports are opened one after the other until it is found. Ports
-        whose USB serial number is the same come first. Opening a port restarts most boards.
+        Only the controller itself can report this number. USB ports are therefore opened one after the other until the
+        controller is found, beginning with ports whose USB serial number is the same. Opening a port restarts most
+        boards.
 
         Args:
-            serial_number: Serial number of the controller, which `Leds.serial_number` has.
-            timeout_s: Longest time until the device on a port answers (s).
+            serial_number: Serial number of the controller, as `Leds.serial_number` returns it.
+            timeout_s: Longest wait for an answer on each port (s).
+
+        Returns:
+            The open connection. Its lights are off.
 
         Raises:
-            PortNotFoundError: No port has this controller. The message lists the ports and the device on each.
+            ValueError: `timeout_s` is out of range.
+            PortNotFoundError: No USB port has this controller. The message lists the ports and the result on each.
         """
         tried = {}
         candidates = [port for port in ports.find_controllers() if port.vendor is not None]
@@ -140,40 +155,44 @@ class Leds:
             leds.close()
         found = ", ".join(f"{name} ({result})" for name, result in tried.items()) or "none"
         raise ports.PortNotFoundError(
-            f"LED controller {serial_number} was not found. Connect it by USB, or give the name of its port. USB ports "
-            f"tried: {found}."
+            f"LED controller {serial_number} was not found on any USB port. Connect it by USB, or give the name of its "
+            f"port. USB ports tried: {found}."
         )
 
     @property
     def port(self) -> str:
-        """Name of the port."""
+        """Name of the serial port, such as `/dev/ttyACM0`."""
         return self._port
 
     @property
     def serial_number(self) -> str:
-        """Serial number of the controller."""
+        """Serial number that the controller reports."""
         return self._controller.serial_number
 
     @property
     def firmware(self) -> str:
-        """Version of the firmware."""
+        """Version of the controller's firmware, such as "1.0.0"."""
         return self._controller.firmware
 
     @property
     def board(self) -> str:
-        """Name of the board."""
+        """Name of the controller's board, such as "atmega328p"."""
         return self._controller.board
 
     def set(self, levels: Sequence[int]) -> Lit:
         """Set the lights and wait until the controller has applied the levels.
 
         Args:
-            levels: Duty cycles of the four channels, 0 (off) to 255 (always on).
+            levels: Duty cycles of the four channels, integers from 0 (off) to 255 (always on).
+
+        Returns:
+            The controller's answer, which contains the applied levels.
 
         Raises:
-            ValueError: There are not four levels, or one is out of range.
-            LedTimeoutError: No valid answer came within `answer_s`. The lights may have changed or not.
+            ValueError: `levels` are not four integers from 0 to 255.
+            LedTimeoutError: No valid answer arrived within `answer_s`. It is unknown if the lights changed.
             DisconnectedError: The port vanished or is closed.
+            LedError: The controller refused the request or applied other levels.
         """
         checked = _checked(levels)
         lit = self._state(functools.partial(protocol.Set, levels=checked))
@@ -185,19 +204,23 @@ class Leds:
         return lit
 
     def ping(self) -> Lit:
-        """The levels that are applied now.
+        """Ask the controller for the levels that are applied now.
+
+        Returns:
+            The controller's answer.
 
         Raises:
-            LedTimeoutError: No valid answer came within `answer_s`.
+            LedTimeoutError: No valid answer arrived within `answer_s`.
             DisconnectedError: The port vanished or is closed.
+            LedError: The controller refused the request.
         """
         return self._state(protocol.Ping)
 
     def close(self) -> None:
         """Turn the lights off and close the port.
 
-        If the controller does not answer within `answer_s`, the port is closed all the same, and the controller's
-        watchdog turns the lights off. Closing twice is allowed.
+        If the controller does not answer within `answer_s`, the port is closed anyway. The controller's watchdog then
+        turns the lights off. Closing twice is allowed.
         """
         if not self._open:
             return
@@ -205,18 +228,24 @@ class Leds:
         try:
             self.set(protocol.DARK)
         except ports.LedError as error:
-            _log.warning("the lights could not be turned off by a request, the watchdog will do it: %s", error)
+            _log.warning(
+                "the lights on %s could not be turned off by a request, so the controller's watchdog will turn them "
+                "off: %s",
+                self._port,
+                error,
+            )
         self._stop()
 
     def reconnect(self, *, limit_s: float = 30.0) -> None:
-        """Find the controller again after its port has vanished, by its serial number, and turn its lights off.
+        """Search for the controller after its port has vanished, connect to it again, and turn its lights off.
 
-        The port of the same name is tried first, then ports of the same USB device. The wait between attempts begins
-        at 0.1 s and doubles up to 5 s. Requests of other threads raise `DisconnectedError` meanwhile.
+        The controller is recognised by its serial number. The port of the same name is tried first, then the ports of
+        USB devices of the same vendor and product. The wait between attempts begins at 0.1 s and doubles up to 5 s.
+        Requests of other threads raise `DisconnectedError` meanwhile.
 
         Args:
-            limit_s: Time after which no further attempt begins (s). An attempt takes at most `timeout_s` and
-                two times `answer_s` for each port.
+            limit_s: Time after which no further attempt begins (s). An attempt takes at most `timeout_s` plus two times
+                `answer_s` for each port.
 
         Raises:
             DisconnectedError: The controller was not found. The message lists the ports that were tried.
@@ -240,8 +269,8 @@ class Leds:
                     tried[name] = str(error)
             if time.monotonic() + wait > deadline:
                 raise ports.DisconnectedError(
-                    f"controller {self.serial_number} was not found within {limit_s:g} s. Check its cable. Tried: "
-                    + ", ".join(f"{name} ({result})" for name, result in tried.items())
+                    f"LED controller {self.serial_number} was not found within {limit_s:g} s. Check its cable. "
+                    "Ports tried: " + ", ".join(f"{name} ({result})" for name, result in tried.items())
                 )
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT_S)
@@ -255,6 +284,7 @@ class Leds:
         self.close()
 
     def _handshake(self, port: str, timeout_s: float) -> tuple[_connection.Connection, protocol.Controller]:
+        """Open a port and return the connection and the controller's description."""
         connection = _connection.Connection(port, self._baud)
         try:
             return connection, connection.handshake(timeout_s)
@@ -263,7 +293,7 @@ class Leds:
             raise
 
     def _start(self, connection: _connection.Connection) -> None:
-        """Turn the lights off, and keep the connection alive from now on."""
+        """Turn the lights off, and start the background thread of requests."""
         self._connection = connection
         try:
             self.set(protocol.DARK)
@@ -277,14 +307,14 @@ class Leds:
         self._thread.start()
 
     def _stop(self) -> None:
-        """Close the port and wait for the end of the thread."""
+        """Close the port and wait until the background thread has ended."""
         self._connection.close()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
 
     def _state(self, request: Callable[[int], protocol.Request]) -> Lit:
-        """Send a request about the levels. A controller that has booted gets the watchdog's period first."""
+        """Send a request whose reply is a `State`. If the controller has rebooted, set the watchdog's period again."""
         connection = self._connection
         reply, sent_s, acknowledged_s = connection.exchange(request, protocol.State, timeout_s=self._answer_s)
         if reply.boot != self._boot:
@@ -312,7 +342,7 @@ class Leds:
                 wait = 0.0
 
     def _candidates(self) -> list[str]:
-        """The ports on which `reconnect` looks for the controller."""
+        """The names of the ports on which `reconnect` searches for the controller, in order."""
         names = [self._port]
         if self._usb is not None:
             kind = self._usb.vendor, self._usb.product
@@ -323,7 +353,7 @@ class Leds:
 
 
 def _usb_port(name: str) -> ports.Port | None:
-    """The USB port of a device, or None."""
+    """The USB port that a device name refers to, or None if it is not a USB port."""
     target = os.path.realpath(name)
     for port in ports.find_controllers():
         with contextlib.suppress(OSError):
@@ -333,7 +363,7 @@ def _usb_port(name: str) -> ports.Port | None:
 
 
 def _checked(levels: Sequence[int]) -> protocol.Levels:
-    """The levels as a tuple of four integers."""
+    """The levels as a tuple of four integers, or a `ValueError`."""
     try:
         found = tuple(operator.index(level) for level in levels)
     except TypeError as error:

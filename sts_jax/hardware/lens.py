@@ -1,8 +1,8 @@
-"""The fisheye lens of a real sensor, and its image as the pinhole view of the simulated one.
+"""The model of a real sensor's fisheye lens, and the conversion of its images to the simulated sensor's pinhole view.
 
-Pixel coordinates are (column, row), whole numbers at pixel centres. An image from the camera is called raw, and one
-that shows the view of the sensor's pinhole is called rectified. A raw and a rectified pixel correspond if their rays
-meet the gel's outer face (z = 0 in the sensor frame) in the same point.
+Pixel coordinates are (column, row), with whole numbers at pixel centres. A *raw* image comes from the camera. A
+*rectified* image shows the view of the simulated sensor's pinhole camera. A raw pixel and a rectified pixel correspond
+if their rays meet the gel's outer face (z = 0 in the sensor frame) in the same point.
 """
 
 import dataclasses
@@ -15,17 +15,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_ANGLE = math.pi  # rad, a ray at this angle points backwards along the optical axis
-_MARGIN = 16  # pixels beyond the image's border at which coordinates are clipped
-_BAND = 256  # rows of a map that are computed at once
-_GRAZING = 1e-6  # smallest cosine of the angle between a ray and the pad's normal at which they meet
+MOST_ANGLE = math.pi  # angle of a ray that points backwards along the optical axis (rad)
+_MARGIN = 16  # distance beyond the image's border at which coordinates are clipped (pixels)
+_BAND = 256  # number of rows of a map that are computed at once
+_GRAZING = 1e-6  # smallest cosine of the angle between a ray and the pad's normal for which they intersect
 _PROBES = 64  # least number of points along the longer side at which the density of a map is measured
-_TABLE = 2048  # angles of the table from which the inversion starts
+_TABLE = 2048  # number of angles in the table that gives the inversion its start values
 
 
 @runtime_checkable
 class Pinhole(Protocol):
-    """The view of a sensor. `sts_jax.Sensor().camera` is one."""
+    """The pinhole camera that defines the sensor's view, such as `sts_jax.Sensor().camera`."""
 
     @property
     def distance(self) -> SupportsFloat:
@@ -37,32 +37,34 @@ class Pinhole(Protocol):
 
     @property
     def aspect(self) -> SupportsFloat:
-        """Width / height of the view."""
+        """Width of the view divided by its height."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Lens:
-    r"""A fisheye camera of the Kannala-Brandt model (OpenCV's `cv2.fisheye`) and its place in the sensor.
+    r"""A fisheye lens in the Kannala-Brandt model (OpenCV's `cv2.fisheye`), with the camera's pose in the sensor.
 
-    A point p of the sensor frame is at q = R p + t in the camera frame, where R is the matrix of `rotation` and t is
-    `translation`. With the angle a between q and the optical axis, the point is seen at
+    A point p of the sensor frame is at q = R p + t in the camera frame. R is the matrix of `rotation`, and t is
+    `translation`. Let a be the angle between q and the optical axis (rad). The point appears at the raw pixel
 
-        (fx d q_x / r + cx, fy d q_y / r + cy),   r = sqrt(q_x^2 + q_y^2),
+        (column, row) = (fx d q_x / r + cx, fy d q_y / r + cy),
+        r = sqrt(q_x^2 + q_y^2),
         d = a + k_1 a^3 + k_2 a^5 + k_3 a^7 + k_4 a^9.
 
     Raises:
-        ValueError: a value is out of range, or the camera does not look at the pad from inside the sensor.
+        ValueError: A value is out of range, the pad is not in front of the camera, or the camera is not inside the
+            sensor (z < 0 in the sensor frame).
     """
 
-    width: int  # pixels
-    height: int  # pixels
-    fx: float  # pixels per radian at the centre
-    fy: float  # pixels per radian at the centre
-    cx: float  # pixels, column of the optical axis
-    cy: float  # pixels, row of the optical axis
-    k: tuple[float, float, float, float]
-    rotation: tuple[float, float, float]  # rad, rotation vector from the sensor frame to the camera frame
-    translation: tuple[float, float, float]  # m, centre of the gel's outer face in the camera frame
+    width: int  # width of the raw images (pixels)
+    height: int  # height of the raw images (pixels)
+    fx: float  # horizontal focal length on the optical axis (pixels per radian)
+    fy: float  # vertical focal length on the optical axis (pixels per radian)
+    cx: float  # column of the optical axis (pixels)
+    cy: float  # row of the optical axis (pixels)
+    k: tuple[float, float, float, float]  # coefficients k_1 to k_4 of the equation
+    rotation: tuple[float, float, float]  # rotation vector from the sensor frame to the camera frame (rad)
+    translation: tuple[float, float, float]  # centre of the gel's outer face in the camera frame (m)
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -88,8 +90,8 @@ class Lens:
         if self.center[2] >= 0:
             raise ValueError(
                 f"rotation {self.rotation} and translation {self.translation} place the camera at "
-                f"{tuple(round(float(c), 4) for c in self.center)} in the sensor frame, but it must lie inside the "
-                "sensor, at z < 0"
+                f"{tuple(round(float(c), 4) for c in self.center)} in the sensor frame, but the camera must lie inside "
+                "the sensor, at z < 0"
             )
 
     @classmethod
@@ -101,13 +103,19 @@ class Lens:
         field_of_view: float = math.radians(160),
         distance: float = 0.1,
     ) -> "Lens":
-        """A lens without error under the pad's centre: the distance to the image's centre is proportional to the angle.
+        """Return an equidistant lens whose camera looks straight at the centre of the pad.
+
+        In an equidistant lens, the distance of a pixel from the image's centre is proportional to the angle of its ray.
 
         Args:
-            width: width of the raw image (pixels).
-            height: height of the raw image (pixels).
-            field_of_view: angle across the image's diagonal (rad). The paper's device: 160 degrees.
-            distance: distance to the gel's outer face (m). Paper's code: 0.1.
+            width: Width of the raw image (pixels).
+            height: Height of the raw image (pixels).
+            field_of_view: Angle across the image's diagonal, in (0, 2 pi] (rad). The default is the 160 degrees of the
+                paper's sensor.
+            distance: Distance from the camera to the gel's outer face (m). The default is from the paper's code.
+
+        Raises:
+            ValueError: An argument is out of range.
         """
         if not 0 < field_of_view <= 2 * MOST_ANGLE:
             raise ValueError(f"field_of_view must be in (0, 2 pi] rad, got {field_of_view}")
@@ -126,25 +134,26 @@ class Lens:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The rotation R from the sensor frame to the camera frame, shape (3, 3)."""
+        """Rotation matrix R from the sensor frame to the camera frame, shape (3, 3)."""
         return rotation_matrix(self.rotation)
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """The camera's position in the sensor frame (m), shape (3,)."""
+        """Position of the camera in the sensor frame (m), shape (3,)."""
         return -self.matrix.T @ np.asarray(self.translation)
 
     @property
     def largest_angle(self) -> float:
-        """The angle from the optical axis up to which the image is unique (rad).
+        """Angle from the optical axis up to which the lens model is valid (rad), at most pi.
 
-        Beyond it, d decreases with the angle, which no real lens does. The polynomial is not valid there.
+        Beyond this angle, the polynomial d decreases, so two angles would have the same pixel. No real lens behaves
+        like this.
         """
         return _largest_angle(self.k)
 
 
 def rotation_matrix(vector: tuple[float, float, float]) -> NDArray[np.float64]:
-    """The matrix of a rotation vector (rad), shape (3, 3)."""
+    """Convert a rotation vector (rad) to a rotation matrix, shape (3, 3)."""
     angle = math.hypot(*vector)
     if angle == 0:
         return np.eye(3)
@@ -154,15 +163,18 @@ def rotation_matrix(vector: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def project(lens: Lens, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Project points of the sensor frame into the raw image.
+    """Project points in the sensor frame to raw pixels.
 
     Args:
-        lens: the camera.
-        points: shape (..., 3), sensor frame (m).
+        lens: The lens and the pose of the camera.
+        points: Points in the sensor frame (m), shape (..., 3).
 
     Returns:
-        Pixel coordinates, shape (..., 2). They may lie outside of the image. Points beyond `Lens.largest_angle` give
-        NaN.
+        Raw pixel coordinates (column, row), shape (..., 2). They may lie outside of the image. They are NaN for points
+        at angles beyond `Lens.largest_angle`.
+
+    Raises:
+        ValueError: `points` has another shape.
     """
     points = np.asarray(points, np.float64)
     if points.shape[-1:] != (3,):
@@ -171,7 +183,15 @@ def project(lens: Lens, points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Project points of the camera frame, shape (..., 3), into the raw image, shape (..., 2). See `project`."""
+    """Project points in the camera frame to raw pixels, as `project` does.
+
+    Args:
+        lens: The lens.
+        points: Points in the camera frame (m), shape (..., 3).
+
+    Returns:
+        Raw pixel coordinates (column, row), shape (..., 2).
+    """
     radius = np.hypot(points[..., 0], points[..., 1])
     angle = np.arctan2(radius, points[..., 2])
     distorted_angle = np.where(angle <= lens.largest_angle, distort_angle(lens.k, angle), np.nan)
@@ -180,14 +200,15 @@ def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The rays of raw pixels in the camera frame.
+    """Compute the rays of raw pixels, the inverse of `project_camera`.
 
     Args:
-        lens: the camera.
-        pixels: pixel coordinates, shape (..., 2).
+        lens: The lens.
+        pixels: Raw pixel coordinates (column, row), shape (..., 2).
 
     Returns:
-        Unit vectors, shape (..., 3). Pixels that no angle up to `Lens.largest_angle` reaches give NaN.
+        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels at angles beyond
+        `Lens.largest_angle`.
     """
     pixels = np.asarray(pixels, np.float64)
     x, y = (pixels[..., 0] - lens.cx) / lens.fx, (pixels[..., 1] - lens.cy) / lens.fy
@@ -198,20 +219,20 @@ def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDArray[np.float32]:
-    """The raw pixel that belongs to each pixel of the pinhole's view.
+    """Compute the raw pixel that corresponds to each pixel of the rectified image.
 
     Args:
-        lens: the camera.
-        pinhole: the sensor's view.
-        resolution: (height, width) of the rectified image, pixels. It shows the largest centred part of the view with
-            this aspect ratio, like `sts_jax.optics.full_window`.
+        lens: The lens and the pose of the camera.
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+        resolution: Height and width of the rectified image (pixels). The image shows the largest centred part of the
+            view with this aspect ratio, as `sts_jax.sense` does.
 
     Returns:
-        Raw pixel coordinates, shape (height, width, 2). Some lie outside of the raw image if the camera does not see
-        the whole view.
+        Raw pixel coordinates (column, row) of each pixel, shape (height, width, 2). Some lie outside of the raw image
+        if the camera does not see the whole view.
 
     Raises:
-        ValueError: the view contains rays beyond `Lens.largest_angle`.
+        ValueError: The view contains rays beyond `Lens.largest_angle`, or `resolution` or `pinhole` is out of range.
     """
     left, top, width, height = window(pinhole, resolution)
     rows, columns = resolution
@@ -224,34 +245,38 @@ def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> 
     if np.isnan(pixels).any():
         raise ValueError(
             f"the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from its optical axis, but the "
-            "view needs larger angles. Calibrate it again with boards that reach the view's corners."
+            "sensor's view needs larger angles. Calibrate it again, with images of the board in the corners of the "
+            "view."
         )
     return pixels
 
 
 def rectified(lens: Lens, pinhole: Pinhole, image: NDArray[np.uint8], resolution: tuple[int, int]) -> NDArray[np.uint8]:
-    """The pinhole's view from a raw image.
+    """Convert a raw image to the sensor's pinhole view.
 
-    The raw image is sampled at least as densely as its pixels lie, and the samples of each pixel are averaged, so that
-    small images show no aliasing. The maps of the last eight combinations of arguments are kept.
+    Each rectified pixel is the mean of one or more samples of the raw image. Neighbouring samples are at most about one
+    raw pixel apart, so small images show no aliasing. The maps for the eight most recent combinations of lens, pinhole
+    and resolution are cached, because computing a map is slow.
 
     Args:
-        lens: the camera.
-        pinhole: the sensor's view.
-        image: raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
-        resolution: (height, width) of the result, pixels.
+        lens: The lens and the pose of the camera.
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+        image: Raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
+        resolution: Height and width of the rectified image (pixels).
 
     Returns:
-        Rectified image of the given resolution, uint8. Parts of the view that the camera does not see are black.
+        Rectified image, shape (height, width) or (height, width, channels), uint8. Parts of the view that the camera
+        does not see are black.
 
     Raises:
-        ValueError: the image is not uint8 or has another size, or see `rectification`.
+        ValueError: The image is not uint8 or has another size than the lens, the view contains rays beyond
+            `Lens.largest_angle`, or `resolution` or `pinhole` is out of range.
     """
     _check_image(image)
     if image.shape[:2] != (lens.height, lens.width):
         raise ValueError(
             f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated at "
-            f"{lens.width}x{lens.height}. Set the camera to this size, or calibrate again."
+            f"{lens.width}x{lens.height}. Set the camera to the size of the lens, or calibrate again."
         )
     maps = _rectifying_maps(lens, _Values.of(pinhole), _checked(resolution))
     sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -259,17 +284,20 @@ def rectified(lens: Lens, pinhole: Pinhole, image: NDArray[np.uint8], resolution
 
 
 def distortion(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDArray[np.float32]:
-    """The pixel of the pinhole's view that belongs to each raw pixel.
+    """Compute the pixel of the rectified image that corresponds to each raw pixel, the inverse of `rectification`.
 
     Args:
-        lens: the camera.
-        pinhole: the sensor's view.
-        resolution: (height, width) of the rectified image, pixels.
+        lens: The lens and the pose of the camera.
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+        resolution: Height and width of the rectified image (pixels).
 
     Returns:
-        Coordinates in the rectified image, shape (lens.height, lens.width, 2). Raw pixels that show more than the view
-        have coordinates outside of the rectified image. If a ray does not meet the plane of the gel's outer face, they
-        are NaN.
+        Rectified pixel coordinates (column, row) of each raw pixel, shape (lens.height, lens.width, 2). Raw pixels
+        outside of the view have coordinates outside of the rectified image. Raw pixels whose ray does not meet the
+        plane of the gel's outer face, or exceeds `Lens.largest_angle`, have NaN.
+
+    Raises:
+        ValueError: `resolution` or `pinhole` is out of range.
     """
     return _view_pixels(lens, _Values.of(pinhole), _checked(resolution), 1)
 
@@ -282,24 +310,25 @@ def distorted(
     outside: float | tuple[float, float, float],
     samples: int | None = None,
 ) -> NDArray[np.uint8]:
-    """The raw image of a camera that sees the pinhole's view, the inverse of `rectified`.
+    """Convert a rectified image to the raw image that the camera would take of it, the inverse of `rectified`.
 
-    The maps of the last two combinations of arguments are kept.
+    The maps for the two most recent combinations of lens, pinhole, size and `samples` are cached, because computing a
+    map is slow.
 
     Args:
-        lens: the camera.
-        pinhole: the sensor's view.
-        image: rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show the
-            largest centred part of the view with its aspect ratio, as `sts_jax.sense` renders it.
-        outside: value or colour of the raw pixels that show more than the view, 0 to 255.
-        samples: samples of each raw pixel in each direction, which are averaged. None: as many as the image needs to
-            show no aliasing. Fewer samples are faster.
+        lens: The lens and the pose of the camera.
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show the
+            largest centred part of the view with its aspect ratio, as the images of `sts_jax.sense` do.
+        outside: Grey value or colour of the raw pixels outside of the view, 0 to 255.
+        samples: Number of samples per raw pixel in each direction. The samples are averaged. Fewer samples are faster.
+            None: as many as needed to avoid aliasing.
 
     Returns:
-        Raw image of shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
+        Raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
 
     Raises:
-        ValueError: the image is not uint8, or `samples` is below 1.
+        ValueError: The image is not uint8, `samples` is below 1, or `pinhole` is out of range.
     """
     _check_image(image)
     if samples is not None and samples < 1:
@@ -312,9 +341,19 @@ def distorted(
 
 
 def window(pinhole: Pinhole, resolution: tuple[int, int]) -> tuple[float, float, float, float]:
-    """The part of the gel's outer face that an image shows: left, top, width and height (m).
+    """Return the rectangle of the gel's outer face that a rectified image shows.
 
-    It equals `sts_jax.optics.full_window`.
+    The result equals that of `sts_jax.optics.full_window`, which this package does not import.
+
+    Args:
+        pinhole: The view of the sensor, such as `Sensor.camera`.
+        resolution: Height and width of the rectified image (pixels).
+
+    Returns:
+        x of the left edge, y of the top edge, width and height, in the sensor frame (m).
+
+    Raises:
+        ValueError: `resolution` or `pinhole` is out of range.
     """
     rows, columns = _checked(resolution)
     values = _Values.of(pinhole)
@@ -326,7 +365,7 @@ def window(pinhole: Pinhole, resolution: tuple[int, int]) -> tuple[float, float,
 
 @dataclasses.dataclass(frozen=True)
 class _Values:
-    """The numbers of a pinhole, by which maps are kept."""
+    """The numbers of a pinhole as a hashable key for the cached maps."""
 
     distance: float
     fov: float
@@ -336,14 +375,17 @@ class _Values:
     def of(cls, pinhole: Pinhole) -> "_Values":
         values = cls(float(pinhole.distance), float(pinhole.fov), float(pinhole.aspect))
         if not values.distance > 0 or not 0 < values.fov < math.pi or not values.aspect > 0:
-            raise ValueError(f"pinhole must have distance > 0, fov in (0, pi) and aspect > 0, got {values}")
+            raise ValueError(
+                f"pinhole must have distance > 0, fov in (0, pi) and aspect > 0, got distance={values.distance}, "
+                f"fov={values.fov}, aspect={values.aspect}"
+            )
         return values
 
 
 @functools.lru_cache(maxsize=8)
 def _rectifying_maps(lens: Lens, pinhole: _Values, resolution: tuple[int, int]) -> tuple[NDArray, NDArray]:
-    """OpenCV's maps of `rectified`, at the resolution times the number of samples in each direction."""
-    probes = math.ceil(_PROBES / max(resolution))  # of each pixel, so that small images are probed densely enough
+    """The OpenCV maps for `rectified`: the raw pixel of each sample of each rectified pixel."""
+    probes = math.ceil(_PROBES / max(resolution))  # points per pixel, so that small images are probed densely enough
     probed = rectification(lens, pinhole, (resolution[0] * probes, resolution[1] * probes))
     samples = _samples(probed, (lens.height, lens.width), probes)
     fine = resolution[0] * samples, resolution[1] * samples
@@ -354,14 +396,14 @@ def _rectifying_maps(lens: Lens, pinhole: _Values, resolution: tuple[int, int]) 
 def _distorting_maps(
     lens: Lens, pinhole: _Values, resolution: tuple[int, int], samples: int | None
 ) -> tuple[NDArray, NDArray]:
-    """OpenCV's maps of `distorted`, at the raw size times the number of samples in each direction."""
+    """The OpenCV maps for `distorted`: the rectified pixel of each sample of each raw pixel."""
     if samples is None:
         samples = _samples(_view_pixels(lens, pinhole, resolution, 1), resolution, 1)
     return _converted(_view_pixels(lens, pinhole, resolution, samples), resolution)
 
 
 def _view_pixels(lens: Lens, pinhole: _Values, resolution: tuple[int, int], samples: int) -> NDArray[np.float32]:
-    """`distortion` at `samples` points of every raw pixel in each direction."""
+    """The result of `distortion` at `samples` x `samples` points of every raw pixel."""
     left, top, width, height = window(pinhole, resolution)
     scale = np.array([resolution[1] / width, resolution[0] / height])
     x = (np.arange(lens.width * samples) + 0.5) / samples - 0.5
@@ -376,17 +418,18 @@ def _view_pixels(lens: Lens, pinhole: _Values, resolution: tuple[int, int], samp
 
 
 def _bands(rows: int) -> list[slice]:
-    """Groups of rows, which limit the memory that large maps need while they are computed."""
+    """Slices of `_BAND` rows. Computing a large map slice by slice limits the memory."""
     return [slice(first, first + _BAND) for first in range(0, rows, _BAND)]
 
 
 def _samples(coordinates: NDArray[np.float32], size: tuple[int, int], probes: int) -> int:
-    """Samples per pixel and direction with which no pixel of an image is skipped.
+    """The number of samples per pixel in each direction with which a map skips no pixel of the source image.
 
     Args:
-        coordinates: coordinates in the image at `probes` points of each pixel in each direction.
-        size: (height, width) of the image.
-        probes: see `coordinates`.
+        coordinates: Coordinates in the source image, at `probes` x `probes` points of each pixel of the result, shape
+            (rows, columns, 2).
+        size: Height and width of the source image (pixels).
+        probes: Number of points per pixel in each direction.
     """
     inside = (coordinates > -0.5) & (coordinates < np.array(size[::-1]) - 0.5)
     coordinates = np.where(inside.all(axis=-1, keepdims=True), coordinates, np.nan)
@@ -396,7 +439,7 @@ def _samples(coordinates: NDArray[np.float32], size: tuple[int, int], probes: in
 
 
 def _converted(coordinates: NDArray[np.float32], size: tuple[int, int]) -> tuple[NDArray, NDArray]:
-    """A map in OpenCV's fast format, whose coordinates are multiples of 1/32 pixel. NaN becomes a pixel outside."""
+    """Convert a map to OpenCV's fast fixed-point format with steps of 1/32 pixel. NaN becomes a pixel outside."""
     limits = np.array(size[::-1], np.float32) + _MARGIN
     clipped = np.clip(np.nan_to_num(coordinates, nan=-_MARGIN), -_MARGIN, limits).astype(np.float32)
     whole, fraction = cv2.convertMaps(clipped, None, cv2.CV_16SC2)
@@ -404,20 +447,20 @@ def _converted(coordinates: NDArray[np.float32], size: tuple[int, int]) -> tuple
 
 
 def _averaged(image: NDArray, resolution: tuple[int, int]) -> NDArray:
-    """The mean of the samples of each pixel."""
+    """Average the samples of each pixel."""
     if image.shape[:2] == resolution:
         return image
     return cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
 
 
 def distort_angle(k: Sequence[float], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The polynomial d of the lens at angles from the optical axis (rad), see `Lens`."""
+    """Evaluate the polynomial d of a `Lens` with coefficients `k` at angles from the optical axis (rad)."""
     square = angle * angle
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 
 
 def _undistort_angle(k: tuple[float, ...], distorted_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The inverse of `distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
+    """Invert `distort_angle` by Newton's method, which starts from a table. NaN beyond the largest angle."""
     largest = _largest_angle(k)
     known = np.linspace(0, largest, _TABLE)
     table = distort_angle(k, known)
@@ -443,6 +486,7 @@ def _is_number(value: object) -> bool:
 
 
 def _checked(resolution: tuple[int, int]) -> tuple[int, int]:
+    """The resolution as two integers, or a `ValueError`."""
     if len(resolution) != 2 or not all(isinstance(n, int | np.integer) and n >= 1 for n in resolution):
         raise ValueError(f"resolution must be (height, width) in pixels, both >= 1, got {resolution!r}")
     return int(resolution[0]), int(resolution[1])

@@ -1,4 +1,4 @@
-"""Serial ports: listing, opening for one process alone, and the errors of the LED controller."""
+"""Serial ports: listing them, opening one for exclusive use, and the errors of the LED controller."""
 
 import contextlib
 import dataclasses
@@ -11,57 +11,60 @@ from serial.tools import list_ports
 
 from sts_jax.hardware import protocol
 
-READ_S = 0.02  # longest wait of one read
-WRITE_S = 0.2  # longest wait of one write
+READ_S = 0.02  # longest wait of one read (s)
+WRITE_S = 0.2  # longest wait of one write (s)
 
 
 class LedError(OSError):
-    """An error of the LED controller or its port. The message states what was found and the remedy."""
+    """Base class of the errors of the LED controller and of its port. The message states the cause and the remedy."""
 
 
 class PortNotFoundError(LedError):
-    """There is no such port. The message lists the ports that were found."""
+    """Raised if a port does not exist, or if no port has the wanted controller. The message lists other ports."""
 
 
 class PortPermissionError(LedError):
-    """The user may not open the port."""
+    """Raised if the user may not open the port. The message names the group that has the permission."""
 
 
 class PortInUseError(LedError):
-    """Another process has opened the port. The message names it."""
+    """Raised if the port is open already. The message names the process that has opened it, if it is known."""
 
 
 class NotALedControllerError(LedError):
-    """The device on the port gave no valid answer. The message describes the bytes that were received."""
+    """Raised if a port is not serial or its device does not answer as an LED controller. The message has details."""
 
 
 class WrongVersionError(LedError):
-    """The controller speaks another version of the protocol."""
+    """Raised if the controller uses another version of the protocol. The message names both versions."""
 
 
 class LedTimeoutError(LedError):
-    """The controller gave no valid answer in time."""
+    """Raised if the controller gave no valid answer in time, or accepted no bytes."""
 
 
 class DisconnectedError(LedError):
-    """The port has vanished."""
+    """Raised if the port has vanished or is closed. `Leds.reconnect` searches for the controller again."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Port:
     """A serial port of this machine."""
 
-    device: str  # the name to connect to, such as /dev/ttyACM0
-    description: str
-    serial_number: str | None  # of the USB device. The controller's own serial number is known after `connect`
-    vendor: int | None  # USB vendor
-    product: int | None  # USB product
+    device: str  # name for `Leds.connect`, such as /dev/ttyACM0
+    description: str  # description by the operating system, may be empty
+    serial_number: str | None  # USB serial number, None: unknown. The controller's own one is `Leds.serial_number`
+    vendor: int | None  # number of the USB vendor, None: not a USB device
+    product: int | None  # number of the USB product, None: not a USB device
 
 
 def find_controllers() -> list[Port]:
-    """List the serial ports to which a controller may be connected, with their USB serial numbers.
+    """List the serial ports of this machine.
 
-    No port is opened, because opening resets most boards. Ports of USB devices come first.
+    The LED controller may be on any of them. No port is opened, because opening a port restarts most boards.
+
+    Returns:
+        The ports, those of USB devices first.
     """
     found = [
         Port(port.device, port.description or "", port.serial_number or None, port.vid, port.pid)
@@ -71,29 +74,31 @@ def find_controllers() -> list[Port]:
 
 
 def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
-    """Open a serial port for this process alone.
+    """Open a serial port so that no other process can open it.
 
     Args:
-        name: Device or URL of pyserial.
-        baud: Rate (baud).
+        name: Name of the device, or a URL of pyserial.
+        baud: Rate of the serial line (baud).
 
     Raises:
         PortNotFoundError: There is no such port.
-        PortPermissionError: The user may not open it.
-        PortInUseError: Another process, or another part of this one, has opened it.
-        NotALedControllerError: It is not a serial port.
-        LedError: It cannot be opened for another reason.
+        PortPermissionError: The user may not open the port.
+        PortInUseError: Another process, or another part of this process, has opened the port.
+        NotALedControllerError: The device is not a serial port.
+        LedError: The port cannot be opened for another reason.
     """
     try:
         return serial.serial_for_url(name, baudrate=baud, timeout=READ_S, write_timeout=WRITE_S, exclusive=True)
     except ValueError as error:
-        raise PortNotFoundError(f"{name!r} is not a port or a URL of pyserial ({error}). {_ports_found()}") from error
+        raise PortNotFoundError(
+            f"{name!r} is neither a port nor a URL of pyserial ({error}). {_ports_found()}"
+        ) from error
     except OSError as error:
         raise _opening_error(name, error) from error
 
 
 def _opening_error(name: str, error: OSError) -> LedError:
-    """The error for a port that cannot be opened, by the number of the system's error."""
+    """The error to raise for a port that cannot be opened, chosen by the operating system's error number."""
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO:
             return PortNotFoundError(f"there is no port {name}. {_ports_found()}")
@@ -114,6 +119,7 @@ def _opening_error(name: str, error: OSError) -> LedError:
 
 
 def _ports_found() -> str:
+    """A sentence for error messages that lists the serial ports of this machine."""
     found = ", ".join(f"{port.device} ({port.description})" for port in find_controllers())
     return f"Ports found: {found}." if found else "No serial ports were found: connect the controller by USB."
 
@@ -129,7 +135,7 @@ def _group(name: str) -> str:
 
 
 def users_of(name: str) -> list[str]:
-    """The processes that have opened a device, as far as this user may see them. Linux only, elsewhere empty."""
+    """The processes that have opened a device and that this user may see. The list is empty except on Linux."""
     target, users, own = os.path.realpath(name), [], False
     for folder in Path("/proc").glob("[0-9]*/fd"):
         with contextlib.suppress(OSError):
@@ -143,6 +149,7 @@ def users_of(name: str) -> list[str]:
 
 
 def _points_to(link: Path, target: str) -> bool:
+    """Return True if a symbolic link leads to the target, and False if it does not or cannot be read."""
     with contextlib.suppress(OSError):
         return os.readlink(link) == target
     return False

@@ -1,8 +1,8 @@
-"""The serial protocol of the LED controller: messages as dataclasses, and their lines.
+"""The serial protocol of the LED controller: messages as dataclasses, and their encoding as lines of text.
 
-A line is ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline: `7 PING*018E`. The
-host sends requests, and the controller answers each with one reply of the same sequence number. The documentation's
-page on the protocol defines both.
+A line consists of ASCII text, `*`, the checksum of the text in four hexadecimal digits, and a newline: `7 PING*018E`.
+The host sends requests, and the controller answers each request with one reply of the same sequence number. The page
+docs/hardware/protocol.md defines the requests and the replies.
 
 Parsing is strict: each message has exactly one valid line. Any other line raises a `ProtocolError`.
 """
@@ -12,35 +12,35 @@ import dataclasses
 import enum
 import re
 
-VERSION = 1  # of the protocol
+VERSION = 1  # version of the protocol
 BAUD = 115200  # 8 data bits, no parity, 1 stop bit
-CHANNELS = 4
+CHANNELS = 4  # lights of the sensor that are controlled separately
 LONGEST_LINE = 64  # bytes, with the newline
-LAST_SEQUENCE = 65535  # 1 follows. 0 belongs to lines of the controller that answer no request
-SHORTEST_WATCH_MS = 100
-LONGEST_WATCH_MS = 10_000
-DEFAULT_WATCH_MS = 1000
+LAST_SEQUENCE = 65535  # largest sequence number. 1 follows it. 0 marks replies to no particular request
+SHORTEST_WATCH_MS = 100  # shortest period of the watchdog (ms)
+LONGEST_WATCH_MS = 10_000  # longest period of the watchdog (ms)
+DEFAULT_WATCH_MS = 1000  # period of the watchdog after a boot (ms)
 
 Levels = tuple[int, int, int, int]  # duty cycles of the channels, 0 (off) to 255 (always on)
 DARK: Levels = (0, 0, 0, 0)
 
 
 class Code(enum.IntEnum):
-    """The reason for which the controller refused a request."""
+    """The controller's reason for refusing a request."""
 
     CHECKSUM = 1  # the line is damaged
     COMMAND = 2  # there is no such command
-    ARGUMENTS = 3  # too few, too many or out of range
-    VERSION = 4  # the host speaks another version of the protocol
+    ARGUMENTS = 3  # the arguments are too few, too many or out of range
+    VERSION = 4  # the host uses another version of the protocol
     LENGTH = 5  # the line is longer than `LONGEST_LINE`
 
 
 class ProtocolError(ValueError):
-    """A line that is not a message of the protocol. The error's message names the line.
+    """Raised for a line that is not a valid message of the protocol. The error's message contains the line.
 
     Attributes:
-        code: The error code with which a controller answers this line.
-        sequence: The sequence number of that answer.
+        code: Error code that a controller sends in its reply to this line.
+        sequence: Sequence number of that reply.
     """
 
     def __init__(self, message: str, code: Code = Code.CHECKSUM, sequence: int = 0):
@@ -51,80 +51,80 @@ class ProtocolError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Hello:
-    """Request for the controller's description."""
+    """Request for the description of the controller, which is a `Controller`."""
 
     sequence: int
-    version: int = VERSION  # of the protocol that the host speaks
+    version: int = VERSION  # version of the protocol that the host uses
 
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """Request for new levels."""
+    """Request to set the levels of the lights."""
 
     sequence: int
-    levels: Levels
+    levels: Levels  # duty cycles of the channels, 0 (off) to 255 (always on)
 
 
 @dataclasses.dataclass(frozen=True)
 class Ping:
-    """Request for the state. It keeps the lights on."""
+    """Request for the state of the lights. Like any request, it restarts the watchdog's period."""
 
     sequence: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """Request for another period of the watchdog."""
+    """Request to set the watchdog's period."""
 
     sequence: int
-    period_ms: int
+    period_ms: int  # time without requests after which the lights go off, 100 to 10000 (ms)
 
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """Reply to `Hello`."""
+    """Reply to `Hello`: the description of the controller."""
 
     sequence: int
-    version: int  # of the protocol that the controller speaks
-    firmware: str  # the firmware's own version
-    board: str
-    serial_number: str
-    channels: int
+    version: int  # version of the protocol that the controller uses
+    firmware: str  # version of the firmware
+    board: str  # name of the board
+    serial_number: str  # serial number of the controller
+    channels: int  # number of channels
 
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """Reply to `Set` and `Ping`."""
+    """Reply to `Set` and `Ping`: the state of the lights."""
 
     sequence: int
-    levels: Levels  # applied now
-    counter: int  # changes of the levels since the boot
+    levels: Levels  # duty cycles that are applied at the time of the reply
+    counter: int  # number of changes of the levels since the boot
     boot: int  # number of the boot, 0 to 65535
-    uptime_ms: int | None = None  # time since the boot, in replies to `Ping` only
+    uptime_ms: int | None = None  # time since the boot (ms). None in replies to `Set`
 
 
 @dataclasses.dataclass(frozen=True)
 class Watching:
-    """Reply to `Watch`."""
+    """Reply to `Watch`: the watchdog's period."""
 
     sequence: int
-    period_ms: int
+    period_ms: int  # time without requests after which the lights go off (ms)
 
 
 @dataclasses.dataclass(frozen=True)
 class Refused:
     """Reply to a request that was not executed."""
 
-    sequence: int
-    code: Code
-    text: str
+    sequence: int  # 0 if the controller could not read the request's sequence number
+    code: Code  # reason for the refusal
+    text: str  # the reason in words
 
 
 @dataclasses.dataclass(frozen=True)
 class TurnedOff:
-    """Unsolicited line: the watchdog turned the lights off."""
+    """Line that the controller sends without a request: the watchdog has turned the lights off."""
 
-    counter: int
+    counter: int  # number of changes of the levels since the boot, this one included
 
 
 Request = Hello | Set | Ping | Watch
@@ -132,15 +132,21 @@ Reply = Controller | State | Watching | Refused | TurnedOff
 
 
 def checksum(text: bytes) -> int:
-    """CRC-16 with polynomial 0x1021 and initial value 0xFFFF, neither reflected nor inverted (CRC-16/CCITT-FALSE)."""
+    """Return the CRC-16/CCITT-FALSE of a text: polynomial 0x1021, initial value 0xFFFF, not reflected, not inverted."""
     return binascii.crc_hqx(text, 0xFFFF)
 
 
 def encode(text: str) -> bytes:
-    """The line of a text.
+    """Append the checksum and the newline to a text.
+
+    Args:
+        text: Printable ASCII without `*`.
+
+    Returns:
+        The line, at most `LONGEST_LINE` bytes.
 
     Raises:
-        ProtocolError: The text has other characters than printable ASCII, or `*`, or is too long.
+        ProtocolError: The text is empty, contains `*` or other characters than printable ASCII, or is too long.
     """
     if not re.fullmatch(r"[ -)+-~]+", text):
         raise ProtocolError(f"a message must consist of printable ASCII without '*', got {text!r}", Code.ARGUMENTS)
@@ -153,30 +159,33 @@ def encode(text: str) -> bytes:
 
 
 def decode(line: bytes) -> str:
-    """The text of a line.
+    """Check the checksum of a line and return the text before it.
+
+    Args:
+        line: The whole line, with its newline.
 
     Raises:
-        ProtocolError: The line is too long, has no newline at its end, has other bytes than printable ASCII, or its
-            checksum differs.
+        ProtocolError: The line is too long, contains other bytes than printable ASCII, lacks the checksum or the
+            newline, or its checksum differs.
     """
     if len(line) > LONGEST_LINE:
-        raise ProtocolError(
-            f"line has {len(line)} bytes, but at most {LONGEST_LINE} are allowed: {line!r}", Code.LENGTH
-        )
+        raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}", Code.LENGTH)
     found = re.fullmatch(rb"([ -)+-~]+)\*([0-9A-F]{4})\n", line)
     if found is None:
-        raise ProtocolError(f"not a line of the protocol: {line!r}")
+        raise ProtocolError(f"a line must be text, '*', four hexadecimal digits and a newline, got {line!r}")
     text, digits = found.groups()
     if int(digits, 16) != checksum(text):
-        raise ProtocolError(f"checksum is {checksum(text):04X}, but the line has {digits.decode()}: {line!r}")
+        raise ProtocolError(
+            f"the checksum of the text is {checksum(text):04X}, but the line has {digits.decode()}: {line!r}"
+        )
     return text.decode()
 
 
 def encode_request(request: Request) -> bytes:
-    """The line of a request.
+    """Encode a request as a line with its checksum and newline.
 
     Raises:
-        ProtocolError: A value is out of its range.
+        ProtocolError: A value of the request is out of range.
     """
     match request:
         case Hello(sequence, version):
@@ -193,16 +202,20 @@ def encode_request(request: Request) -> bytes:
 
 
 def decode_request(line: bytes) -> Request:
-    """The request of a line.
+    """Decode a request from a line.
+
+    Args:
+        line: The whole line, with its checksum and newline.
 
     Raises:
-        ProtocolError: The line is not a request. `code` and `sequence` are those of the controller's answer.
+        ProtocolError: The line is not a valid request. The error has the code and the sequence number of the reply
+            that a controller sends to such a line.
     """
     text = decode(line)
     words = text.split(" ")
     sequence = _number(words[0], 1, LAST_SEQUENCE)
     if sequence is None:
-        raise ProtocolError(f"sequence number must be in 1..{LAST_SEQUENCE}: {line!r}", Code.ARGUMENTS)
+        raise ProtocolError(f"the sequence number must be in 1..{LAST_SEQUENCE}: {line!r}", Code.ARGUMENTS)
     match words[1:]:
         case ["HELLO", version] if (number := _number(version, 0, 65535)) is not None:
             return Hello(sequence, number)
@@ -213,17 +226,15 @@ def decode_request(line: bytes) -> Request:
         case ["WATCH", period] if (number := _number(period, SHORTEST_WATCH_MS, LONGEST_WATCH_MS)) is not None:
             return Watch(sequence, number)
         case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
-            raise ProtocolError(
-                f"the arguments are missing, superfluous or out of range: {line!r}", Code.ARGUMENTS, sequence
-            )
+            raise ProtocolError(f"arguments are missing, too many or out of range: {line!r}", Code.ARGUMENTS, sequence)
     raise ProtocolError(f"unknown command: {line!r}", Code.COMMAND, sequence)
 
 
 def encode_reply(reply: Reply) -> bytes:
-    """The line of a reply.
+    """Encode a reply as a line with its checksum and newline.
 
     Raises:
-        ProtocolError: A value is out of its range.
+        ProtocolError: A value of the reply is out of range.
     """
     match reply:
         case Controller(sequence, version, firmware, board, serial_number, channels):
@@ -244,18 +255,22 @@ def encode_reply(reply: Reply) -> bytes:
 
 
 def decode_reply(line: bytes) -> Reply:
-    """The reply of a line.
+    """Decode a reply from a line.
+
+    Args:
+        line: The whole line, with its checksum and newline.
 
     Raises:
-        ProtocolError: The line is not a reply.
+        ProtocolError: The line is not a valid reply.
     """
     found = _reply(decode(line).split(" "))
     if found is None:
-        raise ProtocolError(f"not a reply of the protocol: {line!r}", Code.ARGUMENTS)
+        raise ProtocolError(f"not a reply of the LED controller's protocol: {line!r}", Code.ARGUMENTS)
     return found
 
 
 def _reply(words: list[str]) -> Reply | None:
+    """The reply that consists of these words, or None if they are not a valid reply."""
     sequence = _number(words[0], 0, LAST_SEQUENCE)
     match words[1:]:
         case ["OFF", "watchdog", counter] if sequence == 0 and (changes := _number(counter, 1, _UINT32)) is not None:
@@ -280,7 +295,7 @@ _UINT32 = 2**32 - 1
 
 
 def _controller(sequence: int, values: list[str]) -> Controller | None:
-    """The reply to HELLO. All versions of the protocol begin it with the version."""
+    """Decode the reply to HELLO. In all versions of the protocol, its first value is the version."""
     version = _number(values[0], 0, 65535) if values else None
     if version is None:
         return None
@@ -312,7 +327,7 @@ def _levels(words: list[str]) -> Levels | None:
 
 
 def _number(word: str, smallest: int, largest: int) -> int | None:
-    """A decimal number without sign and leading zeros, or None if it is not one of the range."""
+    """A decimal number without sign and leading zeros, or None if the word is not one or is out of range."""
     if not re.fullmatch(r"0|[1-9][0-9]{0,9}", word):
         return None
     return int(word) if smallest <= int(word) <= largest else None

@@ -1,15 +1,15 @@
-"""Recording both streams of a sensor, one image at a time, into files that other programs read too.
+"""`Recorder`: writes the images of both streams of a sensor into video files, one image at a time.
 
 A recording is a folder:
 
-    recording.json    format, encoding, and the devices
-    visual.mkv        the images without light, in a Matroska file
-    tactile.mkv       the images with the light
-    frames.jsonl      one line for each image: time, proof of its light, and its place in the video file
-    sensor.json       a copy of the sensor file and of its backgrounds, if there is one
+    recording.json    version of the format, encoding, and identity of the sensor
+    visual.mkv        images without light, as a Matroska video that other programs can play
+    tactile.mkv       images with light, as a Matroska video
+    frames.jsonl      one line for each image: time, proof of the light, and position in the video file
+    sensor.json       a copy of the sensor file, with copies of its background images, if there is one
 
-An image is written before its line. After an interruption at any moment, all lines but an unfinished last one are of
-complete images.
+Each image is written before its line in frames.jsonl. After an interruption at any time, each complete line therefore
+refers to a complete image.
 """
 
 import dataclasses
@@ -33,19 +33,19 @@ from sts_jax.hardware.session import Origin
 from sts_jax.hardware.settling import Settling
 from sts_jax.hardware.shots import Shot
 
-FORMAT = 1  # of the files of a recording, incremented when older files can no longer be read
+FORMAT = 1  # version of the format of a recording. Incremented when older files can no longer be read
 HEAD, FRAMES = "recording.json", "frames.jsonl"
 
 _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
 
 
 def video_name(stream: str) -> str:
-    """The file of a stream in the folder of a recording."""
+    """Return the name of the video file of a stream, "visual" or "tactile"."""
     return f"{stream}.mkv"
 
 
 class Recorder:
-    """Writes the images of a sensor to a folder, which `Replay` plays back.
+    """Writes the images of a sensor to a folder. `Replay` plays the recording back.
 
     ```python
     with hardware.STS.from_file("bench") as sensor:
@@ -54,8 +54,12 @@ class Recorder:
                 recorder.add(shot)
     ```
 
-    When `add` returns, the image is in its file, also if the process is killed afterwards. A power failure can lose the
+    When `add` returns, the image is in its file and survives if the process is killed. A power failure can lose the
     last seconds, which the operating system has not written to the disk yet.
+
+    Attributes:
+        folder: Folder of the recording.
+        counts: Number of recorded images of each stream, a dictionary with the keys "visual" and "tactile".
     """
 
     def __init__(
@@ -67,31 +71,32 @@ class Recorder:
         encoding: str = "png",
         file: str | os.PathLike | None = None,
     ):
-        """Make the folder.
+        """Create the folder and write `recording.json`.
 
         Args:
-            folder: A new or an empty folder.
-            origin: The sensor.
-            settling: Its settling times, kept for the reader.
+            folder: Folder of the recording. It must be empty, or it is created.
+            origin: Identity of the sensor.
+            settling: Settling times of the sensor's lights, which are stored with the recording. None: not stored.
             encoding: "png" is lossless. "jpeg" (quality 95, full colour resolution) needs about a fifth of the space.
-            file: The sensor file, of which a copy is kept with the recording. None: there is none.
+            file: Path of the sensor file or of its folder. The file is copied into the recording. None: there is none.
 
         Raises:
             FileExistsError: The folder is not empty.
             ValueError: The encoding is unknown.
+            FileNotFoundError: There is no such sensor file.
             SensorFileError: The sensor file is damaged.
             OSError: The folder cannot be written to.
         """
         if encoding not in matroska.CODECS:
             raise ValueError(f"encoding must be one of {', '.join(matroska.CODECS)}, got {encoding!r}")
         self.folder = Path(folder)
-        self.counts = {"visual": 0, "tactile": 0}  # images on disk
+        self.counts = {"visual": 0, "tactile": 0}
         self._encoding = encoding
         self._start_s: float | None = None  # time of the first image (s)
         self._size = origin.height, origin.width
         self._files: dict[str, int] = {}  # open file descriptors, by name
         if self.folder.exists() and (not self.folder.is_dir() or any(self.folder.iterdir())):
-            raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new one.")
+            raise FileExistsError(f"{self.folder} is not an empty folder: give the name of a new folder.")
         self.folder.mkdir(parents=True, exist_ok=True)
         if file is not None:
             _copy_sensor(sensor_file(file), self.folder)
@@ -107,19 +112,19 @@ class Recorder:
         )
 
     def add(self, shot: Shot) -> None:
-        """Write an image.
+        """Write an image to the video file of its stream.
 
         Args:
-            shot: An image that is later than the ones before.
+            shot: Image to write. It must be later than all images that were added before.
 
         Raises:
-            ValueError: The image has another size than those of the sensor.
-            OSError: The disk is full or the folder is not writable. Everything that was added before is kept.
+            ValueError: The image has another size than the images of the sensor.
+            OSError: The disk is full or the folder is not writable. All images that were added before are kept.
         """
         height, width = self._size
         if shot.image.shape != (height, width, 3):
             raise ValueError(
-                f"the {shot.stream} image has shape {shot.image.shape}, but those of the recording have "
+                f"the {shot.stream} image has shape {shot.image.shape}, but the images of this recording have "
                 f"{(height, width, 3)}: make a new recording for another size."
             )
         self._start_s = shot.time_s if self._start_s is None else self._start_s
@@ -156,12 +161,22 @@ class Recorder:
         self.close()
 
     def _encoded(self, shot: Shot) -> bytes:
+        """Encode the image as PNG or JPEG."""
         if self._encoding == "png":
             return encoded(shot.image)
         return cv2.imencode(".jpg", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), _QUALITY)[1].tobytes()
 
     def _append(self, name: str, data: bytes, head: bytes = b"") -> int:
-        """Append to a file, which begins with `head`, and return its new size. An error leaves the file as it was."""
+        """Append data to a file. If writing fails, the file is unchanged.
+
+        Args:
+            name: Name of the file in the folder.
+            data: Data to append.
+            head: Data that is written first if the file is empty.
+
+        Returns:
+            New size of the file (bytes).
+        """
         path = self.folder / name
         try:
             if name not in self._files:
@@ -184,7 +199,7 @@ class Recorder:
 
 
 def _copy_sensor(file: Path, folder: Path) -> None:
-    """Copy a sensor file and its backgrounds."""
+    """Copy a sensor file and its background images into a folder."""
     device = Device.load(file)
     for background in (device.background_visual, device.background_tactile):
         if background is not None:

@@ -1,15 +1,16 @@
-"""Trajectories of the real sensor on disk: their format, reading, and review.
+"""Reading, confirming and discarding the recorded trajectories of the real sensor.
 
-A session is a folder:
+A session is a folder of trajectories of one sensor. A trajectory consists of a pair of images of the held object
+(`initial`) and a pair of the object at rest (`final`):
 
-    session.json                       the sensor, and the version of the format
+    session.json                       the identity of the sensor, and the version of the format
     trajectories/00012/initial/        visual.png, tactile.png and pair.json
-    trajectories/00012/final/          likewise
-    trajectories/00012/confirmed.json  written last. A trajectory without it does not count
+    trajectories/00012/final/          the same files
+    trajectories/00012/confirmed.json  written last. A trajectory without this file is not confirmed
     discarded/00013/                   a trajectory that was discarded
 
-A folder `initial` or `final` appears at once, when all its files are on disk. `confirmed.json` holds the checksums of
-both `pair.json`, which hold those of the images.
+A folder `initial` or `final` appears only when all its files are on disk. `confirmed.json` contains the checksums of
+the two `pair.json`, and each `pair.json` contains the checksums of its images.
 """
 
 import contextlib
@@ -34,12 +35,12 @@ from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.settling import Settling
 from sts_jax.hardware.shots import Pair, Shot, Stream
 
-FORMAT = 1  # of the files of a session, incremented when older files can no longer be read
+FORMAT = 1  # version of the format of a session. Incremented when older files can no longer be read
 SESSION, CONFIRMED, PAIR = "session.json", "confirmed.json", "pair.json"
 TRAJECTORIES, DISCARDED = "trajectories", "discarded"
 _ENDS: tuple[End, End] = ("initial", "final")
 _STREAMS: tuple[Stream, Stream] = ("visual", "tactile")
-# Filtered and Huffman coded: as small as deflate for images with noise, and fast enough.
+# Filters and Huffman codes only, because full deflate is slower and does not make noisy images smaller.
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 
 Standing = Literal["confirmed", "unconfirmed", "incomplete", "discarded"]
@@ -48,26 +49,26 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordedTrajectory:
-    """The two ends of a trajectory as they were collected."""
+    """A confirmed trajectory: the raw images at its beginning and at its end."""
 
-    number: int
-    initial: Pair  # while the object was held
-    final: Pair  # when it rested
+    number: int  # number of the trajectory in its session
+    initial: Pair  # images of the held object
+    final: Pair  # images of the object at rest
     confirmed: str  # date and time of the confirmation, ISO 8601, UTC
-    note: str
+    note: str  # text that was stored with the confirmation, may be empty
 
 
 class Entry(NamedTuple):
-    """A trajectory in the listing of a session."""
+    """The number and the state of a trajectory, as `list_recordings` returns them."""
 
-    number: int
-    standing: Standing  # "unconfirmed": both pairs are there. "incomplete": a pair is missing
-    taken: str | None  # date and time of the first image, ISO 8601, UTC, None: there is no pair
-    note: str
+    number: int  # number of the trajectory in its session
+    standing: Standing  # "unconfirmed": both pairs exist. "incomplete": a pair is missing
+    taken: str | None  # date and time of the initial visual image, ISO 8601, UTC. None: there is none
+    note: str  # text that was stored with the confirmation, may be empty
 
 
 class Images(NamedTuple):
-    """The images of all confirmed trajectories, in the order of their numbers."""
+    """The images of all confirmed trajectories, RGB, ordered by the numbers of the trajectories."""
 
     initial_visual: UInt8[np.ndarray, "n height width 3"]
     initial_tactile: UInt8[np.ndarray, "n height width 3"]
@@ -76,12 +77,20 @@ class Images(NamedTuple):
 
 
 class Recordings:
-    """The confirmed trajectories of a session. Images are read, and their checksums compared, when they are used.
+    """The confirmed trajectories of a session, a sequence of `RecordedTrajectory`.
 
     ```python
     for trajectory in hardware.load_recordings("runs/real/dataset"):
         trajectory.initial.visual.image, trajectory.final.tactile.image
     ```
+
+    A trajectory is read from disk, and its checksums are compared, each time it is accessed. The list of trajectories
+    is that at the time of loading.
+
+    Attributes:
+        folder: Folder of the session.
+        session: Content of `session.json`: the fields of `Origin`, and the version of the format.
+        numbers: Numbers of the confirmed trajectories.
     """
 
     def __init__(self, folder: str | os.PathLike):
@@ -95,15 +104,17 @@ class Recordings:
 
     @property
     def identity(self) -> str:
-        """SHA-256 of the checksums of all confirmed trajectories. It changes if one is added, discarded or replaced."""
+        """SHA-256 checksum of the confirmed trajectories. It changes if one is added, discarded or replaced."""
         files = {number: trajectory_folder(self.folder, number) / CONFIRMED for number in self.numbers}
         return _files.digest({str(number): _files.sha256(file) for number, file in files.items()})
 
     def __getitem__(self, index: int) -> RecordedTrajectory:
-        """The trajectory at an index, which is not its number.
+        """Read the trajectory at an index of `numbers`. The index differs from the trajectory's number.
 
         Raises:
-            TornFileError: A file is missing or damaged.
+            IndexError: The index is out of range.
+            FileNotFoundError: The trajectory has been discarded meanwhile.
+            TornFileError: A file of the trajectory is missing or damaged.
         """
         return read_trajectory(self.folder, self.numbers[index])
 
@@ -111,19 +122,26 @@ class Recordings:
         return (read_trajectory(self.folder, number) for number in self.numbers)
 
     def images(self, convert: Callable[[Image], Image] = lambda image: image) -> Images:
-        """All images as arrays.
+        """Read the images of all trajectories into arrays.
 
-        500 trajectories of 1640 x 1232 need 12 GB, so reduce the images by `convert` there.
+        The raw images of 500 trajectories of 1640 x 1232 pixels need 12 GB of memory. `convert` can make them smaller.
 
         Args:
-            convert: Applied to each raw image, such as a rectification or a reduction. All results need the same shape.
+            convert: Function that is applied to each raw image, such as a rectification or a resize. All its results
+                must have the same shape.
+
+        Returns:
+            Four arrays, one for each stream of the initial and of the final pairs.
 
         Raises:
             TornFileError: A file is missing or damaged.
             ValueError: There is no confirmed trajectory.
         """
         if not self.numbers:
-            raise ValueError(f"{self.folder} has no confirmed trajectory: collect some, or confirm them in the review.")
+            raise ValueError(
+                f"{self.folder} has no confirmed trajectory: collect trajectories, or confirm existing ones with "
+                "`python -m experiments.real review --confirm NUMBER`."
+            )
         rows = [
             [convert(shot.image) for pair in (t.initial, t.final) for shot in (pair.visual, pair.tactile)] for t in self
         ]
@@ -134,35 +152,53 @@ class Recordings:
 
 
 def load_recordings(folder: str | os.PathLike) -> Recordings:
-    """Open the confirmed trajectories of a session for reading. Another process may collect meanwhile.
+    """List the confirmed trajectories of a session, whose images are read later. Another process may be collecting.
+
+    Args:
+        folder: Folder of the session, which contains `session.json`.
+
+    Returns:
+        The confirmed trajectories, in the order of their numbers.
 
     Raises:
         FileNotFoundError: There is no session in the folder.
         TornFileError: `session.json` is damaged.
-        ValueError: The session was written by another version of the format.
+        ValueError: The session has another version of the format.
     """
     return Recordings(folder)
 
 
 def read_session(folder: Path) -> dict[str, Any]:
-    """The content of `session.json`."""
+    """Read `session.json` and check its version. `load_recordings` lists the errors."""
     path = folder / SESSION
     try:
         content = _files.read_json(path, "restore it from a backup")
     except FileNotFoundError:
-        raise FileNotFoundError(f"{folder} holds no session ({SESSION} is missing): give the folder of one.") from None
+        raise FileNotFoundError(
+            f"{folder} holds no session ({SESSION} is missing): give the folder of a session."
+        ) from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = content.get("format") if isinstance(content, dict) else None
-        raise ValueError(f"{path} has format {found!r}, but this version of sts_jax reads format {FORMAT}.")
+        raise ValueError(
+            f"{path} has format {found!r}, but this version of sts_jax reads format {FORMAT}. Read it with the version "
+            "of sts_jax that wrote it."
+        )
     return content
 
 
 def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") -> None:
-    """Confirm a trajectory after the session, so that it counts.
+    """Confirm a trajectory after collecting, so that `load_recordings` includes it.
+
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
+        note: Text that is stored with the trajectory.
 
     Raises:
-        LockedError: Another process collects into the folder.
+        LockedError: Another process is using the folder.
         FileNotFoundError: There is no such session or trajectory, or a pair is missing.
+        TornFileError: `session.json` is damaged.
+        ValueError: The session has another version of the format.
     """
     with _locked(folder) as session:
         confirm_trajectory(session, number, note)
@@ -171,20 +207,34 @@ def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") ->
 def discard_recording(folder: str | os.PathLike, number: int) -> None:
     """Move a trajectory to the folder `discarded`. Nothing is deleted.
 
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
+
     Raises:
-        LockedError: Another process collects into the folder.
+        LockedError: Another process is using the folder.
         FileNotFoundError: There is no such session or trajectory.
+        FileExistsError: There is a discarded trajectory of the same number.
+        TornFileError: `session.json` is damaged.
+        ValueError: The session has another version of the format.
     """
     with _locked(folder) as session:
         discard_trajectory(session, number)
 
 
 def restore_recording(folder: str | os.PathLike, number: int) -> None:
-    """Move a trajectory back from the folder `discarded`. It counts again if it was confirmed.
+    """Move a trajectory back from the folder `discarded`. If it was confirmed before, it is confirmed again.
+
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
 
     Raises:
-        LockedError: Another process collects into the folder.
+        LockedError: Another process is using the folder.
         FileNotFoundError: There is no such session or discarded trajectory.
+        FileExistsError: There is another trajectory of the same number.
+        TornFileError: `session.json` is damaged.
+        ValueError: The session has another version of the format.
     """
     with _locked(folder) as session:
         restore_trajectory(session, number)
@@ -192,6 +242,7 @@ def restore_recording(folder: str | os.PathLike, number: int) -> None:
 
 @contextlib.contextmanager
 def _locked(folder: str | os.PathLike) -> Iterator[Path]:
+    """Check that a folder is a session, and lock it."""
     path = Path(folder)
     read_session(path)
     with _files.lock(path):
@@ -199,15 +250,23 @@ def _locked(folder: str | os.PathLike) -> Iterator[Path]:
 
 
 def trajectory_folder(folder: Path, number: int, *, discarded: bool = False) -> Path:
-    """The folder of a trajectory."""
+    """Return the folder of a trajectory in the folder of a session."""
     return folder / (DISCARDED if discarded else TRAJECTORIES) / f"{number:05d}"
 
 
 def list_recordings(folder: str | os.PathLike) -> list[Entry]:
-    """All trajectories of a session, by number.
+    """List all trajectories of a session, also unconfirmed and discarded ones.
+
+    Args:
+        folder: Folder of the session.
+
+    Returns:
+        One entry for each trajectory, ordered by number.
 
     Raises:
         FileNotFoundError: There is no session in the folder.
+        TornFileError: `session.json` is damaged.
+        ValueError: The session has another version of the format.
     """
     folder = Path(folder)
     read_session(folder)
@@ -216,11 +275,19 @@ def list_recordings(folder: str | os.PathLike) -> list[Entry]:
 
 
 def next_recording(folder: str | os.PathLike) -> int:
-    """The number of a session's next trajectory, after all that were ever given. 0 if there is no session yet."""
+    """Return the number of the next trajectory of a session.
+
+    Args:
+        folder: Folder of the session.
+
+    Returns:
+        The largest number of all trajectories, also discarded ones, plus 1. 0 if there is no trajectory or no session.
+    """
     return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
 
 
 def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
+    """The kind ("trajectories" or "discarded"), the number and the folder of each trajectory."""
     for kind in (TRAJECTORIES, DISCARDED):
         for path in (folder / kind).glob("[0-9]*"):
             if path.name.isdecimal() and path.is_dir():
@@ -228,13 +295,14 @@ def _numbered(folder: Path) -> Iterator[tuple[str, int, Path]]:
 
 
 def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
+    """The entry of the trajectory in a folder. Damaged files are ignored here."""
     ends = [path / end / PAIR for end in _ENDS]
     taken, note = None, ""
     try:
         taken = json.loads(ends[0].read_bytes())["visual"]["taken"]
         note = json.loads((path / CONFIRMED).read_bytes())["note"]
     except (OSError, ValueError, KeyError, TypeError):
-        pass  # reading the trajectory names the damage
+        pass  # reading the trajectory later raises an error that names the damaged file
     standing: Standing = "discarded"
     if not discarded:
         complete = all(end.exists() for end in ends)
@@ -243,7 +311,15 @@ def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
 
 
 def encoded_pair(pair: Pair, settling: Settling | None) -> dict[str, bytes]:
-    """The files of a pair, by name."""
+    """Encode a pair as the content of its files.
+
+    Args:
+        pair: The images and their proofs.
+        settling: Settling times to store with the pair. None: not stored.
+
+    Returns:
+        Content of each file, by name.
+    """
     files: dict[str, bytes] = {}
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -266,7 +342,7 @@ def encoded_pair(pair: Pair, settling: Settling | None) -> dict[str, bytes]:
 
 
 def encoded(image: Image) -> bytes:
-    """An RGB image as PNG."""
+    """Encode an RGB image as PNG."""
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG)
     if not done:
         raise ValueError(f"an image of shape {image.shape} cannot be encoded as PNG")
@@ -274,7 +350,12 @@ def encoded(image: Image) -> bytes:
 
 
 def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
-    """Mark a trajectory as good. It counts from then on. The caller holds the lock of the session.
+    """Confirm a trajectory by writing its file `confirmed.json`. The caller must have locked the session.
+
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
+        note: Text that is stored with the trajectory.
 
     Raises:
         FileNotFoundError: A pair is missing.
@@ -289,6 +370,7 @@ def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
 
 
 def _pair_sum(path: Path, end: str) -> str:
+    """The SHA-256 of the file `pair.json` of a pair."""
     file = path / end / PAIR
     if not file.exists():
         raise FileNotFoundError(f"trajectory {path.name} has no {end} pair, so it cannot be confirmed: discard it.")
@@ -296,20 +378,22 @@ def _pair_sum(path: Path, end: str) -> str:
 
 
 def discard_trajectory(folder: Path, number: int) -> None:
-    """Move a trajectory to `discarded`. Nothing is deleted. The caller holds the lock of the session.
+    """Move a trajectory to the folder `discarded`. Nothing is deleted. The caller must have locked the session.
 
     Raises:
         FileNotFoundError: There is no such trajectory.
+        FileExistsError: There is a discarded trajectory of the same number.
         OSError: The folder cannot be moved.
     """
     _move(trajectory_folder(folder, number), trajectory_folder(folder, number, discarded=True))
 
 
 def restore_trajectory(folder: Path, number: int) -> None:
-    """Move a trajectory back from `discarded`. It counts again if it was confirmed. The caller holds the lock.
+    """Move a trajectory back from the folder `discarded`. The caller must have locked the session.
 
     Raises:
-        FileNotFoundError: There is no such trajectory.
+        FileNotFoundError: There is no such discarded trajectory.
+        FileExistsError: There is another trajectory of the same number.
         OSError: The folder cannot be moved.
     """
     _move(trajectory_folder(folder, number, discarded=True), trajectory_folder(folder, number))
@@ -319,7 +403,10 @@ def _move(source: Path, target: Path) -> None:
     if not source.is_dir():
         raise FileNotFoundError(f"{source} does not exist: list the trajectories to see their numbers.")
     if target.exists():
-        raise FileExistsError(f"{target} exists: rename one of them and {source}, so that no number occurs twice.")
+        raise FileExistsError(
+            f"{source} cannot be moved to {target}, which exists already: rename one of the two folders to an "
+            "unused number."
+        )
     target.parent.mkdir(parents=True, exist_ok=True)
     source.rename(target)
     for path in (target.parent, source.parent):
@@ -336,24 +423,29 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
     path = trajectory_folder(folder, number)
     file = path / CONFIRMED
     if not file.exists():
-        raise FileNotFoundError(f"{folder} has no confirmed trajectory {number}: list the trajectories.")
+        raise FileNotFoundError(
+            f"{folder} has no confirmed trajectory {number}: list the trajectories to see their numbers."
+        )
     content = _files.read_json(file, _remedy(number))
     checksum = content.pop("checksum", None) if isinstance(content, dict) else None
     if checksum != _files.digest(content):
         raise TornFileError(f"{file} is damaged, because its checksum differs: {_remedy(number)}.")
     if content["number"] != number:
-        raise TornFileError(f"{file} is of trajectory {content['number']}: rename the folder, or discard it.")
+        raise TornFileError(
+            f"{file} belongs to trajectory {content['number']}, not to trajectory {number}: rename the folder to "
+            f"{content['number']:05d}, or discard trajectory {number}."
+        )
     initial, final = (read_pair(path / end, number, content[end]) for end in _ENDS)
     return RecordedTrajectory(number, initial, final, content["confirmed"], content["note"])
 
 
 def read_pair(path: Path, number: int, checksum: str | None = None) -> Pair:
-    """Read a pair and compare its checksums.
+    """Read a pair and compare the checksums of its images.
 
     Args:
-        path: The folder of the pair.
-        number: The trajectory, for messages.
-        checksum: SHA-256 of `pair.json`. None: not compared.
+        path: Folder of the pair.
+        number: Number of the trajectory, for error messages.
+        checksum: Expected SHA-256 of `pair.json`. None: not compared.
 
     Raises:
         TornFileError: A file is missing or damaged.
@@ -371,6 +463,7 @@ def read_pair(path: Path, number: int, checksum: str | None = None) -> Pair:
 
 
 def _checked(path: Path, checksum: str | None, number: int) -> bytes:
+    """Read a file and compare its checksum, unless that is None."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -381,4 +474,5 @@ def _checked(path: Path, checksum: str | None, number: int) -> bytes:
 
 
 def _remedy(number: int) -> str:
+    """The remedy for a damaged trajectory, for error messages."""
     return f"restore it from a backup, or discard trajectory {number}"

@@ -1,4 +1,4 @@
-"""`Replay`: a recording of both streams that is read like a sensor."""
+"""`Replay`: plays back a recording of both streams, with the methods of a connected sensor."""
 
 import bisect
 import itertools
@@ -16,7 +16,9 @@ from sts_jax.hardware.sensor_file import Device, sensor_file
 from sts_jax.hardware.shots import LightError, Pair, Shot, Stream
 from sts_jax.hardware.sts import first_still, stream_order
 
-_LATE_S = 0.25  # s by which an image may be late. The buffer of a sensor's camera holds as much at 30 frames a second
+# Largest delay at which `stream` still returns an image (s). The buffer of a real sensor's camera holds 8 frames, which
+# are about as much at 30 frames per second.
+_LATE_S = 0.25
 
 
 class Replay:
@@ -27,12 +29,16 @@ class Replay:
         pair = sensor.read()
     ```
 
-    Images come at the times at which they came from the sensor. Whoever reads too slowly misses images, as at a sensor,
-    and `skipped` counts them. With `speed=None` every image is returned, as fast as it is read. The times of a `Shot`
-    are those of the recording, shifted to the clock `time.monotonic` and divided by the speed.
+    The replay imitates the timing of the sensor: each image becomes available as long after `connect` as it arrived
+    after the beginning of the recording. A program that reads too slowly misses images, as with a sensor, and `skipped`
+    counts them. With `speed=None`, the replay waits for the program instead and returns every image.
 
-    The lights cannot be switched, so the order of the streams is that of the recording. One thread may use a replay at
-    a time.
+    The times of a `Shot` are on the clock `time.monotonic`. Differences of times are those of the recording, divided by
+    the speed. A replay cannot switch lights, so the images of both streams have their recorded order. Only one thread
+    at a time may use a replay.
+
+    Attributes:
+        skipped: Number of images since `connect` that were not returned because the program read too slowly.
     """
 
     def __init__(
@@ -43,68 +49,75 @@ class Replay:
         loop: bool = False,
         fps: float | None = None,
     ):
-        """Keep the configuration. `connect` opens the files.
+        """Store the configuration. `connect` opens the files.
 
         Args:
-            source: Folder of a recording, which `Recorder` wrote, or two video files of equal length: the visual and
-                the tactile stream, whose frames of equal number belong together. Nothing proves their light, so
-                `before` and `until_s` of their images have NaN as times.
-            speed: Recorded seconds in a second. None: as fast as it is read, and without loss.
-            loop: Start again at the end. `Shot.epoch` counts on. Without it, the end raises `EndOfVideoError`.
-            fps: Frames per second of the videos. None: by the header of the visual one.
+            source: Folder of a recording that `Recorder` wrote, or the paths of two video files, the visual stream
+                first. Frames of the two videos with the same number form a pair, so the videos must have the same
+                length (a difference of one frame is allowed). Videos contain no proof of the light, so all times in
+                `Shot.before` and `Shot.until_s` are NaN.
+            speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads,
+                without missing images.
+            loop: If True, the replay starts again at the end, and `Shot.epoch` continues to increase. If False, reading
+                beyond the end raises `EndOfVideoError`.
+            fps: Frame rate of the two videos (frames per second). None: the rate in the header of the visual video.
 
         Raises:
-            ValueError: The speed is not positive, or `fps` is given for a recording.
+            ValueError: `speed` is not positive and finite, or `fps` is given for a recording.
         """
         if speed is not None and not (speed > 0 and math.isfinite(speed)):
             raise ValueError(f"speed must be > 0 and finite, or None, got {speed}")
         if fps is not None and not isinstance(source, tuple):
-            raise ValueError(f"fps is {fps}, but a recording has its own times: leave it out.")
+            raise ValueError(f"fps is {fps}, but a recording has its own times: leave fps out.")
         self._source, self._fps = source, fps
         self._speed, self._loop = speed, loop
         self._name = " and ".join(map(str, source)) if isinstance(source, tuple) else str(source)
         self._film: Film | None = None
-        self.skipped = 0  # images that were not returned because they came too late to the reader
+        self.skipped = 0
 
     @classmethod
     def from_file(cls, path: str | os.PathLike, *, speed: float | None = 1.0, loop: bool = False) -> "Replay":
-        """The recording that belongs to a sensor file, as `STS.from_file`.
+        """Create a replay from the copy of the sensor file in a recording. The counterpart of `STS.from_file`.
 
         Args:
-            path: Path of the copy of the sensor file in a recording, or of the recording.
-            speed: As in `Replay`.
-            loop: As in `Replay`.
+            path: Path of the sensor file in the folder of a recording, or path of this folder.
+            speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads.
+            loop: If True, the replay starts again at the end.
 
         Returns:
             The replay, which is not connected yet.
+
+        Raises:
+            ValueError: `speed` is not positive and finite.
         """
         return cls(sensor_file(path).parent, speed=speed, loop=loop)
 
     @property
     def device(self) -> Device | None:
-        """The content of the sensor file that was recorded with the images, or None if there is none.
+        """The device that the sensor file in the recording describes, or None if the recording has no such file.
 
         Raises:
-            SensorFileError: The file is damaged.
+            SensorFileError: The sensor file is damaged.
         """
         if isinstance(self._source, tuple) or not sensor_file(self._source).exists():
             return None
         return Device.load(self._source)
 
     def connect(self, warmup_s: float = 0.0) -> "Replay":
-        """Open the files, and start the clock of the replay.
+        """Open the files and start the replay, or start it again from the beginning.
 
         Args:
-            warmup_s: Time before the first image (s).
+            warmup_s: Time before the first image becomes available (s).
 
         Returns:
             This replay.
 
         Raises:
-            FileNotFoundError: There is no recording, or a file of it is missing.
+            FileNotFoundError: There is no recording, or one of its files is missing.
             TornFileError: A file of the recording is damaged or truncated.
             CameraError: A video cannot be read.
-            ValueError: The recording is empty or of another format, or two videos have different lengths.
+            ValueError: `warmup_s` or `fps` is out of range, the recording is empty or of another format, or the two
+                videos have different lengths.
         """
         if not 0 <= warmup_s < math.inf:
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -116,31 +129,40 @@ class Replay:
         self._pairs = _paired(stills)
         self._times_s = [still.time_s - stills[0].time_s for still in stills]
         steps = sorted(b - a for a, b in itertools.pairwise(self._times_s) if b > a) or [0.0]
-        self._length_s = self._times_s[-1] + steps[len(steps) // 2]  # of a lap
+        # A lap is one run through the recording. With `loop`, the numbers of images continue over all laps.
+        self._length_s = self._times_s[-1] + steps[len(steps) // 2]  # duration of a lap (s)
         self._epochs = 1 + max(still.epoch for still in stills) - min(still.epoch for still in stills)
-        self._position = 0  # number of the next image, counted on over all laps
+        self._position = 0  # number of the next image
         self._newest: tuple[int, int] | None = None  # numbers of the newest pair of `async_read` and `read_latest`
-        self._fresh = False  # whether `async_read` has not returned it yet
+        self._fresh = False  # True until `async_read` has returned the newest pair
         self.skipped = 0
         self._film, self._start_s = film, time.monotonic() + warmup_s
         return self
 
     def disconnect(self) -> None:
-        """Close the files. Without a connection, it does nothing."""
+        """Close the files. If the replay is not connected, nothing happens."""
         film, self._film = self._film, None
         if film is not None:
             film.close()
 
     def read(self, timeout_ms: float | None = None) -> Pair:
-        """Return the next pair whose two images come after the call. With `speed=None`: the next pair.
+        """Return the next pair whose two images become available after the call.
+
+        With `speed=None`, this is the pair after the last one that was returned.
 
         Args:
-            timeout_ms: Longest wait (ms), None: until it comes.
+            timeout_ms: Longest wait (ms). None: no limit.
+
+        Returns:
+            The pair.
 
         Raises:
-            LightError: No pair comes in time.
+            ValueError: `timeout_ms` is not positive.
+            CameraNotConnectedError: The replay is not connected.
+            LightError: No pair becomes available in time.
             EndOfVideoError: There are no more pairs.
-            CameraError: The recording has images of one stream only.
+            CameraError: The recording contains no pair, for example because it has images of one stream only.
+            TornFileError: An image of the recording is damaged.
         """
         self._opened()
         limit_s = _limit_s(timeout_ms)
@@ -150,9 +172,23 @@ class Replay:
         return self._waited(self._pair_from(self._position), limit_s)
 
     def async_read(self, timeout_ms: float | None = None) -> Pair:
-        """Return the newest pair that has come and was not returned yet, or wait for the next one.
+        """Return the newest available pair that was not returned yet, or wait for the next one.
 
-        Args and errors are those of `read`.
+        With `speed=None`, this is the pair after the last one that was returned.
+
+        Args:
+            timeout_ms: Longest wait (ms). None: no limit.
+
+        Returns:
+            The pair.
+
+        Raises:
+            ValueError: `timeout_ms` is not positive.
+            CameraNotConnectedError: The replay is not connected.
+            LightError: No pair becomes available in time.
+            EndOfVideoError: There are no more pairs.
+            CameraError: The recording contains no pair, for example because it has images of one stream only.
+            TornFileError: An image of the recording is damaged.
         """
         self._opened()
         limit_s = _limit_s(timeout_ms)
@@ -161,25 +197,32 @@ class Replay:
         return self._waited(pair, limit_s)
 
     def read_latest(self, max_age_ms: float = 500.0) -> Pair:
-        """Return the newest pair that has come, without waiting. The same pair may be returned several times.
+        """Return the newest available pair without waiting. The same pair may be returned several times.
 
         Args:
-            max_age_ms: Largest allowed time since the older of its images has come (ms).
+            max_age_ms: Largest allowed time since the older image of the pair became available (ms). With
+                `speed=None`, it has no effect.
+
+        Returns:
+            The pair. With `speed=None`, it is the pair that `read` or `async_read` returned last.
 
         Raises:
-            StaleFrameError: The newest pair is older, or there is none yet.
-            EndOfVideoError: The newest pair is older, and there are no more.
-            CameraError: The recording has images of one stream only.
+            ValueError: `max_age_ms` is not positive.
+            CameraNotConnectedError: The replay is not connected.
+            StaleFrameError: The newest pair is older than `max_age_ms`, or no pair is available yet.
+            EndOfVideoError: The newest pair is older than `max_age_ms`, and there are no more pairs.
+            CameraError: The recording contains no pair, for example because it has images of one stream only.
+            TornFileError: An image of the recording is damaged.
         """
         if not max_age_ms > 0:
             raise ValueError(f"max_age_ms must be > 0, got {max_age_ms}")
         self._opened()
         self._look()
         if self._newest is None:
-            raise StaleFrameError("no pair has come yet: call async_read() to wait for the first one.")
+            raise StaleFrameError("no pair is available yet: call async_read() to wait for the first one.")
         age_ms = 0.0 if self._speed is None else 1000 * (time.monotonic() - self._due_s(self._newest[0]))
         if age_ms > max_age_ms:
-            self._pair_from(self._position)  # raises an error at the end
+            self._pair_from(self._position)  # raises `EndOfVideoError` if there are no more pairs
             raise StaleFrameError(
                 f"the newest pair is {age_ms:.0f} ms old, but at most {max_age_ms:g} ms are allowed: raise max_age_ms, "
                 "or call read()."
@@ -187,17 +230,21 @@ class Replay:
         return self._pair(*self._newest)
 
     def stream(self, duty: float | None = None, *, dwell: int = 1) -> Iterator[Shot]:
-        """The images one after the other.
+        """Iterate over the images in the order of the recording.
 
         Args:
-            duty: Share of tactile images, 0 to 1, as in `STS.stream`. Recorded images between those of the wanted
-                stream are left out. None: all images in their order.
-            dwell: As in `STS.stream`. Without effect if `duty` is None.
+            duty: Share of tactile images, 0 to 1, as in `STS.stream`. The streams of the returned images follow from
+                `duty` and `dwell`, and recorded images of the other stream are left out. None: all recorded images.
+            dwell: Number of successive images of one stream, >= 1. It has no effect if `duty` is None.
+
+        Returns:
+            An iterator of images. Each step waits until its image is available. At the end of the recording, it raises
+            `EndOfVideoError`.
 
         Raises:
             ValueError: An argument is out of range.
-            EndOfVideoError: There are no more images.
-            CameraError: The recording has no images of a stream that is asked for.
+            CameraNotConnectedError: The replay is not connected.
+            CameraError: The recording has no images of a stream that `duty` needs.
         """
         self._opened()
         if duty is None:
@@ -209,11 +256,19 @@ class Replay:
         return self._images(order)
 
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
-        """Wait until nothing moves in the visual stream, as `STS.wait_until_still`. Times are those of the recording.
+        """Wait until nothing moves in the visual stream, by the same criterion as `STS.wait_until_still`.
+
+        Args:
+            timeout_s: Longest wait, in the time of the recording (s).
+            window_s: Time without movement, in the time of the recording (s).
+
+        Returns:
+            The last image of the time without movement.
 
         Raises:
-            NotStillError: Something still moves.
-            EndOfVideoError: The recording ends before.
+            NotStillError: Something still moves after `timeout_s`.
+            EndOfVideoError: The recording ends earlier.
+            CameraNotConnectedError: The replay is not connected.
             CameraError: The recording has no visual images.
         """
         scale = self._speed or 1.0
@@ -231,24 +286,29 @@ class Replay:
         return f"Replay({self._name!r}, {'connected' if self._film is not None else 'not connected'})"
 
     def _opened(self) -> Film:
+        """The open recording, or an error if the replay is not connected."""
         if self._film is None:
             raise CameraNotConnectedError(f"the replay of {self._name} is not connected: call connect() first.")
         return self._film
 
     def _due_s(self, number: int) -> float:
-        """The time at which an image comes."""
+        """The time at which an image becomes available (s, `time.monotonic`)."""
         lap, index = divmod(number, len(self._times_s))
         return self._start_s + (lap * self._length_s + self._times_s[index]) / (self._speed or 1.0)
 
     def _first(self, fits: Callable[[int], bool]) -> int:
-        """The number of the first image of the whole replay, in laps without end, that fits a rising condition."""
+        """The number of the first image that fits a condition, if the recording repeats endlessly.
+
+        Args:
+            fits: Condition on the number of an image. All later images must fit it too.
+        """
         end = 1
         while not fits(end - 1):
             end *= 2
         return bisect.bisect_left(range(end), True, key=fits)
 
     def _images(self, streams: Iterator[Stream | None]) -> Iterator[Shot]:
-        """The next images of these streams. None: of any."""
+        """The next image of each of these streams. None: the next image of any stream."""
         for wanted in streams:
             stills = self._opened().stills
             while True:
@@ -262,6 +322,7 @@ class Replay:
             yield self._shot(number)
 
     def _check_end(self, number: int) -> None:
+        """Raise `EndOfVideoError` if there is no image of this number."""
         count = len(self._times_s)
         if not self._loop and number >= count:
             raise EndOfVideoError(
@@ -270,11 +331,11 @@ class Replay:
             )
 
     def _pair_from(self, number: int) -> tuple[int, int]:
-        """The numbers of the first pair whose images have at least this number.
+        """The numbers of both images of the first pair that begins at this number or later.
 
         Raises:
-            EndOfVideoError: There is none.
-            CameraError: The recording has no pair.
+            EndOfVideoError: There is no such pair.
+            CameraError: The recording contains no pair.
         """
         if not self._pairs:
             raise self._one_sided()
@@ -290,18 +351,18 @@ class Replay:
 
     def _one_sided(self) -> CameraError:
         return CameraError(
-            f"{self._name} has {' and '.join(sorted(self._streams))} images only, in an order without pairs: read them "
-            "with stream(), or record both streams."
+            f"{self._name} has {' and '.join(sorted(self._streams))} images only, which form no pairs: read them with "
+            "stream(), or record both streams."
         )
 
     def _look(self) -> None:
-        """Find the newest pair that has come."""
+        """Update `_newest` to the newest pair that is available."""
         if self._speed is None:
             return
         now_s = time.monotonic()
         count = len(self._times_s)
         while True:
-            # Far behind, all pairs but those of the last lap are left out
+            # A reader that is many laps behind skips them at once, without a search for each pair.
             passed = int(max(now_s - self._due_s(self._position), 0) * self._speed / self._length_s) - 1
             self._position += max(passed, 0) * count if self._loop else 0
             try:
@@ -314,12 +375,12 @@ class Replay:
             self._newest, self._fresh, self._position = pair, True, pair[1] + 1
 
     def _waited(self, pair: tuple[int, int], limit_s: float) -> Pair:
-        """Wait for a pair, and return it."""
+        """Wait for the pair with these numbers of images, and return the pair."""
         wait_s = 0.0 if self._speed is None else self._due_s(pair[1]) - time.monotonic()
         if wait_s > limit_s:
             raise LightError(
-                f"the next pair of {self._name} comes in {wait_s:.2f} s, but timeout_ms is {1000 * limit_s:g}: wait "
-                "longer. The recording has a gap here."
+                f"the next pair of {self._name} becomes available in {wait_s:.2f} s, but timeout_ms is "
+                f"{1000 * limit_s:g}: raise timeout_ms. The recording may have a gap here."
             )
         self._newest, self._fresh, self._position = pair, False, max(self._position, pair[1] + 1)
         return self._pair(*pair)
@@ -329,7 +390,7 @@ class Replay:
         return Pair(one, two) if one.stream == "visual" else Pair(two, one)
 
     def _shot(self, number: int) -> Shot:
-        """Wait until an image comes, and read it."""
+        """Wait until the image of a number is available, and read it."""
         film = self._opened()
         lap, index = divmod(number, len(film.stills))
         still, due_s = film.stills[index], self._due_s(number)
@@ -354,7 +415,7 @@ class Replay:
 
 
 def _paired(stills: tuple[Still, ...]) -> list[tuple[int, int]]:
-    """The indices of successive pairs: an image, and the next one of the other stream under the same connection."""
+    """The indices of the images of each pair: two successive images of different streams, from the same connection."""
     pairs, first = [], 0
     for index, still in enumerate(stills):
         one = stills[first]
@@ -368,6 +429,7 @@ def _paired(stills: tuple[Still, ...]) -> list[tuple[int, int]]:
 
 
 def _limit_s(timeout_ms: float | None) -> float:
+    """The limit in seconds, infinite for None."""
     if timeout_ms is None:
         return math.inf
     if not timeout_ms > 0:

@@ -1,4 +1,7 @@
-"""The file of a commissioned sensor: the constants of `sts_jax.Sensor`, and the device that they belong to."""
+"""The file of a commissioned sensor. It contains the constants of `sts_jax.Sensor` and the description of the device.
+
+Commissioning is the measurement of a real sensor by `python -m experiments.commission`, which writes this file.
+"""
 
 import dataclasses
 import datetime
@@ -22,29 +25,33 @@ from sts_jax.hardware import protocol
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.lens import Lens
 
-VERSION = 1  # of the format of the object "device"
-NAME = "sensor.json"  # the file in a folder
+VERSION = 1  # version of the format of the JSON object "device"
+NAME = "sensor.json"  # name of the sensor file in a folder
 
 Stream = Literal["visual", "tactile"]
 
 _COMMISSION = "run `python -m experiments.commission`"
-_WORDS = {float: "a finite number", int: "a whole number", str: "a text"}
+_WORDS = {float: "a finite number", int: "a whole number", str: "a string"}
 
 
 class SensorFileError(ValueError):
-    """The file of a sensor is damaged, incomplete or of another version. The message names it and the remedy."""
+    """Raised if a sensor file is damaged, incomplete or of another version. The message names the file and a remedy."""
 
 
 class WrongDeviceError(SensorFileError):
-    """The file belongs to another camera or another LED controller. The message names both."""
+    """Raised if a sensor file describes another camera or LED controller. The message names both devices."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Background:
-    """An image of the sensor without an object, a PNG file beside the sensor file."""
+    """A raw image of the empty pad, which is stored as a PNG file in the folder of the sensor file.
 
-    name: str  # of the file, without folder
-    sha256: str  # of the file's content, hexadecimal
+    Raises:
+        ValueError: `name` contains a folder, or `sha256` is not a checksum.
+    """
+
+    name: str  # name of the PNG file, without folder
+    sha256: str  # SHA-256 of the PNG file, 64 hexadecimal digits
 
     def __post_init__(self) -> None:
         if not self.name or self.name != Path(self.name).name:
@@ -55,28 +62,28 @@ class Background:
 
 @dataclasses.dataclass(frozen=True)
 class Device:
-    """A commissioned sensor: its camera, lights and lens, and the values that were measured.
+    """The description of a commissioned sensor: its camera, lights and lens, and the values that were measured.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: A value is out of range.
     """
 
-    camera: str  # path in /dev/v4l/by-id, or URL. User name and password of a URL are not kept
-    fps: float  # frames per second
+    camera: str  # path in /dev/v4l/by-id, or URL. The user name and the password of a URL are removed
+    fps: float  # frame rate of the camera (frames per second)
     leds: str  # serial number of the LED controller
-    lens: Lens  # of the raw images, with their width and height and the place of the camera
-    settle_on_s: float  # s, from the acknowledgement of the light to the first frame with the light fully on
-    settle_off_s: float  # s, from the acknowledgement of the light to the first frame with the light fully off
-    levels: protocol.Levels  # duty cycles of the channels for the tactile stream, 0 to 255
-    commissioned: str  # date, ISO 8601
-    exposure_visual: float | None = None  # in the driver's unit, None: not set
-    exposure_tactile: float | None = None  # in the driver's unit, None: not set
-    background_visual: Background | None = None  # raw image, light off
-    background_tactile: Background | None = None  # raw image, light on
-    fourcc: str | None = None  # pixel format of the camera, None: the driver's
-    white_balance: float | None = None  # K, None: not set
-    focus: float | None = None  # in the driver's unit, None: not set
-    lens_from: str = "board"  # "board": calibrated from pictures of a board, "ideal": assumed without error
+    lens: Lens  # lens and pose of the camera, with the width and height of the raw images
+    settle_on_s: float  # time from the acknowledgement that the light is on to the first frame that shows it fully (s)
+    settle_off_s: float  # time from the acknowledgement that the light is off to the first frame fully without it (s)
+    levels: protocol.Levels  # duty cycles of the channels in the tactile stream, 0 to 255
+    commissioned: str  # date of the commissioning, ISO 8601
+    exposure_visual: float | None = None  # exposure of the visual stream in the driver's unit, None: not set
+    exposure_tactile: float | None = None  # exposure of the tactile stream in the driver's unit, None: not set
+    background_visual: Background | None = None  # image of the empty pad without light, None: not recorded
+    background_tactile: Background | None = None  # image of the empty pad with light, None: not recorded
+    fourcc: str | None = None  # pixel format of the camera, such as "MJPG", None: the driver's default
+    white_balance: float | None = None  # white balance of the camera (K), None: not set
+    focus: float | None = None  # focus in the driver's unit, None: not set
+    lens_from: str = "board"  # "board": calibrated from images of a board, "ideal": assumed to be `Lens.ideal`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "camera", _public(self.camera))
@@ -120,16 +127,16 @@ class Device:
 
     @property
     def exposures(self) -> tuple[float, float] | None:
-        """Exposures of the visual and the tactile stream, or None if one of them is not set."""
+        """Exposures of the visual and the tactile stream in the driver's unit, or None if one of them is not set."""
         if self.exposure_visual is None or self.exposure_tactile is None:
             return None
         return self.exposure_visual, self.exposure_tactile
 
     def camera_config(self, source: str | None = None) -> CameraConfig:
-        """The configuration with which the camera was commissioned.
+        """Return the configuration with which the camera was commissioned.
 
         Args:
-            source: another name of the same camera, such as its URL with a password. None: that of the file.
+            source: Another path or URL of the same camera, such as its URL with a password. None: `camera`.
         """
         config = CameraConfig(self.camera if source is None else source, self.width, self.height, fps=self.fps)
         if config.kind != "device":
@@ -150,27 +157,33 @@ class Device:
         visual: NDArray[np.uint8] | None = None,
         tactile: NDArray[np.uint8] | None = None,
     ) -> "Device":
-        """Write one file that both `Device.load` and `sts_jax.Sensor.load` read, and the background images beside it.
+        """Write a sensor file, which `Device.load` and `sts_jax.Sensor.load` read, and its background images.
 
-        Every file is written completely or not at all, the images first. If the process ends in between, an earlier
-        sensor file no longer matches the images, and loading it raises an error.
+        The images are written first. Each file is written completely or not at all. If the process ends in between, an
+        earlier sensor file no longer matches the new images, and `Device.load` raises an error.
 
         Args:
-            path: path of the file, ending in .json, or of a folder, in which the file is `sensor.json`.
-            constants: the constants of the sensor (`sts_jax.Sensor.constants()`). Its camera is the rectified view.
-            visual: raw image without an object and without light, RGB uint8. None: the one that the device names.
-            tactile: raw image without an object, with light, RGB uint8. None: the one that the device names.
+            path: Path of the file, ending in .json, or of a folder, in which the file is named `sensor.json`.
+            constants: The constants of the simulated sensor, from `sts_jax.Sensor.constants()`. Their field `camera`
+                describes the rectified view.
+            visual: Raw image of the empty pad without light, RGB, shape (height, width, 3), uint8. None: keep the file
+                of `background_visual`.
+            tactile: Raw image of the empty pad with light, RGB, shape (height, width, 3), uint8. None: keep the file of
+                `background_tactile`.
 
         Returns:
-            This device with the backgrounds that were written.
+            A copy of this device with the backgrounds that were written.
 
         Raises:
-            SensorFileError: a background that the device names is missing or differs.
-            ValueError: an image has another size than the lens, or `constants` are not those of a sensor.
-            OSError: a file cannot be written.
+            SensorFileError: The file of a background that is kept is missing or damaged.
+            ValueError: An image has another size than the lens or is not uint8, or `constants` are not the constants of
+                a simulated sensor.
+            OSError: A file cannot be written.
         """
         if "camera" not in constants or "device" in constants:
-            raise ValueError("constants must be those of a sensor: pass `sts_jax.Sensor.load(...).constants()`")
+            raise ValueError(
+                "constants must be the constants of a simulated sensor: pass `sts_jax.Sensor.load(...).constants()`"
+            )
         file = sensor_file(path)
         for stream, image in (("visual", visual), ("tactile", tactile)):
             if image is not None:
@@ -186,23 +199,26 @@ class Device:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Device":
-        """Read the device from a file that `save` wrote, and check the images beside it.
+        """Read the device from a sensor file, and compare the checksums of the background images.
 
         Args:
-            path: path of the file or of its folder.
+            path: Path of the sensor file or of its folder.
+
+        Returns:
+            The device.
 
         Raises:
-            FileNotFoundError: there is no such file.
-            OSError: the file cannot be read or is not JSON.
-            SensorFileError: the file has no device or another version, a field is missing, unknown or out of range, or
-                a background image is missing or damaged.
+            FileNotFoundError: There is no such file.
+            OSError: The file cannot be read or is not JSON.
+            SensorFileError: The file describes no device or has another version, a field is missing, unknown or out of
+                range, or a background image is missing or damaged.
         """
         file = sensor_file(path)
         values = _files.read_json(file, f"{_COMMISSION} again")
         device = values.get("device") if isinstance(values, dict) else None
         if not isinstance(device, dict):
             raise SensorFileError(
-                f"{file} describes no device, so it belongs to a simulated sensor. To make the file of a real one, "
+                f"{file} describes no device, so it belongs to a simulated sensor. To make the file of a real sensor, "
                 f"{_COMMISSION}."
             )
         version = device.pop("version", None)
@@ -219,34 +235,35 @@ class Device:
         return loaded
 
     def background(self, path: str | os.PathLike, stream: Stream) -> NDArray[np.uint8]:
-        """Read a background image.
+        """Read the image of the empty pad in one stream.
 
         Args:
-            path: path of the sensor file or of its folder.
-            stream: "visual" or "tactile".
+            path: Path of the sensor file or of its folder.
+            stream: "visual" (without light) or "tactile" (with light).
 
         Returns:
             Raw RGB image, shape (height, width, 3), uint8.
 
         Raises:
-            SensorFileError: no background is recorded for this stream, or its image file is missing or damaged.
+            SensorFileError: No background is recorded for this stream, or its image file is missing or damaged.
+            ValueError: The image has another size than the lens.
         """
         background = self._named(stream)
         if background is None:
-            raise SensorFileError(f"the sensor has no {stream} background. To record it, {_COMMISSION}.")
+            raise SensorFileError(f"the sensor file has no {stream} background. To record it, {_COMMISSION}.")
         image = _checked_image(sensor_file(path).with_name(background.name), background)
         self._check_image(stream, image)
         return image
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
-        """Raise an error if the connected camera or LED controller is not the one of this file.
+        """Raise an error if the connected camera or LED controller is not the one that this device describes.
 
         Args:
-            camera: source of the connected camera. None: not compared.
-            leds: serial number of the connected LED controller. None: not compared.
+            camera: Path or URL of the connected camera. None: the camera is not compared.
+            leds: Serial number of the connected LED controller. None: the controller is not compared.
 
         Raises:
-            WrongDeviceError: one of them differs.
+            WrongDeviceError: The camera or the controller differs.
         """
         found = []
         if camera is not None and _public(camera) != self.camera:
@@ -255,11 +272,12 @@ class Device:
             found.append(f"LED controller {leds}")
         if found:
             raise WrongDeviceError(
-                f"the sensor file is that of camera {self.camera} and LED controller {self.leds}, but the connected "
+                f"the sensor file describes camera {self.camera} and LED controller {self.leds}, but the connected "
                 f"device has {' and '.join(found)}. Load the file of the connected device. To make one, {_COMMISSION}."
             )
 
     def _named(self, stream: Stream) -> Background | None:
+        """The background of a stream, or None if it is not recorded."""
         return self.background_visual if stream == "visual" else self.background_tactile
 
     def _check_image(self, stream: str, image: NDArray[np.uint8]) -> None:
@@ -277,13 +295,17 @@ class Device:
 
 
 def sensor_file(path: str | os.PathLike) -> Path:
-    """The path of a sensor file. `path` is the file or the folder that holds it."""
+    """Return the path of a sensor file.
+
+    Args:
+        path: Path of the file, ending in .json, or of the folder that contains `sensor.json`.
+    """
     path = Path(path)
     return path if path.suffix.lower() == ".json" else path / NAME
 
 
 def _public(source: str) -> str:
-    """A camera's source without the user name and password of a URL."""
+    """The path or URL of a camera without a user name and a password."""
     return re.sub(r"(?<=://)[^/@]*@", "", source)
 
 
@@ -297,18 +319,18 @@ def _written(file: Path, stream: Stream, image: NDArray[np.uint8]) -> Background
 
 
 def _checked_content(path: Path, background: Background) -> bytes:
-    """The content of a background image whose checksum is right."""
+    """Read the file of a background image and compare its checksum."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise SensorFileError(
-            f"the background image {path} cannot be read ({error}). Copy it from where the sensor file comes from, or "
-            f"{_COMMISSION} again."
+            f"the background image {path} cannot be read ({error}). Copy it from the original folder of the sensor "
+            f"file, or {_COMMISSION} again."
         ) from error
     if hashlib.sha256(content).hexdigest() != background.sha256:
         raise SensorFileError(
             f"the background image {path} is damaged or belongs to another sensor file, because its checksum differs. "
-            f"Copy it from where the sensor file comes from, or {_COMMISSION} again."
+            f"Copy it from the original folder of the sensor file, or {_COMMISSION} again."
         )
     return content
 
@@ -319,7 +341,13 @@ def _checked_image(path: Path, background: Background) -> NDArray[np.uint8]:
 
 
 def _decoded(kind: Any, value: Any, name: str) -> Any:
-    """Convert a value of a JSON file to the type of a dataclass's field."""
+    """Convert a value of a JSON file to the type of a dataclass field.
+
+    Args:
+        kind: Type of the field.
+        value: Value in the file.
+        name: Name of the field, for error messages.
+    """
     if typing.get_origin(kind) is types.UnionType:  # `kind | None`
         return None if value is None else _decoded(typing.get_args(kind)[0], value, name)
     if dataclasses.is_dataclass(kind):
@@ -336,6 +364,7 @@ def _decoded(kind: Any, value: Any, name: str) -> Any:
 
 
 def _decoded_dataclass(kind: Any, value: Any, name: str) -> Any:
+    """Convert a JSON object to a dataclass, all of whose fields must be present."""
     kinds = typing.get_type_hints(kind)
     known = [field.name for field in dataclasses.fields(kind)]
     if not isinstance(value, dict):

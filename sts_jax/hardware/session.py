@@ -1,4 +1,4 @@
-"""`Session`: pairs of images are written by a thread as they happen, and nothing confirmed is lost."""
+"""`Session`: a folder to which trajectories of the real sensor are added. A background thread writes the files."""
 
 import collections
 import contextlib
@@ -19,33 +19,41 @@ from sts_jax.hardware.shots import Pair
 from sts_jax.hardware.sts import STS
 
 _JOBS_OF_TRAJECTORY = 3  # two pairs and the confirmation
-_QUEUE = 2 * _JOBS_OF_TRAJECTORY  # jobs that may wait
-_RETRY_S = 1.0  # between attempts to write while the disk is full
+_QUEUE = 2 * _JOBS_OF_TRAJECTORY  # largest number of jobs that may wait
+_RETRY_S = 1.0  # wait after a failed attempt to write (s)
 
 
 class SessionError(OSError):
-    """A session cannot be written. The message lists the changes that are not on disk, the cause and the remedy."""
+    """Raised if a session cannot be written or cannot accept more changes. The message states cause and remedy."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Origin:
-    """The sensor of a session. A session holds images of one sensor only."""
+    """The identity of a sensor, which is stored with its images. All images of a session have the same origin."""
 
     camera: str  # path in /dev/v4l/by-id, or URL without user name, password and port
     leds: str  # serial number of the LED controller
-    width: int  # of the images (pixels)
-    height: int  # of the images (pixels)
+    width: int  # width of the images (pixels)
+    height: int  # height of the images (pixels)
     levels: protocol.Levels  # duty cycles of the channels in the tactile stream, 0 to 255
 
     @classmethod
     def of(cls, sensor: STS) -> "Origin":
-        """The origin of a connected sensor. Waits for a frame, from which the size is taken."""
+        """Return the origin of a sensor.
+
+        Args:
+            sensor: Connected sensor. The size of the images is read from one of its frames.
+
+        Raises:
+            CameraError: The camera sends no frame.
+            CameraNotConnectedError: The sensor is not connected.
+        """
         height, width = sensor.camera.async_read().image.shape[:2]
         return cls(_name(sensor.camera.config), sensor.leds.serial_number, width, height, sensor.levels)
 
 
 def _name(config: CameraConfig) -> str:
-    """A name of a camera that stays when it is replugged, or when a server on this computer gets another port."""
+    """A name of a camera that stays the same if the camera is replugged or its server uses another network port."""
     if config.kind == "stream":
         url = urllib.parse.urlsplit(str(config.source))
         return urllib.parse.urlunsplit((url.scheme, url.hostname or "", url.path, url.query, ""))
@@ -56,15 +64,15 @@ def _name(config: CameraConfig) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """Something that the thread writes."""
+    """A change of the session that the background thread writes to disk."""
 
-    name: str  # for messages
-    run: Callable[[], None]
-    confirms: int | None = None  # the trajectory that it confirms
+    name: str  # description for messages
+    run: Callable[[], None]  # function that writes the change
+    confirms: int | None = None  # number of the trajectory that the change confirms, if any
 
 
 class Session:
-    """A folder to which trajectories are added.
+    """A folder to which trajectories are added, each with an initial and a final pair of images.
 
     ```python
     with Session.open("runs/real/dataset", Origin.of(sensor)) as session:
@@ -77,9 +85,10 @@ class Session:
         session.flush()  # optional, `close` does it too
     ```
 
-    A thread writes, so `save` and `confirm` return at once. What counts in `confirmed` is on disk, also after a loss of
-    power. If the disk is full, the thread tries again every second, and `problem` states it. Pairs wait in memory, of
-    two trajectories at most. `check_ready` therefore stands before each trajectory.
+    A background thread writes the files, so `save` and `confirm` return at once. The trajectories that `confirmed`
+    counts are on disk and survive a loss of power. If writing fails, for example because the disk is full, the thread
+    tries again every second, and `problem` describes the error. Changes that are not on disk yet wait in memory. There
+    is room for the changes of two trajectories, so call `check_ready` before each trajectory.
     """
 
     def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):
@@ -90,27 +99,30 @@ class Session:
         entries = recordings.list_recordings(folder)
         self._confirmed = {entry.number for entry in entries if entry.standing == "confirmed"}
         content = recordings.read_session(folder)
-        self._raw_bytes = 4 * 3 * content["width"] * content["height"]  # of a trajectory
+        self._raw_bytes = 4 * 3 * content["width"] * content["height"]  # uncompressed size of a trajectory's images
         self._changed = threading.Condition()
         self._saved: set[tuple[int, End]] = set()  # pairs that were accepted
         self._jobs: collections.deque[_Job] = collections.deque()  # the first one is being written
-        self._error: Exception | None = None  # of the last attempt
+        self._error: Exception | None = None  # error of the last attempt to write
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="writer of the session", daemon=True)
         self._thread.start()
 
     @classmethod
     def open(cls, folder: str | Path, origin: Origin, *, settling: Settling | None = None) -> "Session":
-        """Start a session, or continue one with the next number.
+        """Start a new session, or continue an existing one.
 
         Args:
-            folder: Folder of the session. It is locked until `close`.
-            origin: The sensor. An existing session must be of the same one.
-            settling: Settling times that prove the lights, which are stored with each pair.
+            folder: Folder of the session. The folder is locked until `close`.
+            origin: Identity of the sensor. An existing session must have the same origin.
+            settling: Settling times of the sensor's lights, which are stored with each pair. None: not stored.
+
+        Returns:
+            The open session. Its first new trajectory has the number after all existing ones, also discarded ones.
 
         Raises:
-            LockedError: Another process collects into the folder.
-            ValueError: The session is of another sensor. The message names both values.
+            LockedError: Another process is using the folder.
+            ValueError: The session has another origin. The message states both values.
             TornFileError: `session.json` is damaged.
             OSError: The folder cannot be written to.
         """
@@ -123,7 +135,7 @@ class Session:
             )
             for kind in (recordings.TRAJECTORIES, recordings.DISCARDED):
                 (folder / kind).mkdir(exist_ok=True)
-            # Left by a process that was killed.
+            # A process that was killed leaves partial files.
             for rest in (*folder.glob(".*.partial"), *folder.glob(f"{recordings.TRAJECTORIES}/*/.*.partial")):
                 shutil.rmtree(rest, ignore_errors=True) if rest.is_dir() else rest.unlink(missing_ok=True)
             _files.flush_folder(folder)
@@ -131,7 +143,7 @@ class Session:
 
     @property
     def confirmed(self) -> int:
-        """Number of confirmed trajectories that are on disk, those that were moved to `discarded` excepted."""
+        """Number of confirmed trajectories that are on disk, without discarded ones."""
         with self._changed:
             return len(self._confirmed)
 
@@ -143,37 +155,44 @@ class Session:
 
     @property
     def problem(self) -> str | None:
-        """Why nothing can be written at present, or None."""
+        """Message of the error that prevents writing at present, or None."""
         with self._changed:
-            return None if self._error is None else f"{self._error} The session itself tries again every second."
+            return None if self._error is None else f"{self._error} The session tries to write again every second."
 
     def check_ready(self) -> None:
-        """Raise an error unless a whole trajectory can be accepted now.
+        """Raise an error unless the session can accept a whole trajectory now.
 
         Raises:
-            SessionError: Writing fails, too much is waiting, or the disk has too little space.
+            SessionError: Writing fails, too many changes wait, or the disk has too little space.
         """
         if (problem := self.problem) is not None:
-            raise SessionError(f"{self.waiting} changes are not on disk yet, but in memory: {problem}")
+            raise SessionError(f"{self.waiting} changes are not on disk yet and wait in memory: {problem}")
         if (waiting := self.waiting) > _QUEUE - _JOBS_OF_TRAJECTORY:
-            raise SessionError(f"the disk is too slow: {waiting} changes are not on disk yet. Wait until they are.")
+            raise SessionError(
+                f"the disk is too slow: {waiting} changes are not on disk yet. Wait until they are written."
+            )
         free = shutil.disk_usage(self.folder).free
-        if free < self._raw_bytes * 2:  # also for the trajectory that may be waiting
+        if free < self._raw_bytes * 2:  # for the new trajectory and for one that may wait
             raise SessionError(
                 f"only {free / 1e6:.0f} MB are free in {self.folder}, and two trajectories need up to "
                 f"{2 * self._raw_bytes / 1e6:.0f} MB: free some disk space."
             )
 
     def begin(self) -> int:
-        """The number of a new trajectory."""
+        """Reserve a number for a new trajectory and return it."""
         number, self._next = self._next, self._next + 1
         return number
 
     def save(self, number: int, end: End, pair: Pair) -> None:
-        """Write a pair in the background.
+        """Write a pair of images in the background.
+
+        Args:
+            number: Number of the trajectory, from `begin`.
+            end: "initial" for the pair of the held object, "final" for the pair of the object at rest.
+            pair: The images.
 
         Raises:
-            SessionError: Too much is waiting. The pair was not accepted.
+            SessionError: Too many changes wait, or the session is closed. The pair was not accepted.
         """
         folder = recordings.trajectory_folder(self.folder, number)
 
@@ -187,11 +206,15 @@ class Session:
         self._saved.add((number, end))
 
     def confirm(self, number: int, note: str = "") -> None:
-        """Mark a trajectory as good, after both pairs were saved. The mark is written in the background.
+        """Confirm a trajectory in the background. Only confirmed trajectories are read by `load_recordings`.
+
+        Args:
+            number: Number of the trajectory, from `begin`. Both of its pairs must have been passed to `save`.
+            note: Text that is stored with the trajectory.
 
         Raises:
-            SessionError: Too much is waiting. The confirmation was not accepted.
-            ValueError: A pair was not saved.
+            SessionError: Too many changes wait, or the session is closed. The confirmation was not accepted.
+            ValueError: A pair was not passed to `save` in this session.
         """
         ends: tuple[End, End] = ("initial", "final")
         if missing := [end for end in ends if (number, end) not in self._saved]:
@@ -202,10 +225,13 @@ class Session:
         self._add(_Job(f"the confirmation of trajectory {number}", write, number))
 
     def discard(self, number: int) -> None:
-        """Move a trajectory to `discarded`, in the background. If nothing of it was saved, nothing happens.
+        """Move a trajectory to the folder `discarded` in the background. Nothing is deleted.
+
+        Args:
+            number: Number of the trajectory. If none of its pairs was saved, nothing happens.
 
         Raises:
-            SessionError: Too much is waiting. The change was not accepted.
+            SessionError: Too many changes wait, or the session is closed. The change was not accepted.
         """
 
         def move() -> None:
@@ -217,10 +243,13 @@ class Session:
         self._add(_Job(f"the move of trajectory {number} to {recordings.DISCARDED}", move))
 
     def flush(self, timeout_s: float = 30.0) -> None:
-        """Wait until everything is on disk.
+        """Wait until all changes are on disk.
+
+        Args:
+            timeout_s: Longest wait (s).
 
         Raises:
-            SessionError: Writing took too long. The message names the changes that are not on disk.
+            SessionError: Changes were not on disk in time. The message lists them and states the cause.
         """
         with self._changed:
             if self._changed.wait_for(lambda: not self._jobs, timeout_s):
@@ -230,10 +259,13 @@ class Session:
         raise SessionError(f"these changes were not on disk after {timeout_s:g} s: {names}. Cause: {cause}")
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Write everything and release the folder.
+        """Wait until all changes are on disk, end the background thread, and unlock the folder.
+
+        Args:
+            timeout_s: Longest wait for the changes (s).
 
         Raises:
-            SessionError: As in `flush`. What is missing is lost.
+            SessionError: Changes were not on disk in time, and are lost. The message lists them and states the cause.
         """
         try:
             self.flush(timeout_s)
@@ -253,9 +285,10 @@ class Session:
         self.close()
 
     def _add(self, job: _Job) -> None:
+        """Append a job to the queue of the background thread."""
         with self._changed:
             if self._closing:
-                raise SessionError("the session is closed: open it again.")
+                raise SessionError(f"the session of {self.folder} is closed: open it again.")
             if len(self._jobs) >= _QUEUE:
                 raise SessionError(
                     f"{len(self._jobs)} changes are not on disk yet, so {job.name} was not accepted: call "
@@ -269,7 +302,7 @@ class Session:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._jobs or self._closing)
-                if self._closing:  # `close` has waited
+                if self._closing:  # `close` has already waited for the jobs
                     return
                 job = self._jobs[0]
             error: Exception | None = None

@@ -1,4 +1,4 @@
-"""Raw images of the real sensor as the views that a `Predictor` and a training take."""
+"""Conversion of the real sensor's raw images to the images that `Predictor` and the training functions need."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,22 +9,22 @@ from jaxtyping import Float, Int, UInt8
 from sts_jax.hardware.lens import Lens, Pinhole, rectified
 from sts_jax.hardware.recordings import Recordings
 
-Progress = Callable[[int, int], None]  # takes the trajectories that were read, and their number
+Progress = Callable[[int, int], None]  # called with the number of trajectories that are done, and with their total
 
 
 class SensorView(NamedTuple):
-    """Both streams of one moment in the view of the sensor's pinhole, as `Predictor` takes them."""
+    """Rectified images of both streams at one time, in the format of `Predictor`."""
 
-    visual: Float[np.ndarray, "height width 3"]  # RGB, float32 in [0, 1]
-    tactile: Float[np.ndarray, "height width 3"]  # RGB, float32 in [0, 1]
+    visual: Float[np.ndarray, "height width 3"]  # visual image, RGB, float32 in [0, 1]
+    tactile: Float[np.ndarray, "height width 3"]  # tactile image, RGB, float32 in [0, 1]
 
 
 class Moments(NamedTuple):
-    """First and last moments of recorded trajectories in the view of the sensor's pinhole."""
+    """Rectified initial and final images of n recorded trajectories."""
 
-    visual: UInt8[np.ndarray, "n 2 height width 3"]  # RGB: initial, final
-    tactile: UInt8[np.ndarray, "n 2 height width 3"]  # RGB: initial, final
-    number: Int[np.ndarray, "n"]  # of the trajectory in its session
+    visual: UInt8[np.ndarray, "n 2 height width 3"]  # visual images, RGB. The second axis is initial, final
+    tactile: UInt8[np.ndarray, "n 2 height width 3"]  # tactile images, RGB. The second axis is initial, final
+    number: Int[np.ndarray, "n"]  # number of each trajectory in its session
 
 
 def sensor_view(
@@ -37,37 +37,47 @@ def sensor_view(
     """Rectify the two raw images of a pair, or the two backgrounds of a sensor file.
 
     Args:
-        lens: the lens of the camera, `Device.lens`.
-        pinhole: the view of the sensor, `Sensor.camera`.
-        visual: raw image, `pair.visual.image` of `STS.read` or of a recording.
-        tactile: raw image.
-        resolution: (height, width) of the view, `Predictor.preprocessing.resolution`. Each pixel is the mean of the raw
-            image over its area.
+        lens: Lens and pose of the camera, `Device.lens`.
+        pinhole: View of the sensor, `Sensor.camera`.
+        visual: Raw visual image, RGB, uint8. For a pair of `STS.read` or of a recording, it is `pair.visual.image`.
+        tactile: Raw tactile image, RGB, uint8. For a pair, it is `pair.tactile.image`.
+        resolution: Height and width of the rectified images (pixels), usually `Predictor.preprocessing.resolution`.
+
+    Returns:
+        The rectified images. Each pixel is the mean of the raw image over the pixel's area.
 
     Raises:
-        ValueError: an image has another size than the lens, see `rectified`.
+        ValueError: An image has another size than the lens or is not uint8, `resolution` is out of range, or the view
+            contains rays beyond `Lens.largest_angle`.
     """
     images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
     return SensorView(*(image.astype(np.float32) / 255 for image in images))
 
 
 def relit(view: SensorView, background: SensorView, empty: SensorView) -> SensorView:
-    """A view in the light of another empty pad: each pixel times `empty / background`, at most 1.
+    """Adapt the brightness and colours of a view to the sensor on which a model was trained.
 
-    A model that was trained on simulated images, or on another sensor, takes every difference from its empty pad for an
-    object. The vignetting of a camera and its edge of the view are such differences.
+    Each pixel is multiplied by `empty / background` and clipped to [0, 1]. `background` is limited to at least 1/255.
+    A model interprets every difference from the empty pad of its training images as an object. Without this adaptation,
+    the vignetting of another camera or a dark border of its view would count as objects.
 
     Args:
-        view: the view of a sensor.
-        background: the view of the empty pad of this sensor.
-        empty: the empty pad of the model, `SensorView(**predictor.empty)`.
+        view: Rectified images of a sensor.
+        background: Rectified images of the same sensor's empty pad.
+        empty: Images of the empty pad that the model was trained on, `SensorView(**predictor.empty)`.
+
+    Returns:
+        The view as if the sensor of the model had taken it.
 
     Raises:
-        ValueError: the three have not the same resolution.
+        ValueError: The three arguments have different resolutions.
     """
     shapes = {name: own.visual.shape for name, own in (("view", view), ("background", background), ("empty", empty))}
     if len(set(shapes.values())) > 1:
-        raise ValueError(f"the images have the shapes {shapes}, but they must be equal: give the same resolution")
+        raise ValueError(
+            f"the visual images have the shapes {shapes}, but the shapes must be equal: rectify all of them with the "
+            "same resolution"
+        )
     return SensorView(
         *(
             np.clip(own * there / np.maximum(here, 1 / 255), 0, 1)
@@ -84,28 +94,33 @@ def moments(
     *,
     progress: Progress | None = None,
 ) -> Moments:
-    """Read and rectify all confirmed trajectories, one at a time.
+    """Read and rectify the initial and final images of all confirmed trajectories.
 
     Args:
-        recordings: the trajectories, from `load_recordings`.
-        lens: the lens of the camera, `Device.lens`.
-        pinhole: the view of the sensor, `Sensor.camera`.
-        resolution: (height, width) of the views (pixels).
-        progress: called after each trajectory.
+        recordings: Confirmed trajectories, from `load_recordings`.
+        lens: Lens and pose of the camera, `Device.lens`.
+        pinhole: View of the sensor, `Sensor.camera`.
+        resolution: Height and width of the rectified images (pixels).
+        progress: Function that is called after each trajectory, with the number of trajectories that are done and with
+            their total.
+
+    Returns:
+        The rectified images, in the order of the trajectories' numbers.
 
     Raises:
-        ValueError: there is no confirmed trajectory, or the images have another size than the lens.
-        TornFileError: a file is missing or damaged.
+        ValueError: There is no confirmed trajectory, or the images have another size than the lens.
+        TornFileError: A file is missing or damaged.
     """
     width, height = recordings.session["width"], recordings.session["height"]
     if (width, height) != (lens.width, lens.height):
         raise ValueError(
             f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
-            f"{lens.width}x{lens.height}: give the sensor file of the device that collected them"
+            f"{lens.width}x{lens.height} pixels: use the lens from the sensor file of the device that collected them"
         )
     if not len(recordings):
         raise ValueError(
-            f"{recordings.folder} has no confirmed trajectory: collect some, or confirm them in the review"
+            f"{recordings.folder} has no confirmed trajectory: collect trajectories, or confirm existing ones with "
+            "`python -m experiments.real review --confirm NUMBER`"
         )
     visual, tactile = [], []
     for done, trajectory in enumerate(recordings, 1):

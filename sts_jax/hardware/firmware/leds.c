@@ -1,6 +1,6 @@
 /* LED controller of the sensor, for boards with an ATmega328P at 16 MHz (Arduino Uno, Nano).
 
-   It answers the requests of the serial protocol in docs/hardware/protocol.md at 115200 baud, 8N1.
+   It answers requests on the serial port at 115200 baud, 8N1. docs/hardware/protocol.md describes the protocol.
 
    channel   Arduino pin   port   timer output
    0         D3            PD3    OC2B
@@ -12,7 +12,8 @@
    from each transistor's gate or base to ground keeps the lights off during that time.
 
    Three mechanisms turn the lights off. All lights are off after a boot. The watchdog of the protocol turns them off if
-   no valid request comes. The watchdog timer of the chip resets the board if the main loop or the clock stops. */
+   no valid request arrives in time. The watchdog timer of the chip resets the board if the main loop or the clock
+   stops. */
 
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
@@ -43,7 +44,7 @@
 
 enum error { CHECKSUM = 1, COMMAND, ARGUMENTS, VERSION, LENGTH };
 
-/* ---- Permanent memory: the number of the boot, and the serial number ------------------------------------------- */
+/* ---- EEPROM: the number of the boot, and the serial number ----------------------------------------------------- */
 
 struct permanent {
     uint16_t boot;
@@ -80,11 +81,11 @@ ISR(WDT_vect)
 {
     noise = ((noise << 5) | (noise >> 27)) ^ TCNT1;
     samples++;
-    WDTCSR |= _BV(WDIE); /* the interrupt has cleared it, and without it the next period would end in a reset */
+    WDTCSR |= _BV(WDIE); /* the interrupt has cleared WDIE, and without WDIE the next period ends in a reset */
 }
 
-/* A random number. The oscillator of the watchdog timer drifts against the crystal, and its interrupts sample the
-   crystal's clock cycles. */
+/* Return a random number. The oscillator of the watchdog timer drifts against the crystal, so the crystal's cycle
+   counts at the interrupts of the watchdog timer are random. */
 static uint32_t random_number(void)
 {
     TCCR1A = 0;
@@ -106,7 +107,7 @@ static uint32_t random_number(void)
     return noise;
 }
 
-/* The first boot of a chip draws the serial number. It survives later flashing. */
+/* The first boot of a chip draws a random serial number and stores it in the EEPROM, where it survives flashing. */
 static void load_serial_number(void)
 {
     uint32_t serial = eeprom_read_dword(&stored.serial);
@@ -191,7 +192,7 @@ static void apply(const uint8_t wanted[CHANNELS])
 static volatile char ring[RING];
 static volatile uint8_t ring_head, ring_tail;
 
-/* A byte with a framing error becomes 0, and a byte without room is lost. The checksum finds both. */
+/* A byte with a receive error becomes 0, and a byte that finds the buffer full is lost. The checksum reveals both. */
 ISR(USART_RX_vect)
 {
     uint8_t damaged = UCSR0A & (_BV(FE0) | _BV(DOR0) | _BV(UPE0));
@@ -272,9 +273,9 @@ static bool number(const char *word, uint32_t least, uint32_t most, uint32_t *va
     return least <= *value && *value <= most;
 }
 
-#define WORDS 7 /* one more than any request has */
+#define WORDS 7 /* one word more than the longest request has */
 
-/* Execute a request and write its answer into `reply`. Returns 0 or the error. */
+/* Execute a request and write its answer into `reply`. Returns 0 if the request was executed, else the error. */
 static enum error execute(uint16_t sequence, uint8_t count, char *words[WORDS])
 {
     const char *command = count > 1 ? words[1] : "";
@@ -397,7 +398,7 @@ static void collect(char byte)
     too_long = false;
 }
 
-/* Turn the lights off if no valid request came in time. */
+/* Turn the lights off if no valid request has arrived for the watchdog's period. */
 static void watch(void)
 {
     static const uint8_t dark[CHANNELS];
@@ -408,7 +409,7 @@ static void watch(void)
     send_reply();
 }
 
-/* After a reset by the watchdog timer, the timer goes on with a period of 16 ms until it is stopped. */
+/* After a reset by the watchdog timer, the timer continues with a period of 16 ms until it is stopped. */
 void stop_watchdog_timer(void) __attribute__((naked, used, section(".init3")));
 void stop_watchdog_timer(void)
 {
@@ -428,7 +429,7 @@ int main(void)
     start_serial();
     wdt_enable(WDTO_500MS);
     sei();
-    transmit("\n"); /* ends whatever a bootloader has sent */
+    transmit("\n"); /* ends a line that the bootloader may have begun */
     for (;;) {
         while (received(&byte)) {
             collect(byte);
