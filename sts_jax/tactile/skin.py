@@ -82,8 +82,8 @@ class Skin:
     shadow_steps: int = dataclasses.field(default=0, metadata=NOT_NEGATIVE | STATIC)
     # Length of the longest shadow along the gel's face (m). Our choice.
     shadow_reach: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
-    # Angular height of a light, seen from the skin (rad). A point of the skin is in partial shadow if only a part of this
-    # height is visible from it. Our choice.
+    # Angular height of a light, seen from the skin (rad). A point is in partial shadow if only a part of this height is
+    # visible from it. Our choice.
     penumbra: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
 
 
