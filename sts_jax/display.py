@@ -78,6 +78,7 @@ class _Panel(NamedTuple):
 
 
 def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
+    """Return the images of the figure of an item."""
     if isinstance(thing, Frame):
         _check_single("Frame", thing.depth, 2)
         seen = np.where(np.asarray(thing.segmentation), 1e3 * np.asarray(thing.depth), np.nan)
@@ -200,6 +201,7 @@ def _built(kind: type, arrays: dict[str, Any]) -> Any:
 
 
 def _check_single(name: str, array: Any, rank: int) -> None:
+    """Raise a ValueError if an array of a single item, which has `rank` axes, has leading axes."""
     if np.ndim(array) != rank:
         raise ValueError(
             f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}, but it must be one item. Select "
@@ -208,6 +210,7 @@ def _check_single(name: str, array: Any, rank: int) -> None:
 
 
 def _image(thing: Any) -> np.ndarray:
+    """Check that an argument is an RGB image, and return it as floats in [0, 1]."""
     if not isinstance(thing, np.ndarray | jax.Array):
         raise TypeError(
             f"an image must be an array (height, width, 3), got {type(thing).__name__}. A Frame is accepted too, and "

@@ -286,6 +286,7 @@ def _check_light(light: Any) -> None:
 
 
 def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:
+    """Raise a ValueError if the resolution, the shape of the pose or wrench, or the number of faces is not allowed."""
     whole = isinstance(resolution, Sequence) and all(isinstance(n, int | np.integer) for n in resolution)
     if not whole or len(resolution) != 2 or min(resolution) < 1:
         raise ValueError(

@@ -200,7 +200,7 @@ def housing(
         distance: Distance of the pinhole from this plane (m).
 
     Returns:
-        sRGB values relative to the pad: 1 on the pad, `rim` or less on the walls.
+        sRGB values relative to the pad, 1 on the pad, and `rim` or less on the walls.
     """
     beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
     below = distance * (1 - 1 / jnp.maximum(beyond, 1))

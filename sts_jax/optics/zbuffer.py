@@ -103,8 +103,8 @@ def rasterise(
         chunk: Number of runs of pixels that are drawn at a time.
 
     Returns:
-        Index of the nearest face at each pixel, -1 where no face is visible. The shape is (h, w), or (2, h, w) if
-        `within` is given: first the image of the near faces, then that of all faces. There is no gradient.
+        Index of the nearest face at each pixel, -1 where no face is visible. The shape is (h, w). If `within` is given,
+        it is (2, h, w), with the image of the near faces before the image of all faces. There is no gradient.
     """
     points, order, within = jax.lax.stop_gradient((points, order, within))
     screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided)

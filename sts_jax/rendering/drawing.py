@@ -81,6 +81,7 @@ def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"
 def _draw(
     sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
+    """Draw one item: sample, shade, light, and filter to pixels."""
     if crop:
         corners_seen = jnp.where(resting.present, resting.points, jnp.array([[0.0, 0.0, -1.0]]))
         window = optics.object_window(sensor.camera, corners_seen, resolution)

@@ -98,8 +98,8 @@ def underside(
         present: False if there is no object.
 
     Returns:
-        Two height maps (m): first that of the faces that are low enough to press on the gel, then that of all faces,
-        which hide the sky. Both are `inf` at cells without a face above.
+        Two height maps (m). The first contains the faces that are low enough to press on the gel. The second contains
+        all faces, which hide the sky. Both are `inf` at cells without a face above.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))

@@ -8,7 +8,7 @@ from sts_jax import tactile
 from sts_jax.rendering.tiles import planes, where_active
 from sts_jax.sensor import Sensor
 
-_UNTOUCHED = 1e-8  # m, depth below which an imprint does not change the image, as in the tails of the smoothing
+_UNTOUCHED = 1e-8  # m, a shallower imprint does not change the image, such as the tail of the smoothing
 
 
 def lit_skin(
