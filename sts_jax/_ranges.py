@@ -25,8 +25,8 @@ def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
         array: The numbers, a NumPy array or a traced JAX array.
 
     Returns:
-        One pair for each limit, with a flag and the text for an error message. The flag is True if all numbers satisfy the
-        limit.
+        One pair for each limit, with a flag and the text for an error message. The flag is True if all numbers satisfy
+        the limit.
     """
     found = []
     if "above" in metadata:

@@ -241,7 +241,7 @@ def _flat(
 
 
 def flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
-    """Set every number of the invalid items to NaN."""
+    """Set all numbers of a prediction's invalid items to NaN. `valid` is the mask of the valid items."""
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)

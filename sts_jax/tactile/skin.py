@@ -90,7 +90,7 @@ class Skin:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Phong:
-    """Reflectance of the skin's inner side."""
+    """Constants of Phong's reflectance model for the skin's inner side."""
 
     # Reflectance k_a of ambient light. Source of this and the next three: paper, supplement "Simulator Details".
     ambient: Scalar = dataclasses.field(default=0.8, metadata=NOT_NEGATIVE)
