@@ -1,4 +1,4 @@
-"""The See-Through-your-Skin sensor in JAX: simulate it, see with it, learn to predict from it."""
+"""The See-Through-your-Skin (STS) visuotactile sensor in JAX: simulation, rendering and learned prediction."""
 
 from sts_jax import dataset, evaluation, geometry, mvae, objects, optics, physics, tactile, training
 from sts_jax.compilation import enable_compilation_cache

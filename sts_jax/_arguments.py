@@ -1,4 +1,4 @@
-"""Checks of the arguments of a `Predictor`. The messages name the argument, its value and the remedy."""
+"""Checks of the arguments of `Predictor`. Each error message states the argument, its value and the remedy."""
 
 import operator
 from collections.abc import Mapping
@@ -11,31 +11,34 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 _QUAT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1
-_FARTHEST = 10.0  # m, largest coordinate of a position (larger numbers cannot be metres)
+_FARTHEST = 10.0  # m, largest coordinate of a position. A larger number is probably in millimetres
 
 
 def traced(value: object) -> bool:
-    """Whether a value is traced by `jax.jit`, `jax.vmap` or `jax.grad`, so that its numbers are unknown."""
+    """Return True if a value is traced by `jax.jit`, `jax.vmap` or `jax.grad`, so that its numbers are unknown."""
     return isinstance(value, jax.core.Tracer)
 
 
 def checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
-    """Return a value as an array. A traced value is returned unchanged.
+    """Convert an argument to a NumPy array. A traced value is returned unchanged.
 
     Args:
-        name: name of the argument, for messages.
-        value: the argument.
-        wanted: the contents that the array must have, for messages.
+        name: Name of the argument, for error messages.
+        value: Value of the argument.
+        wanted: Description of the contents that the array must have, for error messages.
+
+    Returns:
+        The array, of any shape and numeric or Boolean type.
 
     Raises:
-        ValueError: the value is a path, text or otherwise no array of numbers.
+        ValueError: The value is a path or text, or cannot be converted to an array of numbers.
     """
     if traced(value):
         return value
     if isinstance(value, str | bytes | Path):
         raise ValueError(
-            f"{name} is {value!r}, but it must be an array of {wanted}, not a path (for a picture: "
-            "np.asarray(PIL.Image.open(path)) / 255)."
+            f"{name} is {value!r}, but it must be an array of {wanted}, not a path. Load a picture with "
+            "np.asarray(PIL.Image.open(path)) / 255."
         )
     try:
         array = np.asarray(value)
@@ -47,7 +50,7 @@ def checked_array(name: str, value: Any, wanted: str) -> np.ndarray | Array:
 
 
 def float32(array: np.ndarray | Array) -> np.ndarray | Array:
-    """Convert to float32. A number beyond its range becomes infinite, which a later check refuses."""
+    """Convert an array to float32. Numbers that are too large become infinite, and a later check rejects them."""
     with np.errstate(over="ignore"):
         return array.astype(np.float32)
 
@@ -55,39 +58,60 @@ def float32(array: np.ndarray | Array) -> np.ndarray | Array:
 def checked_masks(
     present: Any, arrays: dict[str, np.ndarray | Array], lead: tuple[int, ...]
 ) -> dict[str, np.ndarray | Array]:
-    """Check the masks by modality, and return them as bool arrays.
+    """Check the argument `present` of a `Predictor`, and return its masks as Boolean arrays.
+
+    Args:
+        present: Dictionary from the name of a modality to a Boolean mask of its items, or None.
+        arrays: Inputs that were given, by the name of the modality.
+        lead: Leading axes that all inputs have. Each mask must have this shape.
+
+    Returns:
+        Masks by the name of the modality.
 
     Raises:
-        ValueError: a mask is not bool, masks no given modality, or has another shape than `lead`.
+        ValueError: `present` is not a dictionary, a mask is for a modality that was not given, or a mask has another
+            shape or type.
     """
     if not isinstance(present, Mapping | None):
-        raise ValueError(f"present is a {type(present).__name__}, but it must be a dict of bool arrays by modality.")
+        raise ValueError(
+            f"present is a {type(present).__name__}, but it must be a dict of bool arrays, such as "
+            "present={'tactile': mask}."
+        )
     masks = {}
     for name, value in (present or {}).items():
         mask = checked_array(f"present[{name!r}]", value, "bool")
-        if name not in arrays or mask.shape != lead:
+        if name not in arrays:
             raise ValueError(
-                f"present[{name!r}] has shape {mask.shape}, but it must mask a given modality, one of "
-                f"{list(arrays)}, with shape {lead}."
+                f"present[{name!r}] is the mask of an input that was not given: its key must be one of {list(arrays)}."
+            )
+        if mask.shape != lead:
+            raise ValueError(
+                f"present[{name!r}] has shape {mask.shape}, but it must have shape {lead}, the leading axes of {name}."
             )
         if mask.dtype != bool:
-            raise ValueError(f"present[{name!r}] is {mask.dtype}, but it must be bool, True for the items that count.")
+            raise ValueError(
+                f"present[{name!r}] is {mask.dtype}, but it must be bool: True for the items that are used."
+            )
         masks[name] = mask
     return masks
 
 
 def checked_samples(num_samples: Any, key: Any) -> int:
-    """Check the number of samples and their key, and return the number.
+    """Check the number of samples and the random key that draws them, and return the number.
+
+    Args:
+        num_samples: Number of samples, >= 0.
+        key: One key of `jax.random.key`. It may be None if `num_samples` is 0.
 
     Raises:
-        ValueError: the number is negative or no constant, or the key is missing or no key.
+        ValueError: `num_samples` is negative, traced or not a whole number, or `key` is missing or not a single key.
     """
     try:
         number = operator.index(num_samples)
     except TypeError:
         raise ValueError(
-            f"num_samples={num_samples!r}, but it must be a whole number. Inside jax.jit it must be a constant "
-            "(static_argnames makes it one)."
+            f"num_samples={num_samples!r}, but it must be a whole number. Inside jax.jit, mark it as a constant with "
+            "static_argnames."
         ) from None
     if number < 0:
         raise ValueError(f"num_samples={number}, but it must be >= 0.")
@@ -102,7 +126,7 @@ def checked_samples(num_samples: Any, key: Any) -> int:
 
 
 def plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
-    """Which items `check_values` would accept, `(*n,)`."""
+    """Mask of the items that `check_values` accepts, for arrays that may be traced, (*n,)."""
     if name == "pose":
         lengths = jnp.linalg.norm(jax.lax.stop_gradient(array[..., 3:]), axis=-1)
         return (jnp.abs(lengths - 1) <= _QUAT_TOLERANCE) & (jnp.abs(array[..., :3]) <= _FARTHEST).all(-1)
@@ -110,19 +134,35 @@ def plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
 
 
 def check_values(name: str, array: np.ndarray) -> None:
-    """Raise a ValueError if an image has values outside [0, 1] or a pose is implausible, or a value is NaN."""
+    """Check the numbers of an input.
+
+    Args:
+        name: Name of the modality. All modalities but "pose" are images.
+        array: Images (..., height, width, 3), or poses (..., 7): position (m) and unit quaternion.
+
+    Raises:
+        ValueError: A number is NaN or infinite, an image has values outside [0, 1], a quaternion's length is not 1, or
+            a position is more than 10 m away.
+    """
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} has NaN or infinite values: mask such items with present={{{name!r}: ...}}.")
+        raise ValueError(
+            f"{name} has NaN or infinite values. Exclude such items with present={{{name!r}: mask}}, a mask that is "
+            "False for them."
+        )
     if name == "pose":
         lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32
         if lengths.size and np.abs(lengths - 1).max() > _QUAT_TOLERANCE:
             raise ValueError(
-                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}: "
-                "give a position (m) and a unit quaternion [w, x, y, z]."
+                f"pose has a quaternion of length {lengths.flat[np.abs(lengths - 1).argmax()]:.3g}, but the length "
+                "must be 1: give a position (m) and a unit quaternion [w, x, y, z]."
             )
         if array.size and np.abs(array[..., :3]).max() > _FARTHEST:
-            raise ValueError(f"pose has a position {np.abs(array[..., :3]).max():.3g} m away: give metres, not mm.")
+            raise ValueError(
+                f"pose has a coordinate of {np.abs(array[..., :3]).max():.3g} m, but at most {_FARTHEST:g} m is "
+                "allowed: give metres, not millimetres."
+            )
     elif array.size and (array.min() < 0 or array.max() > 1):
         raise ValueError(
-            f"{name} has values in [{array.min():.3g}, {array.max():.3g}], but images are in [0, 1] (divide by 255?)."
+            f"{name} has values in [{array.min():.3g}, {array.max():.3g}], but images must be in [0, 1]: "
+            "divide by 255 if the values are 8-bit."
         )

@@ -1,4 +1,7 @@
-"""Reductions of vectors in a form that XLA's CPU backend vectorises. XLA computes its own one element at a time."""
+"""Reductions of vectors in a form that XLA's CPU backend vectorises.
+
+XLA computes `jnp.min`, `jnp.max` and `jnp.cumsum` one element at a time on a CPU.
+"""
 
 import functools
 from collections.abc import Callable
@@ -7,21 +10,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-_LANES = 32  # row length in `cumsum`, and half the length from which `_fold` splits a vector
+_LANES = 32  # row length in `cumsum`. `_fold` splits vectors of at least twice this length
 
 
 def minimum(values: Array) -> Array:
-    """`jnp.min` of a vector, by elementwise minima of its parts."""
+    """Smallest value of a vector, as `jnp.min`, computed by elementwise minima of its parts."""
     return _fold(jnp.minimum, jnp.min, values)
 
 
 def maximum(values: Array) -> Array:
-    """`jnp.max` of a vector, by elementwise maxima of its parts."""
+    """Largest value of a vector, as `jnp.max`, computed by elementwise maxima of its parts."""
     return _fold(jnp.maximum, jnp.max, values)
 
 
 def cumsum(counts: Array) -> Int[Array, "n"]:
-    """`jnp.cumsum` of integers whose sum is below 2^24, as products with triangular matrices."""
+    """Cumulative sum of a vector of integers or flags, computed by products with triangular matrices.
+
+    The sum of all values must be below 2^24, up to which float32 represents every integer.
+    """
     size = len(counts)
     rows = -(-size // _LANES)
     table = jnp.pad(counts.astype(jnp.float32), (0, rows * _LANES - size)).reshape(rows, _LANES)
@@ -33,13 +39,14 @@ def cumsum(counts: Array) -> Int[Array, "n"]:
 
 
 def flatnonzero(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
-    """`jnp.flatnonzero` of a vector of flags, padded with n to the length of `flags`."""
+    """Indices of the true flags in ascending order, padded to the length of `flags` with that length."""
     size = len(flags)
     place = jnp.where(flags, cumsum(flags) - 1, size)
     return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
 
 
 def _fold(pair: Callable[[Array, Array], Array], whole: Callable[[Array], Array], values: Array) -> Array:
+    """Reduce a vector: `pair` combines its eight parts until it is short, then `whole` reduces the rest."""
     while len(values) >= 2 * _LANES:
         part = len(values) // 8
         parts = [values[k * part : (k + 1) * part] for k in range(8)]

@@ -1,4 +1,4 @@
-"""Atomic writing of files, JSON files that cannot change unnoticed, checksums, and a lock on a folder."""
+"""Atomic writing of files and folders, JSON files with a check of their content, checksums, and locks on folders."""
 
 import contextlib
 import errno
@@ -19,17 +19,21 @@ class TornFileError(OSError):
 
 
 class LockedError(RuntimeError):
-    """Another process is working in a folder. The message names the folder and the process."""
+    """A folder is locked by another process, or elsewhere in this one. The message names the folder and the process."""
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Create `path` through `write(temporary)`, flush it to disk, then rename it.
+    """Write a file atomically. An interruption leaves either the complete new file or the previous state.
 
-    An interruption leaves either the complete new file or the previous state.
+    The content is written to a temporary file in the same folder, flushed to disk, and renamed to `path`. Missing
+    folders are created. An error that `write` raises and that is not an OSError is passed on unchanged.
+
+    Args:
+        path: The file.
+        write: Function that writes the content to the path of the temporary file.
 
     Raises:
-        OSError: the file cannot be written. The message names the file and the remedy. Any other error of
-            `write` passes through unchanged.
+        OSError: The file cannot be written. The message names the file and the remedy.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -54,7 +58,7 @@ _IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 
 
 def remedy(error: Exception) -> str:
-    """The remedy for a failed write, by the error's number. An error without a number may mean a full disk."""
+    """Describe the remedy for a failed write, by the error's number. An error without a number may mean a full disk."""
     number = getattr(error, "errno", None)
     if number in _FULL:
         return "Free some disk space"
@@ -66,7 +70,7 @@ def remedy(error: Exception) -> str:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a small file through `write_whole`."""
+    """Write bytes to a file atomically. Errors are those of `write_whole`."""
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(data)
@@ -75,7 +79,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON through `write_whole`."""
+    """Write an object of JSON types to a JSON file atomically. Errors are those of `write_whole`."""
     write_bytes(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
@@ -83,12 +87,15 @@ def read_json(path: Path, remedy: str) -> Any:
     """Read a JSON file.
 
     Args:
-        path: the file.
-        remedy: remedy for a damaged file, with which the error message ends.
+        path: The file.
+        remedy: What to do if the file is damaged. The error message ends with this text.
+
+    Returns:
+        The content of the file.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        TornFileError: the file cannot be read or is not JSON.
+        FileNotFoundError: The file does not exist.
+        TornFileError: The file cannot be read or is not JSON.
     """
     try:
         return json.loads(path.read_bytes().decode())
@@ -101,16 +108,21 @@ def read_json(path: Path, remedy: str) -> Any:
 def claim(path: Path, content: dict) -> None:
     """Write a JSON file, or check that an existing one has the same content.
 
+    Args:
+        path: The file.
+        content: The settings to write or to compare, of JSON types. Tuples count as lists.
+
     Raises:
-        ValueError: the content differs. The message names the fields that differ, both values of the first ones, and
-            the remedy.
-        TornFileError: the existing file is not JSON.
+        ValueError: The existing content differs. The message names all fields that differ, both values of the first
+            three, and the remedy.
+        TornFileError: The existing file cannot be read or is not JSON.
+        OSError: The file cannot be written.
     """
     content = json.loads(json.dumps(content))
     if not path.exists():
         write_json(path, content)
         return
-    there = read_json(path, f"choose another folder than {path.parent}, or delete it")
+    there = read_json(path, f"delete {path.parent}, or choose another folder")
     found = list(_differences(there, content))
     if found:
         made = ", ".join(f"{field or 'content'} = {old!r}" for field, old, _ in found[:_SHOWN])
@@ -118,15 +130,15 @@ def claim(path: Path, content: dict) -> None:
         more = f" ({', '.join(field for field, _, _ in found[_SHOWN:])} differ too)" if found[_SHOWN:] else ""
         raise ValueError(
             f"{path} was made with {made}, but the current settings have {asked}{more}: "
-            f"choose another folder than {path.parent}, or delete it to start anew."
+            f"choose another folder, or delete {path.parent} to start again."
         )
 
 
-_SHOWN = 3  # differing fields whose values a message shows
+_SHOWN = 3  # number of differing fields whose values a message contains
 
 
 def _differences(old: object, new: object, field: str = "") -> Iterator[tuple[str, object, object]]:
-    """The fields in which two contents differ, with both values."""
+    """Yield each field in which two contents differ: its dotted name, the old value and the new value."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in [*old, *(key for key in new if key not in old)]:
             yield from _differences(old.get(key), new.get(key), f"{field}.{key}".lstrip("."))
@@ -141,21 +153,24 @@ def sha256(path: Path) -> str:
 
 
 def digest(content: Any) -> str:
-    """SHA-256 of a JSON file's content, in hexadecimal digits, independent of the file's layout."""
+    """SHA-256 of an object of JSON types, in hexadecimal digits, independent of the order of its keys."""
     plain = json.loads(json.dumps(content))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
-OWNER = ".lock-owner"  # file in a locked folder that names the process
+OWNER = ".lock-owner"  # file in a locked folder with the number of the process that locked it
 
 
 @contextlib.contextmanager
 def lock(folder: Path) -> Iterator[None]:
-    """Lock a folder for this process until the block or the process ends.
+    """Lock a folder for this process until the `with` block or the process ends. A missing folder is created.
+
+    Args:
+        folder: The folder.
 
     Raises:
-        LockedError: another process, or another part of this one, holds the lock.
-        OSError: the folder cannot be created or written to.
+        LockedError: The folder is locked already, by another process or elsewhere in this one.
+        OSError: The folder cannot be created or written to.
     """
     owner, held = folder / OWNER, filelock.FileLock(folder / ".lock", timeout=0)
     try:
@@ -181,7 +196,7 @@ def lock(folder: Path) -> Iterator[None]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush a folder's entries to disk, so that files which were created or renamed in it survive a loss of power."""
+    """Flush the entries of a folder to disk, so that new and renamed files in it survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -190,11 +205,17 @@ def flush_folder(folder: Path) -> None:
 
 
 def write_folder(path: Path, files: dict[str, bytes]) -> None:
-    """Create a folder with files. All of it is on disk afterwards, and an interruption leaves no folder of this name.
+    """Create a folder with files atomically. An interruption leaves no folder of this name.
+
+    All files are on disk when the function returns.
+
+    Args:
+        path: The folder. It must not exist or must be empty.
+        files: The content of each file by its name.
 
     Raises:
-        OSError: a file cannot be written, or `path` exists and is not empty. The message names the folder and the
-            remedy.
+        OSError: A file cannot be written, or `path` is a file or a folder that is not empty. The message names the
+            folder and the remedy.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

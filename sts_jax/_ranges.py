@@ -1,7 +1,7 @@
 """Allowed ranges of a dataclass's fields, declared in their metadata.
 
-`aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that all numbers of the field are > 0.
-The keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=). `limits` evaluates them.
+`aspect: float = dataclasses.field(default=4 / 3, metadata=POSITIVE)` declares that every number of the field must be
+> 0. The metadata's keys are "above" (>), "at_least" (>=), "below" (<) and "at_most" (<=). `limits` checks them.
 """
 
 from collections.abc import Mapping
@@ -18,14 +18,15 @@ _SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes small
 
 
 def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
-    """Compare numbers with the range of a field.
+    """Compare numbers with the allowed range of a field.
 
     Args:
-        metadata: of the field.
-        array: the numbers, a NumPy array or a traced one.
+        metadata: Metadata of the field, with the limits of its range.
+        array: The numbers, a NumPy array or a traced JAX array.
 
     Returns:
-        For each limit, whether all numbers keep it, and the message if they do not.
+        One pair for each limit, with a flag and the text for an error message. The flag is True if all numbers satisfy
+        the limit.
     """
     found = []
     if "above" in metadata:

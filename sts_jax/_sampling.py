@@ -1,8 +1,9 @@
-"""Bilinear interpolation of images. Places are columns and rows in pixels, whole numbers at pixel centres.
+"""Bilinear interpolation of images at points given by column and row in pixels, whole numbers at pixel centres.
 
-Each function serves one pattern of access: `bilinear` any places of one image, `bilinear_batch` many places of several
-small images with channels, and `shifted` the same offset from every pixel. A place beyond the image has the value of
-the nearest place in it. To get zero there, pad the image with a ring of zeros.
+There is one function for each pattern of access: `bilinear` for any points of one image, `bilinear_batch` for many
+points in each of several small images with channels, and `shifted` for the same offset from every pixel. A point
+outside the image gets the value of the nearest point inside, unless the image repeats. To get zero there, pad the
+image with a ring of zeros.
 """
 
 import jax
@@ -13,16 +14,16 @@ from jaxtyping import Array, Float, Int
 def bilinear(
     image: Float[Array, "h w *c"], column: Float[Array, "*n"], row: Float[Array, "*n"], *, wrap: bool = False
 ) -> Float[Array, "..."]:
-    """Values of an image at any places.
+    """Interpolate an image at any points.
 
     Args:
-        image: values of any kind, with any number of axes for channels. At least 2x2 pixels without `wrap`.
-        column: of the places, pixels.
-        row: of the places, pixels.
-        wrap: whether the image repeats beyond its border.
+        image: Values of the pixels, with any number of axes for channels. It has at least 2x2 pixels, unless `wrap`.
+        column: Columns of the points (pixels).
+        row: Rows of the points (pixels).
+        wrap: If True, the image repeats beyond its border.
 
     Returns:
-        Values at the places, (*n, *c).
+        Values at the points, (*n, *c).
     """
     height, width = image.shape[:2]
     if wrap:
@@ -40,18 +41,18 @@ def bilinear(
 def bilinear_batch(
     images: Float[Array, "n h w c"], column: Float[Array, "n m"], row: Float[Array, "n m"]
 ) -> Float[Array, "n m c"]:
-    """Values of several images at many places each, with a fast derivative by the images.
+    """Interpolate several images at many points each. The gradient with respect to the images is fast.
 
     Args:
-        images: at least 2x2 pixels each.
-        column: of the places, pixels.
-        row: of the places, pixels.
+        images: Images with channels, at least 2x2 pixels each.
+        column: Columns of the points in each image (pixels).
+        row: Rows of the points in each image (pixels).
 
     Returns:
-        Values at the places.
+        Values at the points.
     """
     count, height, width, channels = images.shape
-    # The four neighbours of a place lie side by side in a table, and one look-up finds them.
+    # The four neighbours of a point lie side by side in a table, so that one look-up finds them.
     corners = [images[:, i : height - 1 + i, j : width - 1 + j] for i in (0, 1) for j in (0, 1)]
     table = jnp.concatenate(corners, axis=-1).reshape(count, (height - 1) * (width - 1), 4 * channels)
     (left, x), (top, y) = _split_within(column, width), _split_within(row, height)
@@ -64,16 +65,16 @@ def bilinear_batch(
 def shifted(
     around: Float[Array, "a b"], columns: Float[Array, ""], rows: Float[Array, ""], shape: tuple[int, int]
 ) -> Float[Array, "h w"]:
-    """Values at the same offset from every pixel of an image.
+    """Interpolate an image at the same offset from every pixel.
 
     Args:
-        around: the image, with `h + 1` rows above and below it and `w + 1` columns on each side.
-        columns: of the offset, pixels.
-        rows: of the offset, pixels.
-        shape: (height, width) of the image, pixels.
+        around: The image (h, w) with a border: h + 1 rows above and below it, and w + 1 columns on each side.
+        columns: Horizontal part of the offset (pixels). It is clipped to [-w, w].
+        rows: Vertical part of the offset (pixels). It is clipped to [-h, h].
+        shape: Height h and width w of the image without the border (pixels).
 
     Returns:
-        Values of the moved image.
+        Image whose pixel (row i, column j) has the value at row i + rows and column j + columns.
     """
     height, width = shape
     columns, rows = jnp.clip(columns, -width, width), jnp.clip(rows, -height, height)
@@ -86,13 +87,16 @@ def shifted(
 
 
 def _split(place: Float[Array, "*n"], size: int) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
-    """Index of the pixel before each place of a repeating line of pixels, and the distance from it."""
+    """Split positions on a periodic line of pixels into the index of the pixel before each and the distance from it."""
     before = jnp.floor(place)
     return before.astype(jnp.int32) % size, place - before
 
 
 def _split_within(place: Float[Array, "*n"], size: int) -> tuple[Int[Array, "*n"], Float[Array, "*n"]]:
-    """Index of the pixel before each place of a line of pixels, and the distance from it. A pixel follows."""
+    """Split positions on a line of pixels into the index of the pixel before each and the distance from it.
+
+    Positions are clipped to the line. The index is at most `size - 2`, so that another pixel follows.
+    """
     place = jnp.clip(place, 0, size - 1)
     before = jnp.minimum(jnp.floor(place), size - 2)
     return before.astype(jnp.int32), place - before

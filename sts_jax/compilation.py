@@ -1,4 +1,4 @@
-"""Keep compiled programs between sessions."""
+"""Storage of compiled programs on disk, for later sessions."""
 
 import hashlib
 import os
@@ -9,30 +9,31 @@ import jax
 
 
 def cache_folder() -> Path:
-    """Folder for files that can be recreated: `sts_jax` in XDG_CACHE_HOME, or in ~/.cache if that is not set."""
+    """Folder for files that can be recreated: `$XDG_CACHE_HOME/sts_jax`, by default `~/.cache/sts_jax`."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sts_jax"
 
 
 def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Let JAX keep compiled programs on disk, so that the next session loads them instead of compiling them again.
 
-    Call it once, before the first computation. It changes JAX's settings for the whole process, and the library itself
-    never calls it. The command lines of the experiments do.
+    Call this function once, before the first computation. It changes JAX's settings for the whole process. The commands
+    in `experiments` call it. The library itself never does.
 
-    On a CPU, XLA logs an error for each program that it loads from the cache, because two of its own preferences are
-    not features of a processor (jax#38445). The message is harmless. The environment variable TF_CPP_MIN_LOG_LEVEL=3,
-    set before `import jax`, silences it.
+    On a CPU, XLA logs an error about processor features for each program that it loads from the cache. The message is
+    harmless: XLA counts two of its own tuning preferences as features, and no processor reports these (jax#38445). Set
+    the environment variable TF_CPP_MIN_LOG_LEVEL=3 before `import jax` to silence it.
 
     Args:
-        folder: folder of the cache, by default JAX_COMPILATION_CACHE_DIR. If that variable is empty, nothing is
-            cached. If it is not set, the cache is in `cache_folder()`, in a folder for this kind of processor, because
-            a program compiled for one kind may not run on another.
+        folder: Folder of the cache. None selects the folder in the environment variable JAX_COMPILATION_CACHE_DIR. If
+            that variable is empty, nothing is cached. If it is not set, the cache is a folder in `~/.cache/sts_jax`, or
+            in `$XDG_CACHE_HOME/sts_jax`. There is one such folder for each kind of processor, because a program
+            compiled for one kind may not run on another.
 
     Returns:
         The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.
 
     Raises:
-        OSError: the folder cannot be created.
+        OSError: The folder cannot be created.
         ValueError: `folder` is an empty string.
     """
     if folder is None and "JAX_COMPILATION_CACHE_DIR" in os.environ:
@@ -45,7 +46,9 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise type(error)(f"{path} cannot be created ({error.strerror}): give another folder for the cache.") from error
+        raise type(error)(
+            f"folder {path} cannot be created ({error.strerror}): give another folder for the cache."
+        ) from error
     jax.config.update("jax_compilation_cache_dir", str(path))
     # By default JAX keeps only programs that took a second to compile, but a session runs hundreds of smaller ones.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
@@ -53,7 +56,7 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
 
 
 def processor() -> str:
-    """Name of this kind of processor, equal on all machines that run the same compiled programs."""
+    """Short hash of the kind of processor. Machines with the same hash can share compiled programs."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Display and storage of results: `show` draws a figure, `save` and `load` write and read one file."""
+"""Display and storage of results: `show` draws a figure, `save` writes a file, and `load` reads it."""
 
 import io
 import os
@@ -21,8 +21,8 @@ from sts_jax.prediction import Prediction
 from sts_jax.sensor import Sensor
 
 _KINDS: dict[str, type] = {kind.__name__: kind for kind in (Frame, Body, Trajectory)}
-_INCH = 2.6  # height of a panel
-_FORMAT = 1
+_INCH = 2.6  # height of a panel (inches)
+_FORMAT = 1  # version of the layout of .npz files
 
 
 class NotebookFigure(Figure):
@@ -40,17 +40,18 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
     A notebook displays the figure. Elsewhere call `figure.savefig(path)`.
 
     Args:
-        thing: a `Frame` (both streams, depth in mm and pressure in kPa), a `Body` (a view from outside, standing on a
-            pad), a `Prediction` (the predicted images) or an image `(height, width, 3)` in [0, 1]. It must be one item:
-            index a batch with `jax.tree.map(lambda x: x[i], frames)`.
-        title: of the figure.
+        thing: One item to draw. A `Frame` gives four panels: visual image, tactile image, depth (mm) and pressure
+            (kPa). A `Body` gives a view from outside, standing on a pad. A `Prediction` gives its predicted images. An
+            array (height, width, 3) is drawn as an image: floats in [0, 1] or uint8. Select item i of a batch with
+            `jax.tree.map(lambda x: x[i], frames)`.
+        title: Title of the figure. The default is the description of a `Body`, and no title for other items.
 
     Returns:
         A Matplotlib figure.
 
     Raises:
-        TypeError: `thing` is none of these.
-        ValueError: `thing` has leading axes or no image, or an image has another shape or range.
+        TypeError: `thing` has none of these types.
+        ValueError: `thing` is a batch or a prediction without images, or an image has another shape, type or range.
     """
     panels = _panels(thing)
     if isinstance(thing, Body):
@@ -72,11 +73,12 @@ class _Panel(NamedTuple):
     """One image of a figure."""
 
     name: str
-    values: np.ndarray  # an RGB image, or numbers to colour
-    colours: str | None = None  # name of the colour map
+    values: np.ndarray  # RGB image, or one number per pixel
+    colours: str | None = None  # name of the colour map, None for an RGB image
 
 
 def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
+    """Return the images of the figure of an item."""
     if isinstance(thing, Frame):
         _check_single("Frame", thing.depth, 2)
         seen = np.where(np.asarray(thing.segmentation), 1e3 * np.asarray(thing.depth), np.nan)
@@ -96,7 +98,9 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
         streams = {"visual": thing.visual, "tactile": thing.tactile}
         panels = [_Panel(f"predicted {name}", np.asarray(x)) for name, x in streams.items() if x is not None]
         if not panels:
-            raise ValueError("the prediction has no image, because the model predicts the pose alone. Print it instead")
+            raise ValueError(
+                "the prediction has no image, because its model predicts only poses. Print the prediction instead"
+            )
         for panel in panels:
             _check_single("Prediction", panel.values, 3)
         return panels
@@ -104,18 +108,21 @@ def _panels(thing: Frame | Body | Prediction | ArrayLike) -> list[_Panel]:
 
 
 def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayLike) -> None:
-    """Write one object to a file, completely or not at all.
+    """Write a frame, body, trajectory or image to a file. An interruption leaves no incomplete file.
 
     Args:
-        path: `.npz` keeps all arrays of a `Frame`, a `Body` or a `Trajectory` for `load`. `.png` keeps the picture of a
-            `Frame` (the visual and the tactile image side by side) or an image `(height, width, 3)` in [0, 1], with 8
-            bits per channel.
-        thing: the object to write.
+        path: Path of the file. Its suffix selects the format:
+            `.npz` stores all arrays of a `Frame`, a `Body` or a `Trajectory`, and `load` reads them.
+            `.png` stores an image, or the visual and the tactile image of a `Frame` side by side, with 8 bits per
+            channel.
+        thing: Item to write. An image is an array (height, width, 3) of floats in [0, 1] or uint8. A frame for a `.png`
+            file must be one frame and not a batch.
 
     Raises:
-        TypeError: an object of this type cannot be written to this type of file.
-        ValueError: the path has another suffix, or the image has another shape or range.
-        OSError: the file cannot be written.
+        TypeError: The format cannot store an item of this type.
+        ValueError: The path has another suffix, the image has another shape, type or range, or a batch of frames was
+            given for a `.png` file.
+        OSError: The file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() == ".png":
@@ -135,7 +142,10 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
         Image.fromarray(np.round(255 * image).astype(np.uint8)).save(data, "png")
     elif path.suffix.lower() == ".npz":
         if not isinstance(thing, tuple(_KINDS.values())):
-            raise TypeError(f"an .npz file keeps one of {', '.join(_KINDS)}, got {type(thing).__name__}")
+            raise TypeError(
+                f"only one of {', '.join(_KINDS)} can be written to an .npz file, got {type(thing).__name__}: "
+                "write an image to a .png file, and other arrays with np.savez"
+            )
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
         arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}
         arrays |= {"kind": np.array(type(thing).__name__), "format": np.array(_FORMAT)}
@@ -147,16 +157,22 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
 
 
 def load(path: str | os.PathLike[str]) -> Any:
-    """Read the `Frame`, `Body` or `Trajectory` that `save` wrote to an `.npz` file.
+    """Read a frame, body or trajectory from an `.npz` file that `save` wrote.
+
+    Args:
+        path: Path of the file.
+
+    Returns:
+        The `Frame`, `Body` or `Trajectory`.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the path is a folder, or has another suffix than .npz.
-        TornFileError: the file is damaged, or `save` did not write it.
+        FileNotFoundError: The file does not exist.
+        ValueError: The path is a folder, or its suffix is not `.npz`.
+        TornFileError: (An `OSError`.) The file is damaged, or was not written by this version of `save`.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file. Write it with sts.save")
+        raise FileNotFoundError(f"{path}: no such file. Write one with sts.save")
     if path.is_dir() or path.suffix.lower() != ".npz":
         raise ValueError(f"path is {str(path)!r}, but it must be an .npz file that sts.save wrote")
     try:
@@ -164,15 +180,15 @@ def load(path: str | os.PathLike[str]) -> Any:
             arrays = dict(file)
         kind, version = _KINDS[str(arrays.pop("kind"))], int(arrays.pop("format"))
         if version != _FORMAT:
-            raise ValueError(f"it has format {version}, but this version of sts_jax reads {_FORMAT}")
+            raise ValueError(f"the file has format {version}, but this version of sts_jax reads format {_FORMAT}")
         return _built(kind, {key: jnp.asarray(value) for key, value in arrays.items()})
-    except Exception as error:  # a damaged zip file raises one of many types
+    except Exception as error:  # A damaged zip file raises exceptions of many types.
         reason = f"{type(error).__name__}: {error}"
         raise TornFileError(f"{path} is damaged or was not written by sts.save ({reason}). Save it again.") from error
 
 
 def _built(kind: type, arrays: dict[str, Any]) -> Any:
-    """Build an instance from its leaves, given by their paths. `hidden/fill` belongs to the field `hidden`."""
+    """Build an instance from its leaves by their paths, such as `hidden/fill` for the leaf `fill` of field `hidden`."""
     fields: dict[str, Any] = {}
     for key, value in arrays.items():
         name, _, rest = key.partition("/")
@@ -185,17 +201,20 @@ def _built(kind: type, arrays: dict[str, Any]) -> Any:
 
 
 def _check_single(name: str, array: Any, rank: int) -> None:
+    """Raise a ValueError if an array of a single item, which has `rank` axes, has leading axes."""
     if np.ndim(array) != rank:
         raise ValueError(
-            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}. Give one item, such as "
-            "jax.tree.map(lambda x: x[0], ...)"
+            f"the {name} has leading axes {np.shape(array)[: np.ndim(array) - rank]}, but it must be one item. Select "
+            "the first one with jax.tree.map(lambda x: x[0], batch)"
         )
 
 
 def _image(thing: Any) -> np.ndarray:
+    """Check that an argument is an RGB image, and return it as floats in [0, 1]."""
     if not isinstance(thing, np.ndarray | jax.Array):
         raise TypeError(
-            f"an image must be an array, got {type(thing).__name__}. sts.show also draws a Frame, Body or Prediction"
+            f"an image must be an array (height, width, 3), got {type(thing).__name__}. A Frame is accepted too, and "
+            "sts.show also draws a Body or a Prediction"
         )
     image = np.asarray(thing)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:

@@ -1,4 +1,4 @@
-"""The sensor's images of an object: both streams, depth and segmentation."""
+"""Images that the sensor takes of an object: both streams, depth and segmentation."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,18 +18,30 @@ from sts_jax.sensor import Sensor
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """One moment of the sensor. Images are float32 in [0, 1], row 0 at the top."""
+    """Images of the sensor at one time, with the object's pose and the pressure on the gel.
 
-    visual: Float[Array, "*n h w 3"]  # lights off: the view through the skin, sRGB
-    tactile: Float[Array, "*n h w 3"]  # lights on: the skin itself
-    # m along the optical axis from the pinhole to the object, also behind the housing's walls, inf where there is none
+    The images `visual` and `tactile` are float32 in [0, 1]. Row 0 of every image is at the top.
+    """
+
+    # View through the skin with the internal light off, sRGB.
+    visual: Float[Array, "*n h w 3"]
+    # Image of the skin's inner side with the internal light on.
+    tactile: Float[Array, "*n h w 3"]
+    # Depth of the object along the optical axis, from the pinhole (m), `inf` in pixels without object. The walls of the
+    # housing hide nothing in this image.
     depth: Float[Array, "*n h w"]
-    segmentation: Bool[Array, "*n h w"]  # pixels of the object, where depth is finite
-    pose: Float[Array, "*n 7"]  # mesh frame in the sensor frame, as drawn, with the gel in balance
-    # whether the gel carries the wrench within its limits, False for a non-finite input or an invalid sensor
+    # Pixels of the object: True where `depth` is finite.
+    segmentation: Bool[Array, "*n h w"]
+    # Pose that is drawn, after the object has sunk into the gel: mesh frame in the sensor frame, position (m) and
+    # quaternion.
+    pose: Float[Array, "*n 7"]
+    # True if the gel balances the wrench within its limits of depth and tilt, or if no wrench presses on it. False for
+    # an invalid sensor, or a pose, wrench or body with values that are not finite.
     balanced: Bool[Array, "*n"]
-    pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid (tactile.cell_centres)
-    window: Float[Array, "*n 4"]  # m, (left, top, width, height) of the part of the gel's face in the images
+    # Pressure on the cells of the gel's grid (Pa). `tactile.cell_centres` returns the centres of the cells.
+    pressure: Float[Array, "*n r c"]
+    # Part of the gel's outer face that the images show: left, top, width, height (m).
+    window: Float[Array, "*n 4"]
 
     def __repr__(self) -> str:
         if not hasattr(self.depth, "shape") or len(self.depth.shape) < 2:  # JAX also builds trees of other leaves
@@ -56,45 +68,48 @@ def sense(
     crop: bool = False,
     moving_edges: bool = False,
 ) -> Frame:
-    """Render one object as the sensor sees it.
+    """Render the images that the sensor takes of one object.
 
-    With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`). Without one, the
-    imprint follows from the pose alone. Both streams show the balanced pose. An object that is wholly below the gel's
-    face has fallen off, and the images are those of an empty sensor.
+    With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`), and both streams
+    show the object in this balanced pose. Without a wrench, the object stays in the given pose. The images show an
+    empty sensor if the whole object is below the gel's face.
 
-    The images are also empty, and `balanced` is False, if the pose or the wrench is not finite, the squared length of
-    the quaternion is zero or overflows, or a traced body has a vertex, normal or colour that is not finite.
+    The images also show an empty sensor, and `balanced` is False, in these cases:
 
-    The function is compiled once for each resolution and size class of bodies (faces and texture). It also works inside
-    other compiled functions, `vmap` and `grad`.
+    - The pose or the wrench is not finite.
+    - The squared length of the quaternion is zero or overflows.
+    - The body is traced, and one of its vertices, normals or colours is not finite.
+    - The sensor is traced, and a constant is out of range (`Sensor.check`). Traced constants then have their default
+      values. A sensor that is not traced raises an error instead.
 
-    An invalid sensor (`Sensor.check`) raises an error. Traced constants, such as those of a jitted function's argument,
-    have no values to check. If they are invalid, the images are those of an empty sensor with the default constants and
-    never contain NaN, and `balanced` is False.
+    The function is compiled once for each resolution and each size class of bodies (numbers of faces and texture
+    pixels). It can be called under `jit`, `vmap` and `grad`.
 
     Args:
-        sensor: constants of the sensor.
-        body: the object.
-        pose: mesh frame in the sensor frame: position (m), quaternion.
-        wrench: force (N) and moment about the sensor's origin (N m) of the pad on the object, sensor frame.
-        resolution: (height, width), pixels. Another aspect ratio than the camera's shows the largest centred part.
-        crop: show a window of the image's aspect ratio around the object.
-        moving_edges: add the effect of the imprint's moving edges to the derivative of the tactile image by the pose,
-            for fitting poses. It is accurate on average over a few pixels (`rendering.edges`). By default, the
-            derivative is that of each pixel and ignores this effect. The images are the same.
+        sensor: Constants of the sensor.
+        body: The object.
+        pose: Pose of the object, mesh frame in the sensor frame: position (m) and quaternion [w, x, y, z].
+        wrench: Wrench of the pad on the object in the sensor frame: force (N) and moment about the origin (N m). None
+            draws the object in the given pose.
+        resolution: Height and width of the images (pixels). If the aspect ratio differs from the camera's, the images
+            show the largest centred part of the view.
+        crop: If True, the images show only a window around the object, with the aspect ratio of `resolution`.
+        moving_edges: If True, the derivative of the tactile image with respect to the pose includes the motion of the
+            imprint's edges across pixels, for fitting poses. It is then accurate on average over a few pixels. If
+            False, the derivative is that of each pixel and ignores moving edges. The images do not change.
 
     Returns:
-        Frame.
+        The images, with the pose that is drawn and the pressure on the gel.
 
     Raises:
-        ValueError: the resolution is not two whole numbers above 0, the pose or the wrench has a wrong shape, or the
-            body has more faces than can be drawn (all checked under `jit` too), or `check` of the sensor or the body
-            raises an error. Traced values are not checked.
+        ValueError: `resolution` is not two whole numbers above 0, `pose` or `wrench` has a wrong shape, or the body has
+            too many faces. These conditions are checked under `jit` too. If the sensor or the body is not traced, also:
+            a constant of the sensor is out of range (`Sensor.check`), or the body is invalid (`Body.check`).
         TypeError: `sensor` is not a `Sensor`, `body` is not a `Body`, or `pose` or `wrench` is not an array of numbers.
     """
     _check_kinds(sensor, body)
-    pose = _numbers("pose", pose, "(7,), position (m), quaternion")
-    wrench = None if wrench is None else _numbers("wrench", wrench, "(6,), force (N) and moment (N m)")
+    pose = _numbers("pose", pose, "(7,): position (m) and quaternion")
+    wrench = None if wrench is None else _numbers("wrench", wrench, "(6,): force (N) and moment (N m)")
     _check_shapes(body, pose, wrench, resolution)
     sensor, sound = sensor.guard()
     sound = jnp.asarray(sound)
@@ -104,7 +119,7 @@ def sense(
     # Hulls and interior are not drawn. Without them, bodies of one size class share a program.
     body = dataclasses.replace(body, hulls=jnp.zeros((1, 1, 3)), interior=jnp.zeros((1, 3, 3)))
     height, width = (int(n) for n in resolution)
-    # Two programs, so that the first one serves every resolution.
+    # Two programs, so that a new resolution compiles only the second one.
     resting = equilibrium.balance(sensor.gel, sound, body.vertices, body.faces, body.two_sided, pose, wrench)
     images = drawing.draw(
         sensor, body, resting, resolution=(height, width), crop=bool(crop), moving_edges=bool(moving_edges)
@@ -122,27 +137,30 @@ def sense(
 
 
 def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n h w 3"]:
-    """The image with the internal light between off, `Frame.visual`, and full, `Frame.tactile`.
+    """Render a frame with the internal light at any level between off and full.
 
-    The LEDs' light adds to the light through the skin, in linear values. The camera exposes the visual stream V k times
-    as long as the tactile stream T (`Room.exposure`). At a share l of the LEDs' power, the exposure preserves the
-    brightness of pixels that are equally bright in both streams:
+    The image is a mixture of both streams, computed in linear light:
 
         image = ((1 - l) V + l k T) / (1 - l + l k)
 
+    V is the visual and T the tactile stream, l is `light`, and k is the exposure time of V divided by that of T
+    (`Room.exposure`). The denominator is the camera's exposure at the level l. It keeps the brightness of pixels that
+    are equally bright in both streams.
+
     Args:
-        sensor: the sensor of the frame.
-        frame: one frame or a batch, with any leading axes.
-        light: share of the LEDs' full power, 0 to 1. Under `jit` and `vmap`, where no error can be raised, it is
-            clipped, and NaN counts as 0.
+        sensor: Sensor that made the frame.
+        frame: One frame or a batch of frames with any leading axes.
+        light: Level of the internal light, from 0 (off) to 1 (full power). Traced values outside this range are
+            clipped, and a traced NaN counts as 0.
 
     Returns:
-        Image, sRGB in [0, 1], which equals `frame.visual` at 0 and `frame.tactile` at 1.
+        Image, sRGB in [0, 1]. It equals `frame.visual` at level 0 and `frame.tactile` at level 1.
 
     Raises:
-        TypeError: `frame` is not a `Frame`, or `light` is not a number.
-        ValueError: `light` is outside [0, 1] or has an axis, or `Sensor.check` raises an error. Traced values are
-            not checked. If the constants of a traced sensor are invalid, the default exposure is used.
+        TypeError: `sensor` is not a `Sensor`, `frame` is not a `Frame`, or `light` is not a number.
+        ValueError: `light` is outside [0, 1] or is an array with axes, or a constant of the sensor is out of range
+            (`Sensor.check`). Traced values are not checked. If a traced constant of the sensor is out of range, the
+            default value of `Room.exposure` is used.
     """
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
@@ -154,7 +172,7 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     bright = light * sensor.room.exposure
     share = bright / (1 - light + bright)
     mixed = optics.to_srgb((1 - share) * optics.to_linear(frame.visual) + share * optics.to_linear(frame.tactile))
-    # The conversion to linear light and back rounds. At 0 and 1, the difference from the stream is added back.
+    # The conversion to linear light and back rounds. At 0 and 1, the difference is added, so that the image is exact.
     ends = jnp.where(share == 0, frame.visual - mixed, jnp.where(share == 1, frame.tactile - mixed, 0))
     return jnp.clip(mixed + jax.lax.stop_gradient(ends), 0, 1)
 
@@ -162,35 +180,40 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
 def touch(
     sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"] | None = None
 ) -> Float[Array, "h w 3"]:
-    """Render the tactile image of a given imprint, whatever its source.
+    """Render the tactile image of a given imprint, such as the result of another contact model.
 
     Args:
-        sensor: constants of the camera, gel, skin, lights, reflectance and housing.
-        imprint: depth of the imprint (m) where the ray of each pixel meets the skin, 0 without contact. Clipped to the
-            gel's thickness. NaN counts as 0.
-        window: part of the gel's face in the image, (left, top, width, height) (m). Default: the whole view.
+        sensor: Constants of the sensor.
+        imprint: Depth of the skin below the gel's undeformed face at the point that each pixel shows (m), 0 without
+            contact. The depth is clipped to [0, `Gel.thickness`], and NaN counts as 0.
+        window: Part of the gel's outer face that the image shows: left, top, width, height (m). None selects the
+            largest centred part of the camera's view with the aspect ratio of `imprint`.
 
     Returns:
-        Image in [0, 1], equal to `Frame.tactile` of this imprint, except that `sense` samples small images more finely
-        (`Sensor.fine_below`). If traced constants or a traced window are invalid, it shows flat skin in the whole view
-        with the default constants.
+        Image in [0, 1]. It equals `Frame.tactile` of the same imprint, except that `sense` samples small images more
+        finely (`Sensor.fine_below`). If a traced constant or a traced window is invalid, the image shows flat skin in
+        the whole view, and traced constants have their default values.
 
     Raises:
-        TypeError: `imprint` is not an array.
-        ValueError: the imprint is not an image or has whole numbers, the window has no area or is not finite, or
-            `Sensor.check` raises an error. Traced values are not checked.
+        TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
+        ValueError: `imprint` is empty, is not two-dimensional or has an integer type, `window` has another shape, is
+            not finite or has no area, or a constant of the sensor is out of range (`Sensor.check`). Traced values are
+            not checked.
     """
     _check_sensor(sensor)
     imprint = _imprint_in_metres(imprint)
     sensor, sound = sensor.guard()
     rows, columns = imprint.shape
     full = optics.full_window(sensor.camera, (rows, columns))
-    window = full if window is None else _numbers("window", window, "(4,), left, top, width, height (m)")
+    window = full if window is None else _numbers("window", window, "(4,): left, top, width, height (m)")
     if window.shape != (4,):
-        raise ValueError(f"window has the shape {window.shape}, but it must be (4,), left, top, width, height (m)")
+        raise ValueError(f"window has the shape {window.shape}, but it must be (4,): left, top, width, height (m)")
     somewhere = jnp.all(jnp.isfinite(window)) & jnp.all(window[2:] > 0)
     if not isinstance(somewhere, jax.core.Tracer) and not somewhere:
-        raise ValueError(f"window is {window}, but it needs finite left, top, width, height (m), the last two > 0")
+        raise ValueError(
+            f"window is {window}, but it must be four finite numbers, left, top, width, height (m), with a width and "
+            "a height > 0"
+        )
     sound &= somewhere
     window = jnp.where(sound, window, full)
     return drawing.touch(sensor, jnp.where(sound, imprint, 0), window)
@@ -205,14 +228,23 @@ def _check_kinds(sensor: Any, body: Any) -> None:
     _check_sensor(sensor)
     if not isinstance(body, Body):
         several = isinstance(body, Sequence) and not isinstance(body, str)
-        remedy = "For several use objects.stack and jax.vmap" if several else "objects.load reads a mesh file"
+        remedy = "For several bodies use objects.stack and jax.vmap" if several else "objects.load reads a mesh file"
         raise TypeError(f"body is {body!r}, but it must be one Body. {remedy}")
     if body.vertices.ndim != 2 or not is_traced(body):
         body.check()
 
 
 def _numbers(name: str, value: Any, wanted: str) -> Array:
-    """The value as a floating-point array. A named tuple, such as a whole `Placement`, raises an error."""
+    """Convert an argument to a floating-point array.
+
+    Args:
+        name: Name of the argument, for error messages.
+        value: Value of the argument.
+        wanted: Shape and meaning of the array that the argument must be, for error messages.
+
+    Raises:
+        TypeError: The value is a named tuple, such as a whole `Placement`, or not an array of numbers.
+    """
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         raise TypeError(
             f"{name} is a {type(value).__name__}, but it must be an array of shape {wanted}. Unpack it with *"
@@ -224,19 +256,19 @@ def _numbers(name: str, value: Any, wanted: str) -> Array:
 
 
 def _imprint_in_metres(imprint: Any) -> Float[Array, "h w"]:
-    """The imprint as an image. Whole numbers raise an error, because they cannot be metres."""
+    """Convert an imprint to a floating-point image. Integers raise an error, because they cannot be metres."""
     try:
         imprint = jnp.asarray(imprint)
     except (TypeError, ValueError):
         raise TypeError(f"imprint is {imprint!r}, but it must be an array (height, width) in metres") from None
     if not jnp.issubdtype(imprint.dtype, jnp.floating):
         raise ValueError(
-            f"imprint has the type {imprint.dtype}, but it must be floating-point, in metres (0.0005 is half a "
-            "millimetre). Multiply a depth image of whole numbers by the metres of one unit first"
+            f"imprint has the type {imprint.dtype}, but it must be a floating-point array in metres (0.0005 is half a "
+            "millimetre). Multiply an image of integers by the size of its unit in metres first"
         )
     if imprint.ndim != 2 or 0 in imprint.shape:
         raise ValueError(
-            f"imprint has the shape {imprint.shape}, but it must be (height, width). For several use jax.vmap"
+            f"imprint has the shape {imprint.shape}, but it must be (height, width). For several imprints use jax.vmap"
         )
     return jnp.asarray(imprint, float)
 
@@ -246,12 +278,15 @@ def _check_light(light: Any) -> None:
     if known and np.asarray(light).dtype.kind not in "iuf":
         raise TypeError(f"light is {light!r}, but it must be one number from 0 (visual) to 1 (tactile)")
     if jnp.ndim(light):
-        raise ValueError(f"light has the shape {jnp.shape(light)}, but it must be one number. For several use jax.vmap")
+        raise ValueError(
+            f"light has the shape {jnp.shape(light)}, but it must be one number. For several levels use jax.vmap"
+        )
     if known and not 0 <= np.asarray(light) <= 1:
-        raise ValueError(f"light is {light}, but it must be a share of the LEDs' power, from 0 (visual) to 1 (tactile)")
+        raise ValueError(f"light is {light}, but it must be from 0 (visual) to 1 (tactile)")
 
 
 def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any) -> None:
+    """Raise a ValueError if the resolution, the shape of the pose or wrench, or the number of faces is not allowed."""
     whole = isinstance(resolution, Sequence) and all(isinstance(n, int | np.integer) for n in resolution)
     if not whole or len(resolution) != 2 or min(resolution) < 1:
         raise ValueError(

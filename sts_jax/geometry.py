@@ -1,8 +1,11 @@
-"""Rotations, poses and vectors: the geometry of the sensor frame.
+"""Quaternions, poses and vectors.
 
-A quaternion is `[w, x, y, z]`, shape `(4,)`, unit length. A pose is a position (m), then a quaternion, shape `(7,)`. It
-maps points of the mesh frame to the sensor frame. All functions broadcast over leading axes and have finite gradients,
-also at zero and at the identity. They accept lists of numbers, and raise a ValueError for an array of the wrong shape.
+A quaternion is `[w, x, y, z]`, shape `(4,)`, with unit length. A pose is a position (m) and a quaternion, shape `(7,)`.
+It maps points of an object's mesh frame to the sensor frame. All functions have finite gradients, also at zero and at
+the identity. Arguments whose shapes start with `*n` may have any leading axes.
+
+The functions of quaternions, matrices and poses accept lists of numbers too, and raise a ValueError if the last axes of
+an argument have the wrong sizes.
 """
 
 from typing import Any
@@ -27,7 +30,7 @@ def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
 
 
 def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Hamilton product: the rotation `b`, then the rotation `a`."""
+    """Hamilton product of two quaternions: the rotation `b`, followed by the rotation `a`."""
     a, b = _checked("a", a, 4), _checked("b", b, 4)
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
@@ -43,20 +46,20 @@ def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Arr
 
 
 def quat_inverse(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Inverse of a unit quaternion: its conjugate."""
+    """Quaternion of the inverse rotation, the conjugate of the unit quaternion `q`."""
     q = _checked("q", q, 4)
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """The unit quaternion of the same rotation with `w >= 0`."""
+    """Normalise a quaternion, and negate it if `w < 0`, which does not change the rotation."""
     q = _checked("q", q, 4)
     q = normalize(q)
     return jnp.where(q[..., :1] < 0, -q, q)
 
 
 def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Rotation matrix of a unit quaternion."""
+    """Rotation matrix R of a unit quaternion. It rotates a column vector v to R v."""
     q = _checked("q", q, 4)
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [
@@ -70,8 +73,9 @@ def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
     """Unit quaternion with `w >= 0` of a rotation matrix, or of the rotation nearest to any other 3x3 matrix.
 
-    The nearest rotation R has the largest `sum(R * matrix)`. Its quaternion is the eigenvector of the largest
-    eigenvalue of Davenport's K (Markley and Mortari 2000, "Quaternion attitude estimation using vector observations").
+    The nearest rotation is the rotation matrix R with the largest `sum(R * matrix)`. Its quaternion is the eigenvector
+    of the largest eigenvalue of Davenport's matrix K (Markley and Mortari 2000, "Quaternion attitude estimation using
+    vector observations").
     """
     m = _checked("matrix", matrix, 3, 3)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
@@ -84,15 +88,15 @@ def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
 
 @jax.custom_jvp
 def _largest_eigenvector(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 4"]:
-    """Unit eigenvector of the largest eigenvalue of symmetric matrices. The other eigenvalues may be equal."""
+    """Unit eigenvector of the largest eigenvalue of symmetric matrices, with a gradient also if others are equal."""
     return jnp.linalg.eigh(matrix)[1][..., :, -1]
 
 
 @_largest_eigenvector.defjvp
 def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    # dv = sum_i v_i (v_i . dA v) / (lambda - lambda_i) over the other eigenvectors. A term is 0 if its eigenvalue is
-    # equal to the largest. The derivative of `eigh` cannot be used, because it divides by the differences of all pairs,
-    # and for a rotation three eigenvalues are equal.
+    # dv = sum_i v_i (v_i . dA v) / (lambda - lambda_i), over the eigenvectors v_i other than v, the one of the largest
+    # eigenvalue lambda. A term is set to 0 if lambda_i is equal to lambda. The derivative of `eigh` cannot be used,
+    # because it divides by the differences of all pairs of eigenvalues, and for a rotation three of them are equal.
     values, vectors = jnp.linalg.eigh(primals[0])
     largest = vectors[..., :, -1]
     gap = values[..., -1:] - values[..., :-1]
@@ -104,14 +108,14 @@ def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> t
 
 
 def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """Quaternion of the rotation by `|v|` radians about `v`, differentiable at zero."""
+    """Quaternion of a rotation vector (rad): the rotation about `v` by the angle `|v|`."""
     v = _checked("v", v, 3)
     half = 0.5 * norm(v)[..., None]
     return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
 
 
 def quat_to_rotvec(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
-    """Rotation vector (rad) of a unit quaternion: the axis times the angle, which is at most pi."""
+    """Rotation vector (rad) of a unit quaternion: the unit axis times the angle in [0, pi]."""
     q = _checked("q", q, 4)
     q = quat_canonical(q)
     sine = norm(q[..., 1:])[..., None]
@@ -121,23 +125,34 @@ def quat_to_rotvec(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
 
 
 def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """A uniformly drawn rotation with `w >= 0`."""
+    """Draw a quaternion with `w >= 0` from the uniform distribution of rotations."""
     return quat_canonical(jax.random.normal(key, (4,)))
 
 
 def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Points of the mesh frame in the sensor frame."""
+    """Transform points from the mesh frame to the sensor frame.
+
+    Args:
+        pose: One pose: position (m) and unit quaternion. For several poses use `jax.vmap`.
+        points: Points in the mesh frame (m).
+
+    Returns:
+        The points in the sensor frame (m).
+
+    Raises:
+        ValueError: `pose` or `points` has the wrong shape.
+    """
     pose, points = _checked("pose", pose, 7), _checked("points", points, 3)
     if pose.ndim != 1:
-        raise ValueError(f"pose has the shape {pose.shape}, but it must be (7,): use jax.vmap for several poses")
-    # Component by component, because a matrix product is several times slower on a CPU and rounds on some GPUs.
+        raise ValueError(f"pose has the shape {pose.shape}, but it must be (7,): for several poses use jax.vmap")
+    # Component by component, because a matrix product is several times slower on a CPU and less precise on some GPUs.
     x, y, z = (points[..., k] for k in range(3))
     rows = zip(quat_to_matrix(pose[3:]), pose[:3], strict=True)
     return jnp.stack([row[0] * x + row[1] * y + row[2] * z + shift for row, shift in rows], axis=-1)
 
 
 def pose_to_matrix(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 4 4"]:
-    """Homogeneous 4x4 matrix of a pose."""
+    """Homogeneous 4x4 matrix of a pose: it maps points (x, y, z, 1) of the mesh frame to the sensor frame."""
     pose = _checked("pose", pose, 7)
     top = jnp.concatenate([quat_to_matrix(pose[..., 3:]), pose[..., :3, None]], axis=-1)
     bottom = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), (*pose.shape[:-1], 1, 4))
@@ -145,13 +160,16 @@ def pose_to_matrix(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 4 4"]:
 
 
 def pose_from_matrix(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 7"]:
-    """Pose of a homogeneous 4x4 matrix, with `w >= 0`."""
+    """Pose of a homogeneous 4x4 matrix, as a position and a quaternion with `w >= 0`.
+
+    If the upper left 3x3 matrix is not a rotation, the pose has the nearest rotation.
+    """
     matrix = _checked("matrix", matrix, 4, 4)
     return jnp.concatenate([matrix[..., :3, 3], quat_from_matrix(matrix[..., :3, :3])], axis=-1)
 
 
 def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """Composition of two poses: the pose `b`, then the pose `a`. Its matrix is the product of their matrices."""
+    """Composition of two poses: `b` is applied first, then `a`. Its matrix is the matrix of `a` times that of `b`."""
     a, b = _checked("a", a, 7), _checked("b", b, 7)
     quat = quat_multiply(a[..., 3:], b[..., 3:])
     turned = jnp.einsum("...ij,...j->...i", quat_to_matrix(a[..., 3:]), b[..., :3], precision="highest")
@@ -159,7 +177,7 @@ def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Arr
 
 
 def pose_inverse(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """The pose that maps the sensor frame into the mesh frame."""
+    """Inverse of a pose: it maps points of the sensor frame to the mesh frame."""
     pose = _checked("pose", pose, 7)
     quat = quat_inverse(pose[..., 3:])
     position = -jnp.einsum("...ij,...j->...i", quat_to_matrix(quat), pose[..., :3], precision="highest")
@@ -172,11 +190,14 @@ def _checked(name: str, value: Any, *tail: int) -> Array:
         try:
             value = jnp.asarray(value, float)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{name} is {value!r}, but it must be an array of {_shape(tail)} numbers") from error
+            raise ValueError(
+                f"{name} is {value!r}, but it must be an array of numbers of shape {_shape(tail)}"
+            ) from error
     if value.shape[max(value.ndim - len(tail), 0) :] != tail:
         raise ValueError(f"{name} has the shape {value.shape}, but it must be {_shape(tail)}")
     return value
 
 
 def _shape(tail: tuple[int, ...]) -> str:
+    """Text of a shape with any leading axes, such as "(..., 4)"."""
     return f"(..., {', '.join(map(str, tail))})"

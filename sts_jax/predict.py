@@ -1,4 +1,4 @@
-"""`Predictor`: a trained model as a function from any subset of vision, touch and pose to their values at rest."""
+"""`Predictor`: a trained model as a function that predicts both images and the pose at rest from earlier ones."""
 
 import dataclasses
 import importlib.resources
@@ -16,15 +16,19 @@ from sts_jax import _arguments, _files, mvae, statespace, training
 from sts_jax.prediction import Prediction, completed, flagged, predict, predict_samples
 
 MODALITIES = ("visual", "tactile", "pose")
-MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # the models of the library, one folder each
-_LARGEST_CONDITION = 100.0  # largest condition, in units of its usual size
+MODELS = Path(str(importlib.resources.files("sts_jax"))) / "models"  # trained models of the library, one folder each
+_LARGEST_CONDITION = 100.0  # largest condition, as a multiple of its usual magnitude
 
 
 class Predictor:
-    """A trained model as a function: `predictor(visual=image)` gives a `Prediction`.
+    """A trained model as a function: `predictor(visual=image)` returns a `Prediction`.
 
-    It is pure, and works inside `jax.jit`, `jax.vmap` and `jax.grad`. `Predictor.load("freefall")` loads a model that
-    comes with the library, and `Predictor.load("runs/freefall/models/statespace")` one that you trained.
+    The inputs are images and the object's pose in the first frame of a trajectory. The prediction is the last frame, in
+    which the object has come to rest.
+
+    `Predictor.load("freefall")` loads a model that comes with the library.
+    `Predictor.load("runs/freefall/models/statespace")` loads a model that you trained. Calls are pure, and work inside
+    `jax.jit`, `jax.vmap` and `jax.grad`.
     """
 
     def __init__(
@@ -34,13 +38,13 @@ class Predictor:
         blank: tuple[np.ndarray, np.ndarray],
         name: str,
     ):
-        """Use `Predictor.load`.
+        """Create a predictor from its parts. `Predictor.load` is the usual way.
 
         Args:
-            model: Definition, parameters and running statistics.
-            preprocessing: The preprocessing of its training.
-            blank: The visual and the tactile image of the untouched sensor, `uint8 (height, width, 3)`.
-            name: The model's folder, for messages.
+            model: Trained model: definition, parameters and running statistics.
+            preprocessing: Preprocessing with which the model was trained.
+            blank: Visual and tactile image of the untouched sensor, each uint8 (height, width, 3).
+            name: Name or folder of the model, for error messages.
         """
         self.model = model
         self.preprocessing = preprocessing
@@ -63,16 +67,22 @@ class Predictor:
         """Load a trained model.
 
         Args:
-            folder: The `workdir` of a training or the folder of `save`, such as `runs/freefall/models/mvae`, or the
-                name of a model that comes with the library, such as `freefall`. A folder of this name in the current
-                directory takes precedence if it has a `config.json`.
-            resolution: The resolution of the images that will be given. A model of another resolution is refused.
-            crop: The view that will be given (True: the square around the object). A model of another view is refused.
+            folder: Folder of a trained model, such as `runs/freefall/models/mvae`: the `workdir` of its training, or a
+                folder that `save` wrote. Or the name of a model that comes with the library, such as `freefall`. If the
+                current directory has a folder of that name with a `config.json`, this folder is loaded.
+            resolution: Height and width of the images that you will pass (pixels). If given, a model that was trained
+                at another resolution raises an error.
+            crop: View of the images that you will pass: True for the square around the object, False for the whole pad.
+                If given, a model that was trained on the other view raises an error.
+
+        Returns:
+            The predictor.
 
         Raises:
-            FileNotFoundError: The folder holds no model, and the library has none of this name.
+            FileNotFoundError: The folder contains no model, and the library has no model of this name.
             OSError: A file is damaged, missing or not listed in `manifest.json`.
-            ValueError: The model was trained on another view, by another version of sts_jax, or has no manifest.
+            ValueError: The model was trained at another resolution or on another view, was written by another version
+                of sts_jax, or has no manifest.
         """
         path = _located(folder)
         model = training.load(path)
@@ -84,34 +94,36 @@ class Predictor:
             there = getattr(preprocessing, field)
             if asked is not None and asked != there:
                 raise ValueError(
-                    f"{folder} was trained on {field}={there}, but {field}={asked} was requested: "
-                    "render the first view, or train a model on the second."
+                    f"{folder} was trained with {field}={there}, but {field}={asked} was requested: "
+                    f"render images with {field}={there}, or train a model with {field}={asked}."
                 )
         if isinstance(model.config, statespace.Config):
             _check_view(str(folder), model.config, preprocessing)
         blank = training.load_blank(path)
         if any(image.shape[:2] != preprocessing.resolution for image in blank):
             raise ValueError(
-                f"{path / 'blank.npz'} has images of {blank[0].shape[:2]}, but the model takes "
-                f"{preprocessing.resolution}: the file belongs to another model. Delete {path} and train again."
+                f"{path / 'blank.npz'} has images of {blank[0].shape[:2]} pixels, but the model needs "
+                f"{preprocessing.resolution}: the file is from another model. Delete the folder {path} and train again."
             )
         return cls(model, preprocessing, blank, str(folder))
 
     def save(self, folder: str | Path, *, compact: bool = False) -> None:
-        """Write a folder that `load` reads. It lacks the optimiser's state, so that training cannot resume from it.
+        """Write the model to a folder that `load` reads. Training cannot resume from this folder.
+
+        The folder has no optimiser state.
 
         Args:
-            folder: A new or an empty folder.
-            compact: Round the weights to a third of their size. A weight changes by at most 1/256 of the root mean
-                square of its output channel, and predictions change slightly.
+            folder: New or empty folder.
+            compact: If True, round the weights, which reduces their size on disk to a third. A weight changes by at
+                most 1/256 of the root mean square of its output channel, and predictions change slightly.
 
         Raises:
-            FileExistsError: The folder is not empty.
-            OSError: The disk is full or the folder is not writable.
+            FileExistsError: The folder is not empty, or is a file.
+            OSError: The disk is full, or the folder is not writable.
         """
         folder = Path(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise FileExistsError(f"{folder} is not an empty folder: give the name of a new one.")
+            raise FileExistsError(f"{folder} is not an empty folder: give a new or an empty folder.")
         settings = {**self.model.settings, "preprocessing": dataclasses.asdict(self.preprocessing)}
         params, stats = nnx.split_state(self.model.state, nnx.Param, nnx.BatchStat)
         training.save_blank(folder, *self._images)
@@ -140,26 +152,36 @@ class Predictor:
         key: PRNGKeyArray | None = None,
         num_samples: int = 0,
     ) -> Prediction:
-        """Predict the last moment from any non-empty subset of the first one's modalities.
+        """Predict the last frame of trajectories from their first frames.
 
-        Values that are traced by `jax.jit`, `jax.vmap` or `jax.grad` cannot be refused. There, an item whose values
-        would raise an error outside gives a prediction of NaN, and the other items are not affected.
+        Pass at least one of `visual`, `tactile` and `pose`. All arrays are floating-point and have the same leading
+        axes *n: none for a single item, and any number for a batch.
+
+        Outside `jax.jit`, an invalid value raises an error. Traced values cannot raise errors: an item with an invalid
+        traced value gives a prediction of NaN. Other items of the batch are not affected.
 
         Args:
-            visual: `(*n, height, width, 3)` in [0, 1], any leading axes, the same for all inputs.
-            tactile: `(*n, height, width, 3)` in [0, 1]. Items without contact are ignored.
-            pose: `(*n, 7)` m and unit quaternion, mesh frame in the sensor frame.
-            condition: `(*n, c)`, the scenario's input in SI units, for models that have one. For a jerk: acceleration
-                of the pad along x and y (m/s^2) and its duration (s).
-            state: `(*n, code)`, the true pose, shape and mass, from `statespace.encode`, for state-space models. A
-                simulation provides them. The remaining error is that of the learned physics and of the decoder.
-            present: By name, which items of a modality count, bool `(*n,)`. Items that do not count may be NaN.
-            key: The random key for `num_samples`, consumed.
-            num_samples: Draw this many predictions. A state-space model's images are then the means over them.
+            visual: Visual images in [0, 1], (*n, height, width, 3).
+            tactile: Tactile images in [0, 1], (*n, height, width, 3). Images without contact are ignored, unless the
+                model was trained with blank tactile images as inputs.
+            pose: Poses of the object, (*n, 7): position (m) and unit quaternion, mesh frame in the sensor frame.
+            condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with
+                them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration (s).
+            state: Codes of the true pose, shape and mass, (*n, code), from `statespace.encode`. Only for state-space
+                models. With the true state of a simulation, the remaining error is that of the learned physics and of
+                the decoder.
+            present: Dictionary from the name of a modality to a Boolean mask (*n,), False for items in which the
+                modality is to be ignored. Ignored values may be NaN. By default, all items are used.
+            key: Random key that draws the samples. It is needed only if `num_samples` > 0.
+            num_samples: Number of predictions to draw for each item, returned in `Prediction.samples`. If it is > 0,
+                the images of a state-space model's prediction are means over these samples.
+
+        Returns:
+            The prediction for each item.
 
         Raises:
-            ValueError: No input is given, the model lacks a modality or was trained without it, or a value has a wrong
-                type or shape, or is out of range or NaN. The message names the argument and the remedy.
+            ValueError: No input is given, the model does not accept an input or was trained without it, or a value has
+                a wrong type or shape, is out of range, or is NaN. The message names the argument and the remedy.
         """
         given = {
             name: value for name, value in zip(MODALITIES, (visual, tactile, pose), strict=True) if value is not None
@@ -170,9 +192,9 @@ class Predictor:
         leads = {name: array.shape[: -1 if name == "pose" else -3] for name, array in arrays.items()}
         lead = next(iter(leads.values()))
         if len(set(leads.values())) > 1:
-            raise ValueError(f"the leading axes differ: {leads}. Give the same number of items of each modality.")
+            raise ValueError(f"the leading axes differ: {leads}. Pass the same number of items of each modality.")
         masks = _arguments.checked_masks(present, arrays, lead)
-        valid: Array | None = None  # valid items, (*n,), or None if no value is traced
+        valid: Array | None = None  # mask of the valid items, (*n,), or None if no value is traced
         for name, array in arrays.items():
             mask = masks.get(name)
             if _arguments.traced(array) or _arguments.traced(mask):
@@ -191,21 +213,26 @@ class Predictor:
         return result if valid is None else flagged(result, valid)
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: ArrayLike | None = None) -> Prediction:
-        """Predict from the prior, without any measurement, for items of any leading `shape`.
+        """Predict the last frame of trajectories without any measurement, from the model's prior distribution.
 
         Args:
-            shape: Leading axes of the items.
-            condition: `(*shape, c)`, as in a call.
+            shape: Leading axes of the predictions. The default is a single prediction.
+            condition: Known parameters of the trajectories in SI units, (*shape, c), for models that were trained with
+                them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration (s).
+
+        Returns:
+            The predictions.
 
         Raises:
-            ValueError: A size is not a positive whole number, or the condition is missing, superfluous or out of range.
+            ValueError: A size in `shape` is not a whole number > 0, or `condition` is missing, not accepted by the
+                model, or out of range.
         """
         try:
             shape = tuple(operator.index(size) for size in shape)
         except TypeError:
             raise ValueError(f"shape is {shape!r}, but it must be a tuple of whole numbers, such as (3,).") from None
         if min(shape, default=1) < 1:
-            raise ValueError(f"shape is {shape}, but each size must be at least 1.")
+            raise ValueError(f"shape is {shape}, but each size must be >= 1.")
         condition, plausible = self._checked_condition(condition, shape)
         result = self._predicted({}, {}, shape, condition, None, 0)
         return result if plausible is None else flagged(result, plausible)
@@ -250,27 +277,30 @@ class Predictor:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The modalities that the model accepts: its inputs, except those that were absent in training."""
+        """Names of the modalities that the model accepts, without those that were absent in its training data."""
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
     @property
     def empty(self) -> dict[str, np.ndarray]:
-        """The images of the untouched sensor in its training by stream, float32 `(height, width, 3)` in [0, 1]."""
+        """Visual and tactile image of the untouched sensor, by name, float32 (height, width, 3) in [0, 1]."""
         return {name: np.asarray(image) for name, image in self._empty.items()}
 
     def _checked_name(self, name: str, value: Any) -> np.ndarray | Array:
-        """Check type and shape of an input and return it as float32. A traced value stays traced."""
+        """Check the type and shape of the input `name`, and return it as float32. A traced value stays traced."""
         if name not in (*self._inputs, *self.preprocessing.absent):
-            raise ValueError(f"{self.name} takes no {name}: it was trained on {', '.join(self._inputs)}.")
+            raise ValueError(
+                f"{self.name} does not accept {name}: it was trained on {', '.join(self._inputs)}. Leave {name}= out."
+            )
         if name in self.preprocessing.absent:
             raise ValueError(
-                f"{self.name} cannot use {name}: no first moment of its training had any (in freefall nothing "
-                f"touches the pad yet). Leave {name}= out, or use a model of another scenario."
+                f"{self.name} cannot use {name}: it was absent from all first frames of the training data (before a "
+                f"fall, for example, nothing touches the pad). Leave {name}= out, or use a model of another scenario."
             )
         array = _arguments.checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
         if not jnp.issubdtype(array.dtype, jnp.floating):
             raise ValueError(
-                f"{name} is {array.dtype}: give floats" + ("." if name == "pose" else " in [0, 1] (uint8 / 255).")
+                f"{name} is {array.dtype}, but it must be floating-point"
+                + ("." if name == "pose" else " in [0, 1]: divide uint8 images by 255.")
             )
         height, width = self.preprocessing.resolution
         tail = (7,) if name == "pose" else (height, width, 3)
@@ -280,16 +310,16 @@ class Predictor:
                 + ("." if name == "pose" else f": render with resolution={self.preprocessing.resolution}.")
             )
         if math.prod(array.shape) == 0:
-            raise ValueError(f"{name} has shape {array.shape}, so there is no item in it: give at least one.")
+            raise ValueError(f"{name} has shape {array.shape}, so there is no item in it: pass at least one.")
         return _arguments.float32(array)
 
     def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
-        """Check a state code and return it as float32."""
+        """Check the argument `state`, and return it as float32."""
         if isinstance(self.model.config, mvae.Config):
-            raise ValueError(f"{self.name} takes no state: it is a model of the paper's kind, which has none.")
+            raise ValueError(f"{self.name} does not accept state: only state-space models do. Leave state= out.")
         array = _arguments.checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
         if array.shape != (*lead, statespace.STATE_CODE):
-            raise ValueError(f"state has shape {array.shape}, but it needs {(*lead, statespace.STATE_CODE)}.")
+            raise ValueError(f"state has shape {array.shape}, but it must have shape {(*lead, statespace.STATE_CODE)}.")
         if not _arguments.traced(array) and not np.isfinite(array).all():
             raise ValueError("state has NaN or infinite values, but every item needs its true state.")
         return _arguments.float32(array)
@@ -297,16 +327,18 @@ class Predictor:
     def _checked_condition(
         self, value: Any, lead: tuple[int, ...]
     ) -> tuple[np.ndarray | Array | None, Bool[Array, "*n"] | None]:
-        """Check a condition. Return it as float32 and, if it is traced, which items are plausible."""
+        """Check the argument `condition`. Return it as float32 and, if it is traced, a mask of the plausible items."""
         width = self.model.config.condition
         array = None if value is None else _arguments.checked_array("condition", value, f"{width} numbers in SI units")
         shape = None if array is None else array.shape
         if shape != (None if width == 0 else (*lead, width)):
-            raise ValueError(f"condition has shape {shape}: {self.name} needs {(*lead, width) if width else 'none'}.")
+            given = "is missing" if shape is None else f"has shape {shape}"
+            wanted = f"needs shape {(*lead, width)}, in SI units" if width else "accepts none: leave condition= out"
+            raise ValueError(f"condition {given}, but {self.name} {wanted}.")
         if array is None:
             return None, None
         if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-            raise ValueError(f"condition is {array.dtype}, but it must be numbers in SI units.")
+            raise ValueError(f"condition is {array.dtype}, but it must be an array of numbers in SI units.")
         condition = _arguments.float32(array)
         scale = np.array(self.preprocessing.condition_scale)
         if _arguments.traced(condition):
@@ -315,14 +347,14 @@ class Predictor:
             raise ValueError("condition has NaN or infinite values, but every item needs a condition.")
         if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
             raise ValueError(
-                f"condition has {np.abs(condition).reshape(-1, width).max(0).tolist()}, but {scale.tolist()} is "
-                "usual: give it in SI units."
+                f"condition has magnitudes {np.abs(condition).reshape(-1, width).max(0).tolist()}, but usual ones are "
+                f"{scale.tolist()}, and at most {_LARGEST_CONDITION:g} times these are allowed: give it in SI units."
             )
         return condition, None
 
 
 def _located(folder: str | Path) -> Path:
-    """The folder of a model, given the folder itself or the name of a model of the library."""
+    """Return the folder of a model, given this folder or the name of a model that comes with the library."""
     path, name = Path(folder), str(folder)
     if name != path.name or (path / "config.json").exists():
         return path
@@ -336,7 +368,7 @@ def _located(folder: str | Path) -> Path:
 
 
 def _check_view(name: str, config: statespace.Config, preprocessing: training.Preprocessing) -> None:
-    """Raise a ValueError if the networks were made for another view or another code of a pose."""
+    """Raise a ValueError if the preprocessing differs from the view or pose encoding that the networks need."""
     presumed = {
         "resolution": (config.input_size,) * 2,
         "crop": False,
@@ -348,5 +380,5 @@ def _check_view(name: str, config: statespace.Config, preprocessing: training.Pr
         if found != wanted:
             raise ValueError(
                 f"{name}: the state-space model needs preprocessing with {field}={wanted!r}, got {found!r}: train it "
-                "with that preprocessing."
+                f"with {field}={wanted!r}."
             )

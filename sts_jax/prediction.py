@@ -1,4 +1,4 @@
-"""Predictions, and the pure functions that compute them from a model's parameters."""
+"""`Prediction`, and the pure functions that compute predictions from the parameters of a model."""
 
 import functools
 import math
@@ -12,23 +12,29 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from sts_jax import mvae, statespace, training
 
-_POSES = 256  # samples of the final pose, of which the prediction of a state-space model is the centre
-_DRAWN = 16  # samples that are drawn as images if `num_samples` is 0 (the predicted images are their means)
-_TURN = 0.02  # m, weight of one radian in the choice of the most central sample
-_ITERATIONS = 30  # of Weiszfeld's method
-_CLOSE = 1e-6  # m, the distance below which a sample's weight in it no longer grows
+_POSES = 256  # number of sampled final poses, whose centre is the predicted pose of a state-space model
+_DRAWN = 16  # number of sampled images if `num_samples` is 0. The predicted images are their means
+_TURN = 0.02  # m, distance that counts as much as a rotation by one radian, in the choice of the most central sample
+_ITERATIONS = 30  # iterations of Weiszfeld's method
+_CLOSE = 1e-6  # m, distance below which the weight of a sample in Weiszfeld's method no longer grows
 
 
 class Prediction(NamedTuple):
-    """A predicted last moment. Modalities that the model lacks are None."""
+    """Prediction of the last frame of a trajectory. Modalities that the model does not predict are None."""
 
-    visual: Float[Array, "*n h w 3"] | None  # [0, 1]
-    tactile: Float[Array, "*n h w 3"] | None  # [0, 1]
-    pose: Float[Array, "*n 7"] | None  # m, unit quaternion with w >= 0, mesh frame in the sensor frame
-    mean: Float[Array, "*n latent"]  # mean of the fused posterior
-    log_var: Float[Array, "*n latent"]  # its log variance
-    samples: "Prediction | None" = None  # samples on a leading axis, each from its own latent
-    # Probability of each of the scenario's `outcomes`, in their order (None for a model of the paper's kind)
+    # Visual image, sRGB in [0, 1].
+    visual: Float[Array, "*n h w 3"] | None
+    # Tactile image in [0, 1].
+    tactile: Float[Array, "*n h w 3"] | None
+    # Pose of the object: position (m) and unit quaternion with w >= 0, mesh frame in the sensor frame.
+    pose: Float[Array, "*n 7"] | None
+    # Mean of the posterior of the latent variables, given all inputs.
+    mean: Float[Array, "*n latent"]
+    # Logarithm of the variance of this posterior.
+    log_var: Float[Array, "*n latent"]
+    # Samples, None if `num_samples` is 0. Their images and poses have another leading axis of `num_samples`.
+    samples: "Prediction | None" = None
+    # Probability of each of the scenario's `outcomes`, in their order. None for an `mvae` model.
     outcome_probability: Float[Array, "*n outcomes"] | None = None
 
     def __repr__(self) -> str:
@@ -52,22 +58,27 @@ def predict(
     num_samples: int = 0,
     shape: tuple[int, ...] = (),
 ) -> Prediction:
-    """Predict with a model of the paper's kind, from the mean of the fused posterior.
+    """Predict with an `mvae` model, by decoding the mean of the posterior of the latent variables.
 
     The function is pure, and is compiled once per shape and subset of the inputs.
 
     Args:
-        graphdef: The model's definition.
-        state: Its parameters and running batch statistics.
-        preprocessing: The preprocessing of its training.
-        blank: The tactile image of the untouched sensor, [0, 1].
-        inputs: Some of `visual`, `tactile` `(*n, height, width, 3)` in [0, 1] and `pose` `(*n, 7)`.
-        present: Which items of an input count, `(*n,)` (default: all). A touch without contact never counts, unless
-            the model was trained with blank images as inputs.
-        condition: `(*n, c)`, SI units, for models that have one.
-        key: The random key of the samples, consumed.
-        num_samples: Number of latents to draw besides the mean.
-        shape: The leading axes if there is no input. The prediction is then that of the prior.
+        graphdef: Definition of the model.
+        state: Parameters and running batch statistics of the model.
+        preprocessing: Preprocessing with which the model was trained.
+        blank: Tactile image of the untouched sensor in [0, 1].
+        inputs: Inputs by the name of the modality: images "visual" and "tactile" in [0, 1], (*n, height, width, 3),
+            and "pose", (*n, 7), position (m) and unit quaternion. Any of these may be missing.
+        present: Masks by the name of the modality, False for items that are ignored. The default is to use all items.
+            Tactile images without contact are always ignored, unless the model was trained with blank tactile images
+            as inputs.
+        condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with them.
+        key: Random key that draws the samples.
+        num_samples: Number of samples to draw from the posterior. Each sample is decoded to images and a pose.
+        shape: Leading axes of the prediction if there is no input. The prediction is then made from the prior.
+
+    Returns:
+        The prediction for each item.
     """
     lead = shape
     for name, value in inputs.items():
@@ -115,12 +126,26 @@ def predict_samples(
     shape: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,
 ) -> Prediction:
-    """Predict with a state-space model. Images are means over samples, and the pose is the centre of samples.
+    """Predict with a state-space model. Images are means over samples, and the pose is the centre of 256 samples.
 
-    Without `num_samples` the images are means over 16 samples of a fixed key, so that every call gives the same
-    prediction. The arguments are those of `predict`, with four differences: `empty` holds both images of the untouched
-    sensor, [0, 1], `inputs` holds all inputs of the model (see `completed`), `shape` is their leading axes, and
-    `calibration` corrects the density of the final pose.
+    If `num_samples` is 0, the images are means over 16 samples that are drawn with a fixed key, so that every call
+    returns the same prediction.
+
+    Args:
+        graphdef: Definition of the model.
+        state: Parameters of the model.
+        preprocessing: Preprocessing with which the model was trained.
+        empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
+        inputs: All inputs of the model by the name of the modality, also those that are ignored (see `completed`).
+        present: Masks by the name of the modality, False for items that are ignored.
+        condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with them.
+        key: Random key that draws the samples. The default is `jax.random.key(0)`.
+        num_samples: Number of samples to return in `Prediction.samples`.
+        shape: Leading axes *n of the inputs and the prediction.
+        calibration: Correction of the probability density of the final pose.
+
+    Returns:
+        The prediction for each item.
     """
     lead = shape
     flat, counts = _flat(preprocessing, inputs, present, lead, empty["tactile"])
@@ -150,10 +175,10 @@ def predict_samples(
 
 
 def _central(poses: Float[Array, "k n 7"]) -> Float[Array, "n 7"]:
-    """The centre of each item's poses.
+    """Centre of k sampled poses, for each of n items.
 
-    Its position has the least mean distance from the poses (geometric median, by Weiszfeld's method). Its orientation
-    is that of the pose with the least mean distance from the others in position and angle.
+    The position of the centre is the geometric median of the sampled positions, computed by Weiszfeld's method. Its
+    orientation is that of the sample with the smallest mean distance from the other samples in position and angle.
     """
     place, quat = poses[..., :3], poses[..., 3:]
 
@@ -175,9 +200,17 @@ def completed(
     present: dict[str, Any],
     lead: tuple[int, ...],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """All inputs of a model and their masks, so that one compiled program serves every subset.
+    """Add the missing inputs of a model with masks that are False, so that one compiled program serves every subset.
 
-    Inputs that are not given are masked for all items.
+    Args:
+        names: Names of all inputs of the model.
+        resolution: Height and width of the images (pixels).
+        inputs: Inputs that are given, by name.
+        present: Masks that are given, by name. An input without a mask is used for all items.
+        lead: Leading axes of the inputs.
+
+    Returns:
+        All inputs and the mask of each, by name.
     """
     lying = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
     nothing = {
@@ -196,7 +229,7 @@ def _flat(
     lead: tuple[int, ...],
     blank: Float[Array, "h w 3"],
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Encoded inputs and their masks, with one leading axis."""
+    """Encode poses, and return all inputs and their masks with one leading axis. Touches without contact are masked."""
     flat, counts = {}, {}
     for name, value in inputs.items():
         value = preprocessing.encode_pose(value) if name == "pose" else value
@@ -208,7 +241,7 @@ def _flat(
 
 
 def flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
-    """Set every number of the invalid items to NaN."""
+    """Set all numbers of a prediction's invalid items to NaN. `valid` is the mask of the valid items."""
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)

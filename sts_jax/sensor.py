@@ -1,4 +1,4 @@
-"""All constants of one sensor, their checks, and their file."""
+"""`Sensor`: all constants of one sensor, with their checks and their file."""
 
 import dataclasses
 import functools
@@ -19,53 +19,62 @@ from sts_jax.optics import Camera, Room
 from sts_jax.tactile import Gel, Leds, Lights, Phong, Skin
 
 _LIGHTS: dict[str, type[Lights] | type[Leds]] = {"Lights": Lights, "Leds": Leds}  # by `lights.kind` in a file
-_LARGEST = float(np.finfo(np.float32).max)  # greater numbers are inf in float32
-_ROUNDED = 1 + 1e-6  # tolerance for float32's last digit
+_LARGEST = float(np.finfo(np.float32).max)  # larger numbers become inf in float32
+_ROUNDED = 1 + 1e-6  # factor that tolerates rounding to float32
 
-_Condition = tuple[Any, Callable[[], str]]  # whether it holds, and the message if it does not
+_Condition = tuple[Any, Callable[[], str]]  # flag, True if the condition holds, and a function that makes the message
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """An STS sensor. Every constant is a field. The defaults are the paper's where it gives a value."""
+    """All constants of an STS sensor. The defaults are those of the paper, where the paper gives a value."""
 
+    # Pinhole of the camera.
     camera: Camera = dataclasses.field(default_factory=Camera)
+    # Size and stiffness of the gel, and limits of its deformation.
     gel: Gel = dataclasses.field(default_factory=Gel)
-    lights: Lights | Leds = dataclasses.field(default_factory=Lights)  # far lights or near ones
+    # Internal lights: directional lights (`Lights`), or points at a finite distance (`Leds`).
+    lights: Lights | Leds = dataclasses.field(default_factory=Lights)
+    # Reflectance of the skin's inner side.
     phong: Phong = dataclasses.field(default_factory=Phong)
+    # Smoothing of the imprint, and shadows on the skin.
     skin: Skin = dataclasses.field(default_factory=Skin)
+    # External light, and the view of it through the skin.
     room: Room = dataclasses.field(default_factory=Room)
-    # images with a shorter side below this (pixels) are sampled every half pixel and filtered. Ours.
+    # Images whose shorter side is below this number of pixels are sampled every half pixel and filtered. Our choice.
     fine_below: int = dataclasses.field(default=128, metadata=NOT_NEGATIVE | STATIC)
 
     def check(self) -> None:
-        """Raise an error if a constant is out of range. Runs on the host with concrete values, never under `jit`.
+        """Raise an error if a constant is out of range. The constants must not be traced by `jit`: use `guard` there.
 
-        Every field must have its shape, be finite and lie in the range that its class declares. Further conditions
-        concern several fields:
+        Every field must have the shape of its default value, be finite, and lie in the range that its class declares.
+        Lights and lamps may have any number of rows. Further conditions concern several fields:
 
-        - The pinhole lies at least `camera.near` in front of the gel, so that objects on the gel are drawn.
-        - The imprint is not deeper than the gel.
-        - No light shines from outside through the paint. Far lights come from the camera's side or lie in the gel's
-          plane, and LEDs lie on the camera's side of the gel's outer face.
-        - LEDs do not lie in the gel. They may lie beside it, where light enters by its edges, and behind the pinhole,
-          which casts no shadow.
+        - The distance from the pinhole to the gel's inner face is at least `camera.near`, so that objects that press on
+          the gel are drawn.
+        - `gel.max_depth`, the largest depth of the imprint, is at most `gel.thickness`.
+        - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
+        - No light shines from outside through the opaque skin: z <= 0 in every direction of `Lights` and every position
+          of `Leds`.
+        - LEDs do not lie in the gel. They may lie beside the gel, where their light enters through its edges, or behind
+          the pinhole, which casts no shadow.
 
         Raises:
-            ValueError: a field is out of range. The message names it, its value and the allowed values.
+            ValueError: A field is out of range. The message contains the field, its value and the allowed values.
         """
         _require(_conditions(self))
 
     def guard(self) -> tuple["Sensor", Bool[Array, ""] | bool]:
-        """Check a sensor whose constants may be traced. Concrete values raise errors, and traced ones give a flag.
+        """Check a sensor whose constants may be traced by `jit`, and replace invalid traced constants.
 
         Returns:
-            This sensor, and whether all its constants are in range. If not, all traced constants have their default
-            values.
+            A sensor and a flag. If all constants are in range, the sensor is this one and the flag is True. If a traced
+            constant is out of range, all traced constants have their default values and the flag is False. If any
+            constant is traced, the flag is traced too.
 
         Raises:
-            ValueError: see `check`, for concrete values and for shapes.
+            ValueError: A constant that is not traced is out of range, or a traced one has a wrong shape (see `check`).
         """
         flags = []
         for holds, message in _conditions(self):
@@ -80,7 +89,7 @@ class Sensor:
         def safe(value: Any, default: Any) -> Any:
             if not isinstance(value, jax.core.Tracer):
                 return value
-            if value.shape != jnp.shape(default):  # another number of lights
+            if value.shape != jnp.shape(default):  # another number of lights than the default
                 default = jnp.broadcast_to(default[:1], value.shape)
             return jnp.where(sound, value, default)
 
@@ -89,38 +98,37 @@ class Sensor:
         return jax.tree.unflatten(structure, [safe(*pair) for pair in zip(leaves, known, strict=True)]), sound
 
     def constants(self) -> dict[str, Any]:
-        """Every constant as lists and numbers, the content of the file that `save` writes."""
+        """All constants as nested dictionaries of lists and numbers, as in the file that `save` writes."""
         return _plain(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write every constant to one JSON file, completely or not at all.
+        """Write all constants to a JSON file. An interruption leaves no incomplete file.
 
         Args:
-            path: path of the file.
+            path: Path of the file.
 
         Raises:
-            ValueError: see `check`.
-            OSError: the file cannot be written. The message names the file and the remedy.
+            ValueError: A constant is out of range (see `check`).
+            OSError: The file cannot be written. The message names the file and the remedy.
         """
         self.check()
         write_json(Path(path), self.constants())
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Sensor":
-        """Read a sensor from a file that `save` wrote, or from the file of a real sensor (`hardware.Device.save`).
-
-        The object "device" of a real sensor's file is ignored.
+        """Read a sensor from a JSON file.
 
         Args:
-            path: path of the file.
+            path: Path of a file that `save` wrote, or of the file of a real sensor (`hardware.Device.save`). The entry
+                "device" of a real sensor's file is ignored.
 
         Returns:
             The sensor.
 
         Raises:
-            FileNotFoundError: the file does not exist.
-            OSError: the file cannot be read, or is damaged or not JSON (`TornFileError`).
-            ValueError: a field is missing, unknown, of another shape or out of range (`check`).
+            FileNotFoundError: The file does not exist.
+            OSError: The file cannot be read, is damaged or is not JSON (`TornFileError`).
+            ValueError: A field is missing, unknown, of another shape or out of range (see `check`).
         """
         values = read_json(Path(path), "write it again with Sensor.save")
         if isinstance(values, dict):
@@ -134,6 +142,7 @@ class Sensor:
 
 
 def _plain(value: Any) -> Any:
+    """Convert a dataclass, an array or a number to the types of JSON."""
     if dataclasses.is_dataclass(value):
         kind = {"kind": type(value).__name__} if isinstance(value, Lights | Leds) else {}
         return kind | {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
@@ -141,12 +150,12 @@ def _plain(value: Any) -> Any:
         return [_plain(v) for v in value]
     if isinstance(value, int | float):
         return value
-    # float32 as its shortest decimal
+    # The shortest decimal of each float32 number.
     return np.asarray(value).astype(str).astype(float).tolist()
 
 
 def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = MappingProxyType({})) -> Any:
-    """Convert the values of a file to the types of the default."""
+    """Convert the values of a file to the types of the default value, and check their shapes and ranges."""
     if not dataclasses.is_dataclass(default):
         _require(_value_conditions(default, value, name, metadata))
         if isinstance(default, tuple):
@@ -154,7 +163,7 @@ def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = Ma
         return type(default)(value) if isinstance(default, int | float) else jnp.asarray(value, jnp.float32)
     if not isinstance(value, dict):
         known = ", ".join(field.name for field in dataclasses.fields(default))
-        raise ValueError(f"field {name or 'sensor'} is {value!r}, but it must have the fields {known}.")
+        raise ValueError(f"field {name or 'sensor'} is {value!r}, but it must be an object with the fields {known}.")
     if name == "lights":
         default, value = _of_kind(value)
     fields = {field.name: field for field in dataclasses.fields(default)}
@@ -170,7 +179,7 @@ def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = Ma
 
 
 def _of_kind(value: dict[str, Any]) -> tuple[Lights | Leds, dict[str, Any]]:
-    """Default lights of the kind that a file names, and its other values."""
+    """Default lights of the kind in a file, and the values of the file without the kind."""
     kinds = ", ".join(_LIGHTS)
     if "kind" not in value:
         raise ValueError(f"field lights.kind is missing, but it must be one of {kinds}.")
@@ -186,11 +195,12 @@ def _require(conditions: Iterator[_Condition]) -> None:
 
 
 def _default(sensor: Sensor) -> Sensor:
+    """The default sensor with the same kind of lights."""
     return dataclasses.replace(type(sensor)(), lights=Leds() if isinstance(sensor.lights, Leds) else Lights())
 
 
 def _conditions(sensor: Sensor) -> Iterator[_Condition]:
-    """All conditions on a sensor. Conditions on traced values are traced."""
+    """Yield all conditions on a sensor. The flag of a condition on traced values is traced."""
     yield from _field_conditions(_default(sensor), sensor, "")
     distance, near = _array(sensor.camera.distance), _array(sensor.camera.near)
     thickness, max_depth = _array(sensor.gel.thickness), _array(sensor.gel.max_depth)
@@ -198,7 +208,7 @@ def _conditions(sensor: Sensor) -> Iterator[_Condition]:
         distance > thickness,
         lambda: (
             f"field camera.distance is {distance:g}, but it must be > gel.thickness = {thickness:g}, so that the "
-            "pinhole is in front of the gel."
+            "pinhole is outside the gel."
         ),
     )
     yield (
@@ -218,15 +228,15 @@ def _conditions(sensor: Sensor) -> Iterator[_Condition]:
 
 
 def _light_conditions(sensor: Sensor) -> Iterator[_Condition]:
-    """Lights lie on the camera's side of the gel's outer face, and LEDs outside of the gel."""
+    """Yield the conditions that lights lie on the camera's side of the gel's outer face, and LEDs outside the gel."""
     leds = isinstance(sensor.lights, Leds)
     name = "lights.positions" if leds else "lights.directions"
     rows = _array(sensor.lights.positions if isinstance(sensor.lights, Leds) else sensor.lights.directions)
     yield (
         (rows[:, 2] <= 0).all(),
         lambda: (
-            f"field {name} has the row {rows[rows[:, 2] > 0][0].tolist()}, but z must be <= 0, on the camera's side, "
-            "because the skin lets no light in from outside."
+            f"field {name} has the row {rows[rows[:, 2] > 0][0].tolist()}, but z must be <= 0 (the camera's side), "
+            "because the skin is opaque to light from outside."
         ),
     )
     if leds:
@@ -245,7 +255,7 @@ def _light_conditions(sensor: Sensor) -> Iterator[_Condition]:
 def _field_conditions(
     default: Any, value: Any, name: str, metadata: Mapping[str, Any] = MappingProxyType({})
 ) -> Iterator[_Condition]:
-    """Every field has the default's type and shape, and is finite and in range."""
+    """Yield the conditions that every number is finite and in range. Raise a ValueError for a wrong type or shape."""
     if not dataclasses.is_dataclass(default):
         static = isinstance(default, int) or (isinstance(default, tuple) and isinstance(default[0], int))
         numbers = value if isinstance(value, tuple) else (value,)
@@ -254,7 +264,7 @@ def _field_conditions(
         if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
             raise ValueError(f"field {name} is {value!r}, but it must be an array.")
         if static and not all(isinstance(number, int | np.integer) for number in numbers):
-            raise ValueError(f"field {name} is {value!r}, but its numbers must be Python's or NumPy's integers.")
+            raise ValueError(f"field {name} is {value!r}, but its numbers must be integers of Python or NumPy.")
         yield from _value_conditions(default, value, name, metadata)
         return
     if type(value) is not type(default):
@@ -265,7 +275,10 @@ def _field_conditions(
 
 
 def _value_conditions(default: Any, value: Any, name: str, metadata: Mapping[str, Any]) -> Iterator[_Condition]:
-    """A value has the default's shape (with any number of lights or lamps), and is finite and in range."""
+    """Yield the conditions that a value is finite and in range. Raise a ValueError if its shape is not the default's.
+
+    Two-dimensional values may have any number of rows, one for each light or lamp.
+    """
     array, shape = _array(value), np.shape(default)
     wanted = "a finite number" if shape == () else f"an array of finite numbers of shape {shape}"
     fits = array.shape == shape or (len(shape) == 2 and array.shape[1:] == shape[1:] and len(array) > 0)
@@ -280,7 +293,7 @@ def _value_conditions(default: Any, value: Any, name: str, metadata: Mapping[str
 
 
 def _row_conditions(name: str, fields: dict[str, Any]) -> Iterator[_Condition]:
-    """Every light has a position or a direction and a colour, and every direction has a length."""
+    """Yield the condition that no direction is zero. Raise a ValueError if the numbers of lights and colours differ."""
     place = "positions" if "positions" in fields else "directions"
     rows, colors = _array(fields[place]), _array(fields["colors"])
     if len(rows) != len(colors):
@@ -291,12 +304,12 @@ def _row_conditions(name: str, fields: dict[str, Any]) -> Iterator[_Condition]:
     if place == "directions":
         yield (
             (rows != 0).any(axis=1).all(),
-            lambda: f"field {name}.directions has a row of zeros, but a direction needs a length: {rows.tolist()}.",
+            lambda: f"field {name}.directions is {rows.tolist()}, but every row must have a length > 0.",
         )
 
 
 def _array(value: Any) -> Any:
-    """Convert a value to an array: a traced one if any part of it is traced, else NumPy's with float64 numbers."""
+    """Convert a value to a traced array if any part of it is traced, else to a NumPy array with float64 numbers."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
         return jnp.asarray(value)
     try:

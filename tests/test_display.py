@@ -126,7 +126,7 @@ def test_a_body_is_drawn_from_outside():
 @pytest.mark.parametrize(
     ("path", "thing", "error", "message"),
     [
-        ("a.npz", np.zeros((2, 2, 3)), TypeError, "keeps one of Frame, Body, Trajectory, got ndarray"),
+        ("a.npz", np.zeros((2, 2, 3)), TypeError, "Trajectory can be written to an .npz file, got ndarray"),
         ("a.png", 3.0, TypeError, "got float"),
         (
             "a.png",

@@ -75,7 +75,10 @@ def test_a_body_with_too_many_faces_raises_an_error():
 def test_other_types_than_sensor_and_body_raise_an_error():
     cases = [
         ((SENSOR, "mug.obj"), r"body is 'mug\.obj', but it must be one Body\. objects\.load reads a mesh file"),
-        ((SENSOR, [BODY, BODY]), r"body is .*, but it must be one Body\. For several use objects\.stack and jax\.vmap"),
+        (
+            (SENSOR, [BODY, BODY]),
+            r"body is .*, but it must be one Body\. For several bodies use objects\.stack and jax\.vmap",
+        ),
         ((SENSOR, None), "body is None, but it must be one Body"),
         (("sensor.json", BODY), r"sensor is 'sensor\.json', but it must be a Sensor"),
         ((BODY, SENSOR), r"sensor is Body\(.*, but it must be a Sensor"),
@@ -249,7 +252,7 @@ def test_an_imprint_of_another_shape_raises_an_error(shape):
 def test_an_invalid_window_raises_an_error_and_a_traced_one_shows_flat_skin(bad):
     imprint = jnp.zeros((24, 32)).at[8:14, 10:20].set(5e-4)
     bad = jnp.array(bad, jnp.float32)
-    with pytest.raises(ValueError, match=r"window is .*finite left, top, width, height"):
+    with pytest.raises(ValueError, match=r"window is .*four finite numbers, left, top, width, height"):
         touch(SENSOR, imprint, bad)
     np.testing.assert_allclose(jax.jit(touch)(SENSOR, imprint, bad), touch(SENSOR, 0 * imprint), atol=1e-6)
     with pytest.raises(ValueError, match=r"window has the shape \(3,\)"):

@@ -127,7 +127,7 @@ def test_the_gradient_of_a_round_trip_through_a_matrix_is_the_identity(vector):
             ),
             r"points has the shape \(2,\), but it must be \(..., 3\)",
         ),
-        ("pose_inverse", ("upright",), r"pose is 'upright', but it must be an array of \(..., 7\) numbers"),
+        ("pose_inverse", ("upright",), r"pose is 'upright', but it must be an array of numbers of shape \(..., 7\)"),
     ],
 )
 def test_an_array_of_another_shape_raises_an_error(name, given, message):

@@ -160,12 +160,13 @@ def test_a_body_is_stable_in_the_attitude_in_which_it_is_made(bodies, category):
 
 @pytest.mark.parametrize("key", [0, None, np.zeros(2, np.int64), [0, 1]])
 def test_an_invalid_key_is_refused_with_the_remedy(key):
-    with pytest.raises(TypeError, match=rf"key is {re.escape(repr(key))}; it takes a JAX key: jax\.random\.key\(0\)"):
+    message = rf"key is {re.escape(repr(key))}, but it must be a JAX key, such as jax\.random\.key\(0\)"
+    with pytest.raises(TypeError, match=message):
         check_key(key)
 
 
 def test_an_array_of_keys_is_refused_and_a_key_of_the_older_kind_is_accepted():
-    with pytest.raises(TypeError, match=r"key has shape \(2,\); it takes one key"):
+    with pytest.raises(TypeError, match=r"key has shape \(2,\), but it must be one key"):
         check_key(jax.random.split(jax.random.key(0)))
     old, new = objects.make(jax.random.PRNGKey(3), "bottle"), objects.make(jax.random.key(3), "bottle")
     np.testing.assert_array_equal(old.vertices, new.vertices)

@@ -392,7 +392,7 @@ def test_errors_name_fields_of_another_kind(field: str, value: object, wanted: s
         ({"sensor": None}, "sensor is None, but it must be a Sensor"),
         ({"scenario": "freefall"}, r"scenario is 'freefall', but it must be Freefall\(\)"),
         ({"scenario": physics.Freefall}, r"scenario is <class .*Freefall'>, but it must be Freefall\(\)"),
-        ({"key": 0}, r"key is 0; it takes a JAX key: jax\.random\.key\(0\)"),
+        ({"key": 0}, r"key is 0, but it must be a JAX key, such as jax\.random\.key\(0\)"),
         ({"num": 1.5}, "num is 1.5, but it must be a whole number"),
         ({"chunk": 0}, "chunk is 0, but it must be a whole number"),
         ({"progress": "bar"}, "progress is 'bar', but it must be True, False or a function"),

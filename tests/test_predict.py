@@ -199,14 +199,14 @@ def test_a_condition_is_given_in_si_units(tmp_path):
     samples = predictor(visual=given["visual"], condition=condition, key=jax.random.key(0), num_samples=2).samples
     assert samples.visual.shape == (2, 2, SIDE, SIDE, 3)
     for wrong, message in (
-        (None, r"condition has shape None: .* needs \(2, 3\)"),
-        (condition[0], r"needs \(2, 3\)"),
+        (None, r"condition is missing, but .* needs shape \(2, 3\)"),
+        (condition[0], r"condition has shape \(3,\), but .* needs shape \(2, 3\)"),
         (condition * np.nan, "condition has NaN"),
         (condition * 1e3, "SI units"),
     ):
         with pytest.raises(ValueError, match=message):
             predictor(visual=given["visual"], condition=wrong)
-    with pytest.raises(ValueError, match="condition has shape None"):
+    with pytest.raises(ValueError, match="condition is missing"):
         predictor.prior()
     traced = jax.jit(lambda condition: predictor(visual=given["visual"], condition=condition))
     np.testing.assert_allclose(traced(condition).visual, out.visual, atol=1e-5)
@@ -459,10 +459,13 @@ def test_a_true_state_determines_the_belief_and_a_wrong_one_is_refused(state_pre
     given, code = measurement(2), np.asarray(random_states(np.random.default_rng(0), 2))
     out = state_predictor(visual=given["visual"], condition=CONDITION, state=code)
     np.testing.assert_allclose(out.mean[:, : statespace.STATE_CODE], code, atol=2e-3)
-    for wrong, message in ((code[:1], r"state has shape \(1, 117\), but it needs"), (code * np.nan, "state has NaN")):
+    for wrong, message in (
+        (code[:1], r"state has shape \(1, 117\), but it must have"),
+        (code * np.nan, "state has NaN"),
+    ):
         with pytest.raises(ValueError, match=message):
             state_predictor(visual=given["visual"], condition=CONDITION, state=wrong)
-    with pytest.raises(ValueError, match="takes no state: it is a model of the paper's kind"):
+    with pytest.raises(ValueError, match="does not accept state: only state-space models do"):
         predictor(pose=given["pose"], state=code)
 
 

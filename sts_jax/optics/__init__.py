@@ -1,4 +1,4 @@
-"""Vision: the camera, the rasteriser (on plain arrays), the view through the skin and views from outside."""
+"""Visual stream: the camera, the rasteriser, shading of the view through the skin, and views from outside."""
 
 from sts_jax.optics.camera import Camera, full_window, object_window, rays, to_pixels
 from sts_jax.optics.external_view import photograph

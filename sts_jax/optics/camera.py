@@ -1,7 +1,7 @@
-"""The pinhole under the gel, and the part of its view that an image shows.
+"""The pinhole camera below the gel, and the part of its view that an image shows.
 
-A window is `(left, top, width, height)` in metres on the gel's outer face (z = 0), to which the optical axis is
-perpendicular. A smaller window is a smaller frustum, so a crop costs its own pixels only.
+A window is this part, as a rectangle `(left, top, width, height)` in metres on the gel's outer face (z = 0). The
+optical axis is perpendicular to this face. The cost of an image depends on its number of pixels and not on the window.
 """
 
 import dataclasses
@@ -21,25 +21,25 @@ Scalar = float | Array
 class Camera:
     """A pinhole on the sensor's z axis, looking out through the gel along +z."""
 
-    # m, from the pinhole to the gel's outer face (paper's code: bottom of the block)
+    # Distance from the pinhole to the gel's outer face (m). Source: paper's code, bottom of the block.
     distance: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
-    # rad, vertical field of view (paper's code): the pad is as high as the image
+    # Vertical field of view (rad). With the default (paper's code), the pad is as high as the image.
     fov: Scalar = dataclasses.field(default=2 * math.atan(0.75), metadata=POSITIVE | {"below": math.pi})
-    # width / height of the native view (device: 1640x1232, paper's code: 640x480)
+    # Width / height of the whole view. Source: device, 1640 x 1232 pixels, and paper's code, 640 x 480.
     aspect: Scalar = dataclasses.field(default=4 / 3, metadata=POSITIVE)
-    # m, a face with a corner nearer to the pinhole than this is not drawn
+    # Smallest depth (m). A face of the object is not drawn if one of its corners is nearer to the pinhole.
     near: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:
-    """The largest centred part of the view with the aspect ratio of an image, which is then not stretched.
+    """Window of the largest centred part of the view with the aspect ratio of an image.
 
     Args:
-        camera: the pinhole.
-        resolution: (height, width) of the image, pixels.
+        camera: The camera.
+        resolution: Height and width of the image (pixels).
 
     Returns:
-        Window (m).
+        Left, top, width and height on the gel's outer face (m).
     """
     ratio = resolution[1] / resolution[0]
     height = 2 * camera.distance * jnp.tan(jnp.asarray(camera.fov) / 2)
@@ -51,19 +51,19 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
 def object_window(
     camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
 ) -> Float[Array, "4"]:
-    """The window around an object with the aspect ratio of an image, as in the paper (supplement, "Training Details").
+    """Window around an object with the aspect ratio of an image, as in the paper (supplement, "Training Details").
 
-    It is the smallest one that lies in the full window and contains the visible part of the bounding box of the
-    projected points. Points nearer than `near` do not count. If nothing is in view, it is the full window.
+    The window is the smallest one that contains the bounding box of the projected points, clipped to the full window
+    (`full_window`). It lies in the full window. If no point is in view, it is the full window.
 
     Args:
-        camera: the pinhole.
-        points: points of the object, sensor frame (m).
-        resolution: (height, width) of the image, pixels.
-        smallest: minimum length of the shorter side (m).
+        camera: The camera.
+        points: Points of the object in the sensor frame (m). Points nearer than `Camera.near` are ignored.
+        resolution: Height and width of the image (pixels).
+        smallest: Smallest length of the window's shorter side (m).
 
     Returns:
-        Window (m).
+        Left, top, width and height on the gel's outer face (m).
     """
     full = full_window(camera, resolution)
     lower, size = full[:2], full[2:]
@@ -83,17 +83,17 @@ def object_window(
 def to_pixels(
     camera: Camera, window: Float[Array, "4"], shape: tuple[int, int], points: Float[Array, "v 3"]
 ) -> tuple[Float[Array, "v 2"], Float[Array, "v"]]:
-    """Project points into an image: `(column, row)`, whole numbers at pixel centres, and depth.
+    """Project points into an image.
 
     Args:
-        camera: the pinhole.
-        window: part of the gel's face in the image (m).
-        shape: (height, width) of the image, pixels.
-        points: sensor frame (m).
+        camera: The camera.
+        window: Part of the gel's outer face in the image: left, top, width, height (m).
+        shape: Height and width of the image (pixels).
+        points: Points in the sensor frame (m).
 
     Returns:
-        Columns and rows (pixels), and depth along the optical axis (m). Points nearer than `camera.near` are projected
-        as if they were at this depth.
+        Columns and rows of the points (pixels, whole numbers at pixel centres), and their depths along the optical axis
+        from the pinhole (m). A point nearer than `Camera.near` is projected as if it had this depth.
     """
     depth = points[:, 2] + camera.distance
     on_face = camera.distance * points[:, :2] / jnp.maximum(depth, camera.near)[:, None]
@@ -104,15 +104,16 @@ def to_pixels(
 def rays(
     camera: Camera, window: Float[Array, "4"], shape: tuple[int, int]
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Slopes (x / depth, y / depth) of the rays through the pixel centres.
+    """Slopes of the rays through the pixel centres: x / depth and y / depth.
 
     Args:
-        camera: the pinhole.
-        window: part of the gel's face in the image (m).
-        shape: (height, width) of the image, pixels.
+        camera: The camera.
+        window: Part of the gel's outer face in the image: left, top, width, height (m).
+        shape: Height and width of the image (pixels).
 
     Returns:
-        Both slopes, x and y. The point at depth D on a ray is (D x, D y, D - camera.distance).
+        Slopes in x and in y. The point at depth D on a ray with the slopes (a, b) is (D a, D b, D - camera.distance) in
+        the sensor frame.
     """
     x = (window[0] + (jnp.arange(shape[1]) + 0.5) / shape[1] * window[2]) / camera.distance
     y = (window[1] + (jnp.arange(shape[0]) + 0.5) / shape[0] * window[3]) / camera.distance

@@ -1,4 +1,4 @@
-"""Pictures of a scene from outside the sensor: any triangles from any viewpoint, with the sensor's rasteriser."""
+"""Pictures of triangles from any viewpoint outside the sensor, drawn by the sensor's rasteriser."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -8,8 +8,8 @@ from sts_jax.optics.camera import Camera, full_window, rays, to_pixels
 from sts_jax.optics.shading import to_srgb
 from sts_jax.optics.zbuffer import barycentrics, pixel_centres, rasterise
 
-_SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # light from above and from below, linear
-_LAMP = (0.45, 0.43, 0.40)  # light of a lamp over the viewer's left shoulder, linear
+_SKY, _GROUND = (0.62, 0.64, 0.68), (0.34, 0.33, 0.32)  # linear light from above and from below
+_LAMP = (0.45, 0.43, 0.40)  # linear light of a lamp over the viewer's left shoulder
 _SAMPLES = 3  # samples along each side of a pixel
 
 
@@ -25,28 +25,28 @@ def photograph(
     resolution: tuple[int, int] = (200, 200),
     two_sided: Bool[Array, ""] | bool = False,
 ) -> Float[Array, "h w 3"]:
-    """Draw triangles from any viewpoint, z up, by daylight and a lamp, on white.
+    """Draw triangles from any viewpoint on a white background, lit by daylight and a lamp. The z axis points up.
 
     Args:
-        vertices: world frame (m).
-        faces: corner indices, counter-clockwise seen from outside.
-        normals: unit normal at each corner of each face.
-        albedo: linear colour at each corner of each face.
-        eye: position of the pinhole (m), not straight above or below the target.
-        target: point in the middle of the picture (m).
-        fov: vertical field of view (rad).
-        resolution: (height, width), pixels.
-        two_sided: whether faces are visible from behind too.
+        vertices: Vertices in the world frame (m).
+        faces: Vertex indices of each face, counter-clockwise as seen from outside the object.
+        normals: Unit normal at each corner of each face.
+        albedo: Linear RGB colour in [0, 1] at each corner of each face.
+        eye: Position of the camera (m). It must not be straight above or below the target.
+        target: Point in the middle of the picture (m).
+        fov: Vertical field of view (rad).
+        resolution: Height and width of the picture (pixels).
+        two_sided: If True, faces are also visible from behind.
 
     Returns:
-        Image, sRGB in [0, 1].
+        Picture, sRGB in [0, 1].
     """
     eye = jnp.asarray(eye, jnp.float32)
     forward = geometry.normalize(jnp.asarray(target, jnp.float32) - eye)
     right = geometry.normalize(jnp.cross(forward, jnp.array([0.0, 0.0, 1.0])))
     turn = jnp.stack([right, jnp.cross(forward, right), forward])
     shape = (resolution[0] * _SAMPLES, resolution[1] * _SAMPLES)
-    # The pinhole of a `Camera` is at z = -distance, so the origin is the point one metre ahead.
+    # The pinhole of a `Camera` is at z = -distance. The origin is therefore the point one metre ahead of the eye.
     camera = Camera(distance=1.0, fov=fov, aspect=resolution[1] / resolution[0], near=0.01)
     window = full_window(camera, shape)
     points = (vertices - eye) @ turn.T - jnp.array([0.0, 0.0, 1.0])

@@ -1,6 +1,6 @@
-"""The view through the skin: a lit object, its shadow on the skin, the haze of a translucent gel.
+"""Shading of the view through the skin: the lit object, its shadow on the skin, and the haze of the translucent gel.
 
-Light is summed in linear units, and `to_srgb` is the last step of an image. Functions of samples accept any shape.
+All light is linear, and `to_srgb` is the last step of an image. Arguments of shape `*n` may have any shape.
 """
 
 import dataclasses
@@ -21,71 +21,77 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """The light above the sensor, and its way through the skin to the camera. Constants are our choice."""
+    """External light on the object, and its path through the skin and the gel to the camera.
 
-    # light that reaches a surface from all sides, including the light that leaks through and under the object
+    Colours are linear RGB, unless stated otherwise. Values without a source are our choice.
+    """
+
+    # Light that reaches a surface from all sides, including the light that leaks through and under the object.
     ambient: Float[Array, "*n 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([0.36, 0.36, 0.37]), metadata=NOT_NEGATIVE
     )
-    # unit vectors from the object towards a window, a lamp and the table, which reflects light
+    # Directions from the object towards any number m of lights, sensor frame, of any length > 0. Defaults: a window, a
+    # lamp, and the table, which reflects light.
     directions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[-0.8, -0.5, 0.1], [0.6, 0.3, 0.74], [0.4, -0.5, -0.77]])
     )
-    # linear light of each, on a surface that faces it
+    # Light of each of these on a surface that faces it.
     colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[0.7, 0.7, 0.68], [0.3, 0.29, 0.27], [0.3, 0.3, 0.31]]),
         metadata=NOT_NEGATIVE,
     )
-    # sRGB of the empty view (paper's code: (178, 178, 204) / 255)
+    # Colour of the view without an object, sRGB. Source: paper's code, (178, 178, 204) / 255.
     background: Float[Array, "*n 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([178.0, 178, 204]) / 255, metadata=SHARE
     )
-    # m, height over the skin at which 1/e of an object's own light comes through
+    # Height above the skin at which 1/e of an object's light reaches the camera (m). Haze replaces the rest.
     haze: Scalar = dataclasses.field(default=3.0, metadata=POSITIVE)
-    # share of the empty view that is scattered by the skin, where no object hides the sky
+    # Share of the background's light that is scattered by the skin. An object near the skin hides a part of it.
     milk: Scalar = dataclasses.field(default=0.25, metadata=SHARE)
-    # share of an object's light that skin and gel transmit, close to the background's tint
+    # Share of an object's light that skin and gel transmit, in each channel. The default is close to the hue of
+    # the background.
     tint: Float[Array, "*n 3"] = dataclasses.field(default_factory=lambda: jnp.array([0.8, 0.8, 1.0]), metadata=SHARE)
-    # share of its light that an object on the skin loses where it hides all of the sky
+    # Share of its light that the underside of an object on the skin loses where it hides the whole sky from the skin.
     crease: Scalar = dataclasses.field(default=0.4, metadata=SHARE)
-    # m, height over the skin at which 1/e of this is lost
+    # Height above the skin at which this loss is 1/e as large (m).
     crease_height: Scalar = dataclasses.field(default=0.015, metadata=POSITIVE)
-    # share of light lost at the pad's edge, as the square of the distance from the centre
+    # Share of light that is lost at the middle of the pad's edges. The loss grows with the square of the distance from
+    # the pad's centre.
     vignette: Scalar = dataclasses.field(default=0.1, metadata=SHARE)
-    # sRGB value of the housing's walls just below the pad's edge, relative to the pad
+    # Brightness of the housing's walls just below the pad's edge, as an sRGB value relative to the pad's.
     rim: Scalar = dataclasses.field(default=0.3, metadata=NOT_NEGATIVE)
-    # m, depth below the skin at which the walls are 1/e as bright
+    # Depth below the skin at which the walls are 1/e as bright (m).
     rim_depth: Scalar = dataclasses.field(default=0.03, metadata=POSITIVE)
-    # exposure time of the visual stream over that of the tactile stream (`expose`)
+    # Exposure time of the visual stream divided by that of the tactile stream. `expose` uses it.
     exposure: Scalar = dataclasses.field(default=1.0, metadata=POSITIVE)
 
 
-_SKY_CELLS = 30  # approximate number of cells along each side of the grid of `hidden_sky`
-_SLICES = 4  # slices of an object in `hidden_sky`
-_LOWEST = 0.0015  # m, minimum height of a slice
+_SKY_CELLS = 30  # approximate number of cells along each side of the grid in `hidden_sky`
+_SLICES = 4  # number of slices of an object in `hidden_sky`
+_LOWEST = 0.0015  # m, smallest height of a slice
 
 
 def to_linear(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
     high = srgb > 0.04045
     return jnp.where(high, (jnp.where(high, srgb + 0.055, 1) / 1.055) ** 2.4, srgb / 12.92)
 
 
 def to_srgb(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """sRGB of linear light (IEC 61966-2-1)."""
+    """Convert linear light to sRGB values (IEC 61966-2-1)."""
     high = linear > 0.0031308
     return jnp.where(high, 1.055 * jnp.exp(jnp.log(jnp.where(high, linear, 1)) / 2.4) - 0.055, 12.92 * linear)
 
 
 def sample_texture(texture: Float[Array, "t t 3"], uv: Float[Array, "*n 2"]) -> Float[Array, "*n 3"]:
-    """Bilinear look-up in a texture that repeats. u runs to the right, and v = 0 is the top row.
+    """Look up values in a texture by bilinear interpolation. The texture repeats beyond its borders.
 
     Args:
-        texture: any values.
-        uv: texture coordinates.
+        texture: Square texture of any values.
+        uv: Texture coordinates. u from 0 to 1 runs from the left to the right edge, and v from the top to the bottom.
 
     Returns:
-        Values.
+        Values at the coordinates.
     """
     size = texture.shape[0]
     if size == 1:
@@ -101,22 +107,32 @@ def hidden_sky(
     x: Float[Array, "w"],
     y: Float[Array, "h"],
 ) -> Float[Array, "h w"]:
-    """Share of the sky, weighted by the cosine, that an object hides from points on the skin.
+    """Compute the share of the sky that an object hides from points on the skin.
 
-    The object is cut at a few heights z, from its lowest point to its top. A slice is the part of its underside below
-    z. At a distance d from a straight edge, a slice hides (1 - d / sqrt(d^2 + z^2)) / 2. K_z integrates the derivative
-    of this term over each cell, along y and along x. Then `hidden = max_z K_z slice_z K_z^T` on a grid of about 5 mm,
-    with quadratic splines between its cells.
+    Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
+    slices at a few heights z, from its lowest to its highest point. The slice at z has the outline of that part of the
+    underside which lies below z.
+
+    A half-plane at the height z hides the share `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2` from a point whose horizontal
+    distance from its edge is d. The matrix K_z contains the difference of f between the two edges of cell j, seen from
+    the centre of cell i. The shares are then
+
+        hidden = max_z K_z slice_z K_z^T
+
+    on a grid of about 30 x 30 cells, where slice_z is the covered share of each cell. Quadratic splines interpolate
+    between the cells.
 
     Args:
-        heights: of the object's underside over the gel's face (m), `inf` where there is none, on a uniform grid.
-        size: of this grid along x and y (m), which is the pad, centred on the sensor's axis.
-        top: height of the object's highest point (m).
-        x: of the points, along an image's rows (m).
-        y: of the points, along its columns (m).
+        heights: Heights of the object's underside above the gel's face (m), on a uniform grid over the pad, `inf` where
+            there is no object.
+        size: Size of the pad along x and y (m). The pad is centred on the sensor's z axis.
+        top: Height of the object's highest point (m).
+        x: x of the points, which form a grid (m).
+        y: y of the points (m).
 
     Returns:
-        Shares in [0, 1]. Points beyond the pad have the share at its edge.
+        Shares from 0 to 1, one row for each y and one column for each x. Points outside the pad have the share of the
+        nearest point inside.
     """
     blocks = [max(1, round(cells / _SKY_CELLS)) for cells in heights.shape]
     padding = [(0, -cells % block) for cells, block in zip(heights.shape, blocks, strict=True)]
@@ -145,7 +161,7 @@ def hidden_sky(
 
 
 def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
-    """Share of the sky that a strip, one cell wide at a height of 1, hides from the centre of each cell."""
+    """Share of the sky that strip j, one cell wide and at height 1, hides from the centre of cell i, at [i, j]."""
     index = jnp.arange(number, dtype=jnp.float32)
     away = (index[None, :] - index[:, None] - 0.5) * pitch
     edge = away + pitch
@@ -153,7 +169,7 @@ def _cast(number: int, pitch: Scalar) -> Float[Array, "n n"]:
 
 
 def _spline(rows: Float[Array, "n k"], place: Float[Array, "m"]) -> Float[Array, "m k"]:
-    """Quadratic spline over rows at whole numbers, constant beyond the ends."""
+    """Evaluate a quadratic spline. Row i of `rows` is the control point at position i. It is constant outside."""
     last = rows.shape[0] - 1
     place = jnp.clip(place, 0, last)
     nearest = jnp.round(place)
@@ -171,20 +187,20 @@ def housing(
     size: tuple[Scalar, Scalar],
     distance: Scalar,
 ) -> Float[Array, "*n"]:
-    """sRGB value of the housing's walls, relative to the pad, for rays that pass beside the pad.
+    """Brightness of the housing's walls, for rays that pass beside the pad.
 
-    A dark wall stands below each edge of the pad. With the light that enters there, its value is
-    `rim exp(-t / rim_depth)` at a depth t below the skin.
+    A dark wall stands below each edge of the pad. At the depth t below the skin, its brightness is
+    `rim exp(-t / rim_depth)`, with the constants `rim` and `rim_depth` of the room.
 
     Args:
-        room: its constants.
-        on_pad: whether the rays pass through the pad.
-        places: where the rays cross the plane of the gel's face (m).
-        size: of the pad along x and y (m).
-        distance: of the pinhole from that plane (m).
+        room: Constants of the external light.
+        on_pad: True for rays that pass through the pad.
+        places: x and y at which the rays cross the plane of the gel's outer face (m).
+        size: Size of the pad along x and y (m).
+        distance: Distance of the pinhole from this plane (m).
 
     Returns:
-        Relative values, 1 on the pad.
+        sRGB values relative to the pad, 1 on the pad, and `rim` or less on the walls.
     """
     beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
     below = distance * (1 - 1 / jnp.maximum(beyond, 1))
@@ -194,16 +210,17 @@ def housing(
 def empty_view(
     room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
 ) -> Float[Array, "*n 3"]:
-    """The view without an object, in linear light.
+    """Background of the view: the pad and the walls, with the object's shadow on the skin but without the object.
 
     Args:
-        room: its constants.
-        square_radius: squared distance from the pad's centre on the gel's face, in units of half the pad's side.
+        room: Constants of the external light.
+        square_radius: Square of the distance from the pad's centre on the gel's face, where 1 is half a side of the
+            pad.
         walls: sRGB values relative to the pad, from `housing`. Their squares approximate linear light.
-        hidden: share of the sky, from `hidden_sky`.
+        hidden: Share of the sky that the object hides, from `hidden_sky`. Zeros give the view of the empty sensor.
 
     Returns:
-        Linear light.
+        Linear RGB light.
     """
     light = (1 - room.vignette * square_radius) * walls * walls * (1 - room.milk * hidden)
     return jnp.maximum(light, 0)[..., None] * jnp.broadcast_to(to_linear(room.background), (*light.shape, 3))
@@ -217,23 +234,27 @@ def shade(
     empty: Float[Array, "*n 3"],
     hidden: Float[Array, "*n"],
 ) -> Float[Array, "*n 3"]:
-    """Colour of an object seen through the skin.
+    """Colour of an object as seen through the skin.
 
-    Lambert's law gives the light on the object, `E = ambient + sum_m max(0, L_m . N) c_m`. Near the skin it loses the
-    share `crease hidden exp(-height / crease_height)`. Haze transmits `exp(-height / haze)` of the object's colour,
-    tinted, and replaces the rest by the empty view. The milky skin transmits `1 - milk` of the sum and adds
-    `milk (1 - hidden)` of the sky's light.
+    The colour is computed in four steps, with constants of the room:
+
+    1. Light on the object by Lambert's law: `ambient + sum_m max(0, L_m . N) c_m`, with the normal N, and the unit
+       direction L_m and colour c_m of each light.
+    2. Contact shade: this light is reduced by the share `crease hidden exp(-height / crease_height)`.
+    3. Haze: the share `exp(-height / haze)` of the object's light, multiplied by `tint`, is transmitted. The rest is
+       replaced by the background.
+    4. Milky skin: `1 - milk` of the sum is transmitted, and `milk (1 - hidden)` of the background's light is added.
 
     Args:
-        room: its constants.
-        albedo: linear, in [0, 1].
-        normals: unit.
-        heights: over the gel's face (m).
-        empty: view without the object, from `empty_view`.
-        hidden: share of the sky, from `hidden_sky`, at the points of the skin in front of the samples.
+        room: Constants of the external light.
+        albedo: Linear RGB colour of the object in [0, 1].
+        normals: Unit normals of the object.
+        heights: Heights of the object's points above the gel's outer face (m).
+        empty: Background at the same pixels, from `empty_view`.
+        hidden: Share of the sky that the object hides from the skin at the same pixels, from `hidden_sky`.
 
     Returns:
-        Linear light.
+        Linear RGB light.
     """
     # Channel by channel, because XLA on a CPU is slow along an axis of three.
     directions, colors = geometry.normalize(room.directions), room.colors
@@ -242,7 +263,7 @@ def shade(
     heights = jnp.maximum(heights, 0)
     lit = 1 - room.crease * hidden * jnp.exp(-heights / room.crease_height)
     through = jnp.exp(-heights / room.haze)
-    # `empty` is the sky's light without the hidden part of the scattered light.
+    # `empty` lacks the hidden part of the scattered light, so divide by its remaining share.
     veil = room.milk * (1 - hidden) / jnp.maximum(1 - room.milk * hidden, 1e-3)
     channels = []
     for k in range(3):

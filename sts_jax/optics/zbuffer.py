@@ -1,13 +1,14 @@
 """A z-buffer in plain JAX: the nearest face at each pixel, for triangles of any size on the screen.
 
-Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop takes the list of runs in chunks
-and draws one pixel of each run of a chunk at a time, so the work grows with the covered pixels and not with the product
-of faces and pixels.
-Each step is one scatter-min of a 32-bit key, with the depth in the high bits and the index of the face in the low ones.
-The choice of the face has no gradient. Values interpolated from the chosen face have one.
+Every face is cut into rows of pixels, and long rows into runs of a few pixels. A loop processes the runs in chunks and
+draws one pixel of each run of a chunk at a time. The work therefore grows with the number of covered pixels and not
+with the product of faces and pixels. Each step is one scatter-min of 32-bit keys, with the depth in the high bits and
+the index of the face in the low bits. The choice of the face has no gradient. Values that are interpolated on the
+chosen face have gradients.
 
-Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. `order` is smaller for
-nearer points and affine across a face on the screen: -1/depth in the view of a pinhole, depth in a parallel view.
+Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. The order of a point is
+a number that is smaller for nearer points and affine across a face on the screen: -1 / depth in the view of a pinhole,
+and depth in a parallel projection.
 """
 
 import math
@@ -22,8 +23,8 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike, UInt32
 from sts_jax import _cpu_reductions
 
 _SLACK = 1e-4  # pixels by which faces are enlarged, so that no pixel centre on a shared edge is missed
-_GROUP = 1024  # faces cut at a time
-_RUN = 8  # pixels of the longest run
+_GROUP = 1024  # number of faces that are cut into runs at a time
+_RUN = 8  # largest number of pixels in a run
 _NOTHING = np.uint32(0xFFFFFFFF)  # key of a pixel without a face
 
 _Corner = tuple[Array, Array, Array]  # column, row, order
@@ -32,36 +33,36 @@ _Corner = tuple[Array, Array, Array]  # column, row, order
 class _Screen(NamedTuple):
     """The triangles to draw."""
 
-    column: Float[Array, "v"]  # pixels, of the vertices
-    row: Float[Array, "v"]  # pixels
-    order: Float[Array, "v"]
-    keep: Bool[Array, "v"]
-    faces: Int[Array, "f 3"]
-    two_sided: Bool[Array, ""]
+    column: Float[Array, "v"]  # columns of the vertices (pixels)
+    row: Float[Array, "v"]  # rows of the vertices (pixels)
+    order: Float[Array, "v"]  # orders of the vertices
+    keep: Bool[Array, "v"]  # True for vertices whose faces can be drawn
+    faces: Int[Array, "f 3"]  # vertex indices
+    two_sided: Bool[Array, ""]  # True if faces are also visible from behind
 
     def corners(self, chosen: Int[Array, "n"]) -> tuple[_Corner, _Corner, _Corner]:
-        """The three corners of some faces."""
+        """Return the three corners of the chosen faces."""
         a, b, c = ((self.column[k], self.row[k], self.order[k]) for k in self.faces[chosen].T)
         return a, b, c
 
 
 class _Runs(NamedTuple):
-    """State of the loop over groups of faces: the list of faces that have runs."""
+    """State of the loop over groups of faces: the list of faces that have runs. Runs are numbered from 0."""
 
     next_face: Int[Array, ""]  # first face of the next group
     listed: Int[Array, ""]  # number of listed faces
-    total: Int[Array, ""]  # number of their runs
-    first: Int[Array, "n"]  # number of the first run of each listed face
-    face: Int[Array, "n"]  # index of the face
-    per_row: Int[Array, "n"]  # number of runs in each of its rows
+    total: Int[Array, ""]  # number of runs of the listed faces
+    first: Int[Array, "n"]  # first run of each listed face
+    face: Int[Array, "n"]  # index of each listed face
+    per_row: Int[Array, "n"]  # number of runs in each row of the face
 
 
 class _Canvas(NamedTuple):
-    """State of the loop over chunks of runs: the keys drawn so far."""
+    """State of the loop over chunks of runs: the keys that are drawn so far."""
 
     next_run: Int[Array, ""]  # first run of the next chunk
-    listed: Int[Array, ""]  # the listed face with the last run before it
-    image: UInt32[Array, "p"]  # key of each pixel
+    listed: Int[Array, ""]  # place in the list of the face with which the next chunk begins
+    image: UInt32[Array, "p"]  # smallest key at each pixel
 
 
 class _Spans(NamedTuple):
@@ -69,11 +70,11 @@ class _Spans(NamedTuple):
 
     pixel: Int[Array, "r"]  # index of the first pixel
     length: Int[Array, "r"]  # number of pixels, at most `_RUN`
-    face: Int[Array, "r"]
+    face: Int[Array, "r"]  # index of the face
     value: Float[Array, "r"]  # order at the first pixel
     slope: Float[Array, "r"]  # change of the order per pixel
-    least: Float[Array, "r"]  # least order of the face's corners
-    most: Float[Array, "r"]
+    least: Float[Array, "r"]  # smallest order of the face's corners
+    most: Float[Array, "r"]  # largest order of the face's corners
 
 
 def rasterise(
@@ -87,22 +88,23 @@ def rasterise(
     within: ScalarLike | None = None,
     chunk: int = 1024,
 ) -> Int[Array, "*layers h w"]:
-    """Index of the nearest face at every pixel centre.
+    """Find the nearest face at every pixel centre.
 
     Args:
-        points: vertices on the screen, (column, row) in pixels.
-        order: of each vertex, smaller is nearer.
-        faces: corner indices, counter-clockwise seen from outside the object in a right-handed frame. Padding faces at
-            the end, whose three corners are the same vertex, cost next to nothing.
-        keep: vertices that can be drawn. A face is drawn if all three of its corners can be.
-        two_sided: whether faces are visible from behind too.
-        shape: (height, width) of the image, pixels.
-        within: an order. If given, the faces with a corner nearer than this are also drawn in an image of their own.
-        chunk: runs drawn at a time.
+        points: Columns and rows of the vertices on the screen (pixels, whole numbers at pixel centres).
+        order: Order of each vertex, smaller for nearer ones and affine across a face on the screen: -1 / depth for a
+            pinhole, depth for a parallel projection.
+        faces: Vertex indices of each face, counter-clockwise as seen from outside the object in a right-handed frame.
+            Padding faces at the end, whose three corners are the same vertex, cost almost nothing.
+        keep: Mask of the vertices that can be drawn. A face is drawn only if all its corners can be drawn.
+        two_sided: If True, faces are also visible from behind.
+        shape: Height and width of the image (pixels).
+        within: An order, or None. If given, a second image contains only the faces with a corner of a smaller order.
+        chunk: Number of runs of pixels that are drawn at a time.
 
     Returns:
-        Face indices, -1 where no face is visible. With `within`, two such images, (2, h, w): of the near faces, and of
-        all faces. No gradient.
+        Index of the nearest face at each pixel, -1 where no face is visible. The shape is (h, w). If `within` is given,
+        it is (2, h, w), with the image of the near faces before the image of all faces. There is no gradient.
     """
     points, order, within = jax.lax.stop_gradient((points, order, within))
     screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided)
@@ -116,7 +118,7 @@ def rasterise(
 
 
 def _face_bits(faces: Int[Array, "f 3"]) -> int:
-    """Number of bits of a key that hold the index of a face."""
+    """Number of bits of a key that store the index of a face."""
     return max((faces.shape[0] - 1).bit_length(), 1)
 
 
@@ -152,9 +154,9 @@ def _list_runs(screen: _Screen, shape: tuple[int, int], chunk: int) -> _Runs:
 def _count_runs(
     screen: _Screen, face: Int[Array, "n"], first_face: Int[Array, ""], shape: tuple[int, int]
 ) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
-    """Number of runs per row and in total of some faces, 0 in total for those that are not drawn.
+    """Count the runs per row and the runs of each face. Faces that are not drawn have 0 runs.
 
-    Faces before `first_face` belong to an earlier group and are not drawn again.
+    Faces before `first_face` are part of an earlier group and are not drawn again.
     """
     height, width = shape
     a, b, c = screen.corners(face)
@@ -165,7 +167,7 @@ def _count_runs(
     top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
     tall = bottom - top
     widest = jnp.abs(area) / jnp.where(tall > 0, tall, 1)
-    # A face that is nearly flat on the screen has rows as wide as the face.
+    # The rows of a face that is nearly a horizontal line on the screen are as wide as the face.
     widest = jnp.where(tall > 1e-3, jnp.minimum(widest, right - left), right - left)
     outside = (jnp.ceil(left - _SLACK) > width - 1) | (jnp.floor(right + _SLACK) < 0)
     empty = jnp.ceil(left - _SLACK) > jnp.floor(right + _SLACK)
@@ -180,7 +182,7 @@ def _count_runs(
 def _draw(
     screen: _Screen, runs: _Runs, shape: tuple[int, int], within: ScalarLike | None, chunk: int
 ) -> UInt32[Array, "p"]:
-    """Smallest key at each pixel. With `within`, near faces come first, and the other faces in a second image."""
+    """Draw the smallest key at each pixel. With `within`, the near faces and the other faces have separate images."""
     pixels = math.prod(shape) * (1 if within is None else 2)
     nearest = _cpu_reductions.minimum(jnp.where(screen.keep, screen.order, jnp.inf))
     last = _cpu_reductions.maximum(jnp.where(screen.keep, screen.order, -jnp.inf))
@@ -197,7 +199,7 @@ def _draw(
             key = (level.astype(jnp.uint32) << face_bits) | spans.face.astype(jnp.uint32)
             return image.at[jnp.where(along < spans.length, spans.pixel + along, pixels)].min(key, mode="drop")
 
-        # The same number of steps for every chunk, because under `vmap` a loop of variable length copies the image.
+        # Every chunk has the same number of steps, because under `vmap` a loop of variable length copies the image.
         return _Canvas(canvas.next_run + chunk, listed, jax.lax.fori_loop(0, _RUN, step, canvas.image))
 
     blank = _Canvas(jnp.int32(0), jnp.int32(0), jnp.full(pixels, _NOTHING))
@@ -207,7 +209,7 @@ def _draw(
 def _spans(
     screen: _Screen, runs: _Runs, canvas: _Canvas, shape: tuple[int, int], within: ScalarLike | None, chunk: int
 ) -> tuple[_Spans, Int[Array, ""]]:
-    """The runs of the next chunk, and the listed face with which the chunk after it begins."""
+    """Return the runs of the next chunk, and the place in the list of the face with which the chunk after it begins."""
     height, width = shape
     run = canvas.next_run + jnp.arange(chunk, dtype=jnp.int32)
     # Every listed face has a run, so at most `chunk` faces begin in this chunk: the next ones of the list.
@@ -241,8 +243,8 @@ def _row_ends(
 ) -> tuple[Float[Array, "r"], Float[Array, "r"]]:
     """Columns at which a row of a face starts and stops.
 
-    A row runs from the face's left edges to its right edges, and not beyond its corners. A face within one row's slack
-    covers that row from end to end.
+    A row extends from the left edges of the face to its right edges, and not beyond its corners. A face that is nearly
+    a horizontal line covers its row from its leftmost to its rightmost corner.
     """
     a, b, c = corners
     top, bottom = _lowest(a[1], b[1], c[1]), _highest(a[1], b[1], c[1])
@@ -264,18 +266,18 @@ def barycentrics(
     column: Float[Array, "*n"],
     row: Float[Array, "*n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Weights of a face's corners at a point on the screen, affine on the screen.
+    """Barycentric weights of a face's three corners at points on the screen.
 
     Args:
-        corners: the three corners, (column, row) in pixels.
-        column: of the point, pixels.
-        row: of the point, pixels.
+        corners: Columns and rows of the three corners (pixels).
+        column: Columns of the points (pixels).
+        row: Rows of the points (pixels).
 
     Returns:
-        Weights that sum to 1. None is below 0, even where rounding puts a point outside its face. A face without area
-        has the weights (1, 0, 0).
+        Weights of the three corners. They sum to 1 and are >= 0, even if rounding puts a point outside its face. A face
+        without area has the weights (1, 0, 0).
     """
-    # Relative to the point, because with absolute pixels float32 has errors of several per cent on slivers.
+    # Relative to the point, because on thin faces absolute coordinates cause errors of several per cent in float32.
     a, b, c = ((x - column, y - row) for x, y in corners)
     area = _cross(a, b, c)
     ok = area != 0
@@ -286,7 +288,7 @@ def barycentrics(
 
 
 def pixel_centres(shape: tuple[int, ...]) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Columns and rows of an image's pixels."""
+    """Column and row of each pixel of an image with the shape (height, width)."""
     row, column = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij")
     return column, row
 

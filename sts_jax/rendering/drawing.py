@@ -20,53 +20,53 @@ from sts_jax.sensor import Sensor
 
 
 class Images(NamedTuple):
-    """The images of one moment."""
+    """Images of one frame."""
 
-    visual: Float[Array, "h w 3"]  # sRGB in [0, 1]
-    tactile: Float[Array, "h w 3"]  # in [0, 1]
-    depth: Float[Array, "h w"]  # m from the pinhole, `inf` where there is no object
+    visual: Float[Array, "h w 3"]  # view through the skin, sRGB in [0, 1]
+    tactile: Float[Array, "h w 3"]  # image of the lit skin in [0, 1]
+    depth: Float[Array, "h w"]  # depth from the pinhole (m), `inf` where there is no object
     segmentation: Bool[Array, "h w"]  # pixels of the object
-    window: Float[Array, "4"]  # m, (left, top, width, height) of the part of the gel's face in the images
+    window: Float[Array, "4"]  # part of the gel's face in the images: left, top, width, height (m)
 
 
 class _Samples(NamedTuple):
-    """The grid of samples from which the pixels are filtered, and the object's faces on it."""
+    """Grid of samples, one ray each, from which the pixels are filtered, and the object's faces on this grid."""
 
-    seen: Float[Array, "4"]  # m, the window of the samples
-    pitch: Float[Array, "2"]  # m, between samples
+    seen: Float[Array, "4"]  # part of the gel's face that the grid covers: left, top, width, height (m)
+    pitch: Float[Array, "2"]  # distance between samples along x and y on the gel's face (m)
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]]  # x / depth and y / depth of the rays
-    places: tuple[Float[Array, "1 b"], Float[Array, "a 1"]]  # m, x and y where the rays cross the gel's face
-    on_pad: Bool[Array, "a b"]  # whether the ray passes through the pad
-    walls: Float[Array, "a b"]  # brightness relative to the pad
-    corners: Corners  # with 1 / depth (1/m) as their value
-    winner: Int[Array, "a b"]  # the nearest face, -1 where there is none
+    places: tuple[Float[Array, "1 b"], Float[Array, "a 1"]]  # x and y at which the rays cross the gel's face (m)
+    on_pad: Bool[Array, "a b"]  # True for rays that pass through the pad
+    walls: Float[Array, "a b"]  # brightness relative to the pad: 1 on the pad, less on the housing's walls
+    corners: Corners  # vertices on the grid, with the value 1 / depth (1/m)
+    winner: Int[Array, "a b"]  # index of the nearest face, -1 where there is none
 
 
 class _Surface(NamedTuple):
-    """Constants and the object's surface, for shading."""
+    """Constants of the sensor and the object's surface, for shading."""
 
     sensor: Sensor
-    corners: Corners
-    turn: Float[Array, "3 3"]  # from the mesh frame to the sensor frame
-    normals: Float[Array, "f 3 3"]
-    colors: Float[Array, "f 3 3"]
-    uv: Float[Array, "f 3 2"]
-    texture: Float[Array, "t t 3"]
-    two_sided: Bool[Array, ""]
+    corners: Corners  # vertices on the grid of samples
+    turn: Float[Array, "3 3"]  # rotation matrix from the mesh frame to the sensor frame
+    normals: Float[Array, "f 3 3"]  # normals at the corners of each face, mesh frame
+    colors: Float[Array, "f 3 3"]  # linear RGB colours at the corners of each face
+    uv: Float[Array, "f 3 2"]  # texture coordinates at the corners of each face
+    texture: Float[Array, "t t 3"]  # texture, which is multiplied by the colours
+    two_sided: Bool[Array, ""]  # True if faces are also visible from behind
 
 
 @functools.partial(jax.jit, static_argnames=("resolution", "crop", "moving_edges"))
 def draw(
     sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
-    """Draw an object in balance. `sense` describes the arguments."""
+    """Draw the images of an object in balance. `sense` describes the options."""
     drawn = functools.partial(_draw, resolution=resolution, crop=crop, moving_edges=moving_edges)
     return looped(drawn)(sensor, body, resting)
 
 
 @jax.jit
 def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"]) -> Float[Array, "h w 3"]:
-    """Draw the tactile image of an imprint. `sts_jax.touch` describes the arguments."""
+    """Draw the tactile image of an imprint (m) in a window of the gel's face (m). `sts_jax.touch` has the details."""
     rows, columns = imprint.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])
@@ -81,12 +81,14 @@ def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"
 def _draw(
     sensor: Sensor, body: Body, resting: Resting, *, resolution: tuple[int, int], crop: bool, moving_edges: bool
 ) -> Images:
+    """Draw one item: sample, shade, light, and filter to pixels."""
     if crop:
         corners_seen = jnp.where(resting.present, resting.points, jnp.array([[0.0, 0.0, -1.0]]))
         window = optics.object_window(sensor.camera, corners_seen, resolution)
     else:
         window = optics.full_window(sensor.camera, resolution)
-    # One sample per pixel. In small images every second sample is a pixel centre, and the others lie half-way between.
+    # Large images have one sample per pixel. In small ones, every second sample is a pixel centre, and the others lie
+    # half-way between.
     stride = 2 if min(resolution) < sensor.fine_below else 1
     samples = _sample(sensor, body, resting, window, resolution, stride)
     depth, light = _see(sensor, body, resting, samples)
@@ -111,7 +113,7 @@ def _sample(
 ) -> _Samples:
     """Project and rasterise the object on a grid with `stride` samples per pixel in each direction.
 
-    The grid has one more ring of samples around the image, for the normals of the outermost ones.
+    The grid extends beyond the image by the samples that the filter needs, and by one more ring for the normals.
     """
     camera = sensor.camera
     shape = (stride * resolution[0] + stride + 1, stride * resolution[1] + stride + 1)
@@ -132,7 +134,7 @@ def _sample(
 def _see(
     sensor: Sensor, body: Body, resting: Resting, samples: _Samples
 ) -> tuple[Float[Array, "a b"], list[Float[Array, "a b"]]]:
-    """The visual stream: depth (m), and the view through the skin in linear light, channel by channel."""
+    """Compute the depth (m), and the three channels of the view through the skin in linear light."""
     size, winner, (x, y) = sensor.gel.size, samples.winner, samples.places
     hidden = optics.hidden_sky(resting.heights, size, _cpu_reductions.maximum(resting.points[:, 2]), x[0], y[:, 0])
     square_radius = (x * 2 / size[0]) ** 2 + (y * 2 / size[1]) ** 2
@@ -154,7 +156,7 @@ def _see(
 
 
 def _shade(surface: _Surface, images: tuple[Array, ...]) -> list[Float[Array, "h w"]]:
-    """The object's depth, and its colour through the skin in linear light."""
+    """Compute the depth of the object (m), and the three channels of its colour through the skin in linear light."""
     winner, on_pad, column, row, slope_x, slope_y, hidden, *empty = images
     nearest = jnp.maximum(winner, 0)
     shares = weighted(surface.corners, winner, column, row)
@@ -167,7 +169,8 @@ def _shade(surface: _Surface, images: tuple[Array, ...]) -> list[Float[Array, "h
         of_corner = [[share * of_face[..., size * k + i] for k, share in enumerate(shares)] for i in range(size)]
         return [first + second + third for first, second, third in of_corner]
 
-    # Plane by plane, and stacked only for functions of vectors: arithmetic along an axis of three is slow on a CPU.
+    # Component by component, because arithmetic along an axis of three is slow on a CPU. Components are stacked only
+    # for functions of vectors.
     across = inside(surface.normals)
     nx, ny, nz = (row[0] * across[0] + row[1] * across[1] + row[2] * across[2] for row in surface.turn)
     square = nx * nx + ny * ny + nz * nz
@@ -198,11 +201,11 @@ def _imprint(
 def _pad_and_walls(
     sensor: Sensor, x: Float[Array, "1 b"], y: Float[Array, "a 1"]
 ) -> tuple[Bool[Array, "a b"], Float[Array, "a b"]]:
-    """Whether each ray passes through the pad, and the brightness relative to the pad: 1 on it, less on the walls."""
+    """Mask of the rays that pass through the pad, and brightness relative to the pad: 1 on it, less on the walls."""
     width, height = sensor.gel.size
-    # The pad's edge coincides with the image's, so a margin absorbs rounding.
+    # The edges of the pad and of the image coincide, so a margin absorbs rounding.
     on_pad = (jnp.abs(x * 2 / width) <= 1.0001) & (jnp.abs(y * 2 / height) <= 1.0001)
-    # In a corner the ray meets the wall beyond whose edge it is farther out, which is the darker one.
+    # Beyond a corner of the pad, a ray meets one of two walls first, at the larger depth. This wall is the darker one.
     sides = (jnp.stack([x, 0 * x], axis=-1), jnp.stack([0 * y, y], axis=-1))
     walls = (
         optics.housing(sensor.room, jnp.zeros(side.shape[:-1], bool), side, sensor.gel.size, sensor.camera.distance)
@@ -212,7 +215,7 @@ def _pad_and_walls(
 
 
 def _pixels(samples: list[Float[Array, "a b"]], stride: int) -> list[Float[Array, "h w"]]:
-    """Filter samples half a pixel apart by a tent that is one pixel wide at half height. At stride 1, do nothing."""
+    """Filter samples half a pixel apart with the weights 1/4, 1/2, 1/4 along both axes. Stride 1 needs no filter."""
     if stride == 1:
         return samples
     rows = [0.5 * s[1:-1:2] + 0.25 * (s[:-2:2] + s[2::2]) for s in samples]

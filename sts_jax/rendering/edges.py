@@ -1,4 +1,4 @@
-"""The derivative of an imprint whose edges move along with the object."""
+"""Derivative of an imprint whose edges move with the object."""
 
 import functools
 import operator
@@ -19,26 +19,28 @@ def with_moving_edges(
     on_pad: Bool[Array, "h w"],
     follows: Bool[Array, "h w"],
 ) -> Float[Array, "h w"]:
-    """Return the imprint, with the derivative of a shape that moves along with the faces' corners.
+    """Return the imprint unchanged, but with a derivative that includes the motion of its edges.
 
-    The derivative of interpolated depth ignores edges that move, and the imprint of a flat object with upright walls
-    changes at its edges alone. With the velocity v of the visible surface (pixels) and the rate at which it sinks,
+    The derivative of the depth that is interpolated at a pixel ignores edges that move across pixels. The imprint of a
+    flat object with upright walls changes only at such edges. The derivative here is
 
         d imprint = rate - v . grad imprint
 
-    Each of two neighbouring pixels receives half of their difference, with the v of the one nearer to the camera: a
-    micro-edge (Pidhorskyi et al. 2024, "Rasterized Edge Gradients"). It is accurate on average over a few pixels.
+    v is the change of the visible surface's position in the image (pixels), and `rate` is the change of its depth below
+    the gel's face (m). At the edge between two neighbouring pixels, each pixel receives half of their difference times
+    the v of the pixel that is nearer to the camera (micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge
+    Gradients"). The derivative is accurate on average over a few pixels.
 
     Args:
-        imprint: depth of the imprint (m).
-        corners: with 1 / depth (1/m) as their value.
-        images: the winning face, the column and the row of each pixel.
-        depth: of the object from the pinhole (m), `inf` where there is none.
-        on_pad: whether the ray passes through the pad.
-        follows: whether the imprint follows the object's surface.
+        imprint: Depth of the imprint below the gel's face (m).
+        corners: Vertices of the object in the image, with the value 1 / depth (1/m).
+        images: Index of the nearest face, column and row of each pixel.
+        depth: Depth of the object from the pinhole (m), `inf` where there is no object.
+        on_pad: True for pixels whose rays pass through the pad.
+        follows: True for pixels in which the imprint is the surface of the object, and not flat or clipped skin.
 
     Returns:
-        The imprint, unchanged.
+        The imprint.
     """
     return imprint
 

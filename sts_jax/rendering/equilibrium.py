@@ -15,14 +15,14 @@ from sts_jax.rendering.tiles import lines, where_active
 class Resting(NamedTuple):
     """An object in balance on the gel."""
 
-    points: Float[Array, "v 3"]  # m, vertices, sensor frame
-    pose: Float[Array, "7"]  # in balance, or a pose below the pad if the given one is not finite
-    shown: Float[Array, "7"]  # in balance, or the given one if it is not finite
-    heights: Float[Array, "r c"]  # m, of its underside over the gel's grid
-    present: Bool[Array, ""]  # whether some part is above the gel's face
-    pressing: Bool[Array, ""]  # whether it presses on the gel
-    balanced: Bool[Array, ""]  # whether the gel carries the wrench within its limits
-    pressure: Float[Array, "r c"]  # Pa
+    points: Float[Array, "v 3"]  # vertices in the sensor frame (m)
+    pose: Float[Array, "7"]  # pose in balance, or a pose below the pad if an input is invalid
+    shown: Float[Array, "7"]  # pose in balance, or the given pose if an input is invalid
+    heights: Float[Array, "r c"]  # heights of the underside above the gel's face, on the gel's grid (m)
+    present: Bool[Array, ""]  # True if a part of the object is above the gel's face
+    pressing: Bool[Array, ""]  # True if it is present, and Fz > 0 or no wrench is given
+    balanced: Bool[Array, ""]  # True if the gel balances the wrench within its limits
+    pressure: Float[Array, "r c"]  # pressure on the gel's grid (Pa)
 
 
 def _balance(
@@ -34,16 +34,16 @@ def _balance(
     pose: Float[Array, "7"],
     wrench: Float[Array, "6"] | None,
 ) -> Resting:
-    """Let an object sink and tilt until the gel carries its wrench.
+    """Let an object sink and tilt until the gel balances the wrench.
 
     Args:
-        gel: constants of the gel.
-        sound: False for an invalid sensor or body, which gives an object below the pad.
-        vertices: mesh frame (m).
-        faces: vertex indices.
-        two_sided: whether faces are visible from behind too.
-        pose: mesh frame in the sensor frame, before it sinks.
-        wrench: of the pad on the object (N, N m), or None for the imprint of the pose alone.
+        gel: Constants of the gel.
+        sound: False for an invalid sensor or body. The object is then placed below the pad, where it is not drawn.
+        vertices: Vertices in the mesh frame (m).
+        faces: Vertex indices of the faces.
+        two_sided: True if faces are also visible from behind.
+        pose: Pose before the object sinks, mesh frame in the sensor frame: position (m) and quaternion.
+        wrench: Force (N) and moment (N m) of the pad on the object. None keeps the object in the given pose.
 
     Returns:
         The object in balance.
@@ -88,22 +88,22 @@ def underside(
     points: Float[Array, "v 3"],
     present: Bool[Array, ""],
 ) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
-    """Heights of an object's underside over the gel's face, on the gel's grid.
+    """Heights of an object's underside above the gel's face, on the gel's grid.
 
     Args:
-        gel: the gel, which has the grid.
-        faces: vertex indices of the object's faces.
-        two_sided: whether faces are visible from behind too.
-        points: vertices, sensor frame (m).
-        present: whether there is an object at all.
+        gel: Constants of the gel.
+        faces: Vertex indices of the object's faces.
+        two_sided: True if faces are also visible from behind.
+        points: Vertices in the sensor frame (m).
+        present: False if there is no object.
 
     Returns:
-        Two height maps (m): of the faces within the gel's reach, which alone can press on it, and of all faces, which
-        block the light. Both are `inf` where no face lies over a cell.
+        Two height maps (m). The first contains the faces that are low enough to press on the gel. The second contains
+        all faces, which hide the sky. Both are `inf` at cells without a face above.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))
-    # Parts that are farther above the lowest point than the largest depth and tilt can lower them never press.
+    # A part never presses if it is higher above the lowest point than the largest depth and tilt can lower it.
     extent = sum(_cpu_reductions.maximum(part) - _cpu_reductions.minimum(part) for part in (across, down))
     reach = _cpu_reductions.minimum(height) + gel.max_depth + jnp.tan(gel.max_tilt) * extent
     across = (across / gel.size[0] + 0.5) * columns - 0.5
@@ -118,7 +118,7 @@ def underside(
 
 
 def _moved(pose: Float[Array, "7"], contact: tactile.Equilibrium) -> Float[Array, "7"]:
-    """The pose of an object after it has turned and sunk into the gel."""
+    """Pose of an object after it has rotated and sunk into the gel."""
     turn = geometry.quat_from_rotvec(jnp.concatenate([contact.turn, jnp.zeros(1)]))
     drop = jnp.stack([jnp.float32(0), jnp.float32(0), -contact.sink])
     position = geometry.transform(jnp.concatenate([drop, turn]), pose[:3])
@@ -128,8 +128,8 @@ def _moved(pose: Float[Array, "7"], contact: tactile.Equilibrium) -> Float[Array
 def _placed(
     condition: Bool[Array, ""], pose: Float[Array, "7"], vertices: Float[Array, "v 3"], otherwise: Float[Array, "v 3"]
 ) -> Float[Array, "v 3"]:
-    """Vertices in the sensor frame if the condition holds, else `otherwise`."""
-    # XLA keeps the result of a condition. It would recompute any other value at each use. x, y and z have separate
-    # memory.
+    """Vertices in the sensor frame if the condition is true, else `otherwise`."""
+    # XLA stores the result of a conditional. It would recompute any other value at each use. x, y and z are returned as
+    # separate arrays.
     planes = jax.lax.cond(condition, lambda: tuple(geometry.transform(pose, vertices).T), lambda: tuple(otherwise.T))
     return jnp.stack(planes, axis=-1)

@@ -1,4 +1,4 @@
-"""The tactile stream: the skin with an imprint, lit from inside."""
+"""Tactile stream: image of the skin with an imprint, lit from inside."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from sts_jax import tactile
 from sts_jax.rendering.tiles import planes, where_active
 from sts_jax.sensor import Sensor
 
-_UNTOUCHED = 1e-8  # m, an imprint too shallow to change an image, such as the tail of the skin's coupling
+_UNTOUCHED = 1e-8  # m, a shallower imprint does not change the image, such as the tail of the smoothing
 
 
 def lit_skin(
@@ -18,17 +18,18 @@ def lit_skin(
     pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """The lit skin at the samples of an imprint.
+    """Compute the brightness of the skin at the samples of an imprint.
 
     Args:
-        sensor: constants of the camera, skin, lights and reflectance.
-        imprint: depth at the samples (m).
-        window: part of the gel's face that the samples cover (m).
-        pitch: of the samples along x and y (m).
-        slopes: x / depth along the first row, and y / depth along the first column.
+        sensor: Constants of the sensor.
+        imprint: Depth of the imprint below the gel's face at the samples (m).
+        window: Part of the gel's face that the samples cover: left, top, width, height (m).
+        pitch: Distance between samples along x and y (m).
+        slopes: x / depth of the rays along a row, and y / depth along a column.
 
     Returns:
-        Three channels, not clipped, without the outermost samples, which serve for the normals of their neighbours.
+        Three channels, not clipped. The outermost samples of the imprint are missing, because they only serve for the
+        normals of their neighbours.
     """
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)
@@ -43,7 +44,11 @@ def lit_skin(
 
 
 def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Float[Array, "h w *tiles"]]:
-    """The lit skin from the rays, the imprint and the lights' shares, which have one more pixel on each side."""
+    """Compute the brightness of pressed skin.
+
+    `images` are the slopes of the rays in x and y, the imprint (m) and the share of each light, with one more pixel on
+    each side than the result.
+    """
     slope_x, slope_y, imprint, *shares = images
     depth = sensor.camera.distance - imprint
     surface = slope_x * depth, slope_y * depth, -imprint
@@ -55,6 +60,6 @@ def _skin(sensor: Sensor, images: tuple[Array, ...]) -> list[Float[Array, "h w *
 
 
 def _near(flags: Bool[Array, "a b"]) -> Bool[Array, "h w"]:
-    """Whether any pixel of a 3x3 neighbourhood is flagged, for all but the outermost pixels."""
+    """True for pixels with a true flag in their 3x3 neighbourhood. The outermost pixels are dropped."""
     rows = flags[:-2] | flags[1:-1] | flags[2:]
     return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]

@@ -1,10 +1,10 @@
 """`looped`: a function that `jax.vmap` turns into a loop on a CPU, including its derivatives.
 
 Under `jax.vmap`, a function with a data-dependent loop, such as the rasteriser, runs the whole batch for as many
-iterations as its slowest item needs. On a CPU, one item after the other is several times as fast.
-`jax.custom_batching.sequential_vmap` has the same purpose, but no reverse-mode derivative. Here the derivative is a
-linear primitive with its own batching rule. It stores the arguments of the function and not the intermediate values,
-and evaluates the function once more in the backward pass.
+iterations as its slowest item needs. On a CPU, it is several times as fast to process one item after the other.
+`jax.custom_batching.sequential_vmap` has the same purpose, but no reverse-mode derivative. In this module, the
+derivative is a linear primitive with its own batching rule. It stores the arguments of the function and not the
+intermediate values, and evaluates the function once more in the backward pass.
 """
 
 import functools
@@ -22,13 +22,13 @@ Flat = Callable[..., list[Array]]
 
 
 def looped(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make `jax.vmap` of a function a loop where JAX runs on a CPU.
+    """Return a function for which `jax.vmap` is a loop over the items on a CPU, and a batch on other devices.
 
     Args:
-        function: from trees of arrays to a tree of arrays. It must not close over traced values.
+        function: Function from trees of arrays to a tree of arrays. It must not close over traced values.
 
     Returns:
-        A function with the same values and derivatives.
+        Function with the same values and derivatives.
     """
 
     def with_trees(*arguments: Any) -> Any:
@@ -47,8 +47,10 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _looped(function: Flat) -> Flat:
-    # JAX passes flags and symbolic zeros in place of arrays. As leaves of the caller's trees they would have the wrong
-    # type for the trees' fields, so everything from here on is a list.
+    """`looped` for a function from arrays to a list of arrays."""
+
+    # JAX passes flags and symbolic zeros in place of arrays. They would have the wrong type for the fields of the
+    # caller's trees, so all functions below use lists of arrays.
     @jax.custom_batching.custom_vmap
     def primal(*leaves: Array) -> list[Array]:
         return function(*leaves)
@@ -93,7 +95,11 @@ def _is_zero(tangent: Any) -> bool:
 def _over_batch(
     single: Flat, dense: Flat, size: int, flags: Sequence[bool], leaves: Sequence[ArrayLike]
 ) -> list[Array]:
-    """Map a function over the first axis of the flagged arguments: a loop on a CPU, `jax.vmap` elsewhere."""
+    """Map a function over the first axis of the flagged arguments.
+
+    `single` and `dense` compute the same function. `single` is called in a loop on a CPU, and `dense` under `jax.vmap`
+    on other devices.
+    """
     if jax.default_backend() != "cpu" or not any(flags):
         return jax.vmap(dense, in_axes=[0 if flag else None for flag in flags], axis_size=size)(*leaves)
 
@@ -104,13 +110,14 @@ def _over_batch(
     return jax.lax.map(one, [leaf for leaf, flag in zip(leaves, flags, strict=True) if flag])
 
 
-# The derivative of a function at its arguments, applied to the tangents of the active arguments, or transposed and
-# applied to cotangents of its results. Operands: the arguments, then tangents or cotangents.
+# Primitive that applies the derivative of a function. Its operands are the function's arguments, followed by tangents
+# of the active arguments, or by cotangents of the results if it is transposed.
 _linear = Primitive("looped_derivative")
 _linear.multiple_results = True
 
 
 def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], transposed: bool) -> list[Array]:
+    """Evaluate the primitive."""
     arguments, vectors = operands[: len(active)], operands[len(active) :]
 
     def of_active(*moving: Array) -> list[Array]:
@@ -124,6 +131,7 @@ def _apply(*operands: ArrayLike, function: Flat, active: tuple[bool, ...], trans
 
 
 def _abstract(*operands: Any, **params: Any) -> list[Any]:
+    """Shapes and types of the primitive's results."""
     shapes = jax.eval_shape(functools.partial(_apply, **params), *operands)
     return [jax.core.ShapedArray(leaf.shape, leaf.dtype) for leaf in shapes]
 
@@ -131,7 +139,7 @@ def _abstract(*operands: Any, **params: Any) -> list[Any]:
 def _derivative(
     primals: Sequence[ArrayLike], tangents: Sequence[Any], **params: Any
 ) -> tuple[list[Array], list[Array]]:
-    """The second derivative, taken from the function itself, because `_linear` is linear in its vectors only."""
+    """Derivative of the primitive. It is linear in tangents and cotangents, but not in the function's arguments."""
     moving = [k for k, tangent in enumerate(tangents) if type(tangent) is not ad.Zero]
 
     def of_moving(*values: Array) -> list[Array]:
@@ -149,6 +157,7 @@ def _derivative(
 
 
 def _transpose(cotangents: Sequence[Any], *operands: Any, transposed: bool, **params: Any) -> list[Any]:
+    """Transpose of the primitive with respect to its tangents or cotangents."""
     first = len(params["active"])
     vectors = [ad.instantiate_zeros(cotangent) for cotangent in cotangents]
     back = _linear.bind(*operands[:first], *vectors, transposed=not transposed, **params)
@@ -156,13 +165,14 @@ def _transpose(cotangents: Sequence[Any], *operands: Any, transposed: bool, **pa
 
 
 def _batch(operands: Sequence[ArrayLike], axes: Sequence[Any], **params: Any) -> tuple[list[Array], list[int]]:
+    """Batching rule of the primitive: a loop if the function's arguments are batched, else `vmap`."""
     flags = [axis is not None for axis in axes]
     moved = [jnp.moveaxis(x, axis, 0) if flag else x for x, axis, flag in zip(operands, axes, flags, strict=True)]
     size = next(jnp.shape(x)[0] for x, flag in zip(moved, flags, strict=True) if flag)
     dense = functools.partial(_apply, **params)
     if any(flags[: len(params["active"])]):
         result = _over_batch(functools.partial(_linear.bind, **params), dense, size, flags, moved)
-    else:  # several tangents at one point, as in `jax.jacfwd`: the function itself is evaluated once
+    else:  # several tangents at one point, as in `jax.jacfwd`, where the function needs one evaluation
         result = jax.vmap(dense, in_axes=[0 if flag else None for flag in flags])(*moved)
     return result, [0] * len(result)
 

@@ -1,8 +1,9 @@
-"""Evaluation of an image function on the tiles with active pixels only, with the gradient of the whole image.
+"""Evaluation of an image function on those tiles of an image that have active pixels.
 
-Most of a sensor's image is empty. `where_active` cuts it into square tiles and evaluates those with an active pixel,
-batch by batch, so that the cost depends on the active area and not on the image's size. If many tiles are active, and
-under `vmap`, the function is called once with the whole image.
+Most of a sensor's image is empty. `where_active` cuts the image into square tiles and evaluates the tiles with an
+active pixel, batch by batch. The cost depends on the active area and not on the size of the image. If many tiles are
+active, and under `vmap`, the function is called once with the whole image. The gradient is always that of the whole
+image.
 """
 
 import functools
@@ -16,10 +17,10 @@ from jaxtyping import Array, Bool, Float, Int
 from sts_jax import _cpu_reductions
 
 TILE = 4  # pixels, side of a tile
-BATCH = 64  # tiles evaluated at a time
-CROWDED = 0.4  # share of active tiles above which the whole image is evaluated at once, on all cores
+BATCH = 64  # number of tiles that are evaluated at a time
+CROWDED = 0.4  # share of active tiles above which the whole image is evaluated at once, on all CPU cores
 
-Images = Any  # a tree of images (height, width)
+Images = Any  # tree of images (height, width)
 Function = Callable[[Any, Images], Images]
 
 
@@ -31,17 +32,18 @@ def where_active(
     Derivatives are those of this expression over the whole image.
 
     Args:
-        function: `(params, images) -> images'`, from images of any size (a + 2 ring, b + 2 ring) to images (a, b). An
-            output pixel must depend only on the input pixels within `ring` of it. A third axis of the images, over
-            tiles, must be preserved. `function` must not close over traced values: pass them as arguments.
-        active: pixels where the result is needed.
-        params: passed to `function` unchanged.
-        images: tree of (h + 2 ring, w + 2 ring). An image of one row or one column is broadcast.
-        otherwise: tree of (h, w) with the values of the other pixels, of the structure that `function` returns.
-        ring: number of neighbouring pixels in each direction that `function` needs.
+        function: Function `(params, images) -> result`. It maps a tree of images of any size (a + 2 ring, b + 2 ring)
+            to a tree of images (a, b). A pixel of the result must depend only on pixels at most `ring` rows and
+            columns away. If the images have a third axis, over tiles, the result must have it too. The function must
+            not close over traced values. Pass these in `params`.
+        active: Mask of the pixels at which the result is needed.
+        params: First argument of `function`.
+        images: Tree of images of shape (h + 2 ring, w + 2 ring). Images with a single row or column are broadcast.
+        otherwise: Tree of images (h, w) with the values of the other pixels, of the structure that `function` returns.
+        ring: Number of neighbouring pixels in each direction that `function` needs.
 
     Returns:
-        Tree of (h, w).
+        Tree of images (h, w).
     """
     if min(active.shape) < TILE:
         return _dense(function, active, params, images, otherwise)
@@ -49,16 +51,17 @@ def where_active(
 
 
 def lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
-    """The first row of an image of x values and the first column of one of y values, since all others are equal."""
+    """First row of an image of x values and first column of an image of y values. The others are equal to these."""
     return images[0][:1], images[1][:, :1]
 
 
 def planes(image: Float[Array, "h w *n 3"]) -> list[Float[Array, "h w *n"]]:
-    """The three channels of an image."""
+    """Split an image into its three channels."""
     return [image[..., k] for k in range(3)]
 
 
 def _dense(function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images) -> Images:
+    """Evaluate the function on the whole image."""
     shape = jnp.broadcast_shapes(*(image.shape for image in jax.tree.leaves(images)))
     values = function(params, jax.tree.map(lambda image: jnp.broadcast_to(image, shape), images))
     return jax.tree.map(lambda value, other: jnp.where(active, value, other), values, otherwise)
@@ -90,12 +93,13 @@ class _Progress(NamedTuple):
     """State of the loop over batches of tiles."""
 
     next_tile: Int[Array, ""]  # first tile of the next batch
-    result: Images
+    result: Images  # images with the values of the tiles so far
 
 
 def _sparse(
     function: Function, ring: int, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images
 ) -> Images:
+    """Evaluate the function on the active tiles, or on the whole image if there are many of them."""
     height, width = active.shape
     rows, columns = -(-height // TILE), -(-width // TILE)
     number = rows * columns
@@ -103,13 +107,13 @@ def _sparse(
     used = jnp.any(flags.reshape(rows, TILE, columns, TILE), axis=(1, 3)).reshape(number)
     end = jnp.sum(used)
     order = jnp.pad(_cpu_reductions.flatnonzero(used), (0, -number % BATCH), constant_values=number)
-    # The last row and column of tiles overlap those before them, so that every tile lies in the image. The last batch
-    # is filled up with repetitions of one of these tiles.
+    # The tiles of the last row and column overlap their neighbours, so that every tile lies in the image. The last
+    # batch is filled up with repetitions of one tile.
     first_row = jnp.minimum(order // columns * TILE, height - TILE)
     first_column = jnp.minimum(order % columns * TILE, width - TILE)
 
     def evaluate_batch(progress: _Progress) -> _Progress:
-        # Tiles lie along the last axis, where a CPU vectorises best.
+        # The last axis is that of the tiles, because a CPU vectorises along it.
         row, column = (
             jax.lax.dynamic_slice(first, (progress.next_tile,), (BATCH,)) for first in (first_row, first_column)
         )
@@ -120,7 +124,7 @@ def _sparse(
             side = jnp.arange(TILE + 2 * ring, dtype=jnp.int32)[:, None]
             down = (row[None, :] + side)[:, None] * (image.shape[1] if image.shape[0] > 1 else 0)
             across = (column[None, :] + side)[None, :] * (1 if image.shape[1] > 1 else 0)
-            # Without neighbours, a batch is a single row of pixels.
+            # If no neighbours are needed, a batch is a single row of pixels.
             place = down + across if ring else (down + across).reshape(1, -1)
             return image.reshape(-1).at[place].get(mode="promise_in_bounds")
 

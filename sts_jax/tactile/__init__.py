@@ -1,4 +1,4 @@
-"""Touch: the gel's equilibrium and the skin's shape, lights, shadows and reflectance."""
+"""Tactile stream: equilibrium of the gel, shape of the skin, lights, shadows and reflectance."""
 
 from sts_jax.tactile.gel import Equilibrium, Gel, cell_area, cell_centres, indent, settle
 from sts_jax.tactile.normals import surface_normals

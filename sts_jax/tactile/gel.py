@@ -1,7 +1,7 @@
-"""The gel as a bed of springs, in equilibrium with the wrench that the pad exerts on the object.
+"""Model of the gel as a bed of independent springs, in equilibrium with the wrench that the pad exerts on the object.
 
-Heights are those of the object's underside over the gel's face (m, positive outwards), on the gel's grid. As in an
-image, row 0 has the lowest y and column 0 the lowest x.
+An object is given by the heights of its underside above the gel's undeformed face (m), one for each cell of the gel's
+grid. They are negative where the object presses into the gel. Row 0 has the smallest y, and column 0 the smallest x.
 """
 
 import dataclasses
@@ -14,13 +14,13 @@ from jaxtyping import Array, Bool, Float, Int, ScalarLike
 from sts_jax import _cpu_reductions
 from sts_jax._ranges import POSITIVE, STATIC
 
-_NEWTON_STEPS = 20  # at most
+_NEWTON_STEPS = 20  # largest number of steps
 _SETTLED = 1e-7  # m, the iteration ends after a step shorter than this
-_ENOUGH = 0.5  # accept a full step if it reduces the energy's directional derivative to this share
-_STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)
-_LEVER = 0.02  # m, lever by which tilts are scaled to heights
+_ENOUGH = 0.5  # a full step is accepted if it reduces the energy's directional derivative to this share
+_STEP_LENGTHS = (1.0, 0.6, 0.35, 0.15, 0.05)  # candidates of the line search, relative to a full step
+_LEVER = 0.02  # m, a tilt is expressed as the height that it causes at this distance
 _BOTTOM = 300.0  # stiffness of the hard bottom beyond `max_depth`, relative to the springs
-_FAR = 1.0  # m, replaces inf where there is no object
+_FAR = 1.0  # m, height that replaces inf where there is no object
 
 Scalar = float | Array
 
@@ -28,36 +28,44 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Gel:
-    """A square pad of soft gel, its outer face in the plane z = 0."""
+    """A rectangular pad of soft gel. Its outer face lies in the plane z = 0."""
 
-    # m, along x and y (paper, "Real-World Dataset")
+    # Size along x and y (m). Source: paper, "Real-World Dataset".
     size: tuple[Scalar, Scalar] = dataclasses.field(default=(0.15, 0.15), metadata=POSITIVE)
-    thickness: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE)  # m (paper, supplement "Simulator Details")
-    # N/m^3, about 10 kPa over 5 mm, so that a bottle sinks 0.2-0.3 mm. Our choice.
+    # Thickness (m). Source: paper, supplement "Simulator Details".
+    thickness: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE)
+    # Pressure per depth (N/m^3). The default gives 10 kPa at a depth of 5 mm. A bottle then sinks 0.2-0.3 mm. Our
+    # choice.
     stiffness: Scalar = dataclasses.field(default=2e6, metadata=POSITIVE)
-    # m, limit of the imprint in an equilibrium. Our choice.
+    # Largest depth to which an object with a wrench sinks (m). Our choice.
     max_depth: Scalar = dataclasses.field(default=0.003, metadata=POSITIVE)
-    # rad (5 degrees), limit about x and about y, from the given pose. Our choice. The equilibrium takes the slope of a
-    # tilt for its angle, which limits this constant.
+    # Largest tilt of an object from its given pose, about x and about y (rad). The default is 5 degrees, our choice. It
+    # must be < 0.3, because the equilibrium assumes that the tangent of a tilt is equal to its angle.
     max_tilt: Scalar = dataclasses.field(default=0.0873, metadata=POSITIVE | {"below": 0.3})
-    # allowed error, over Fz, or over Fz times 1 cm for moments. Our choice.
+    # Largest relative error of a balance: error of Fz divided by Fz, and error of Mx or My divided by Fz times 1 cm.
+    # Our choice.
     tolerance: Scalar = dataclasses.field(default=0.005, metadata=POSITIVE)
-    cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata=POSITIVE | STATIC)  # rows, columns: 1 mm
+    # Number of rows and columns of the grid. The default gives cells of 1 mm.
+    cells: tuple[int, int] = dataclasses.field(default=(150, 150), metadata=POSITIVE | STATIC)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """The equilibrium of a rigid object in the gel."""
+    """Equilibrium of a rigid object on the gel: its motion from the given pose, and the pressure on the gel."""
 
-    sink: Float[Array, "*n"]  # m, motion of the object along -z, after the turn
-    turn: Float[Array, "*n 2"]  # rad, rotation vector about the sensor's x and y axes
-    pressure: Float[Array, "*n r c"]  # Pa, on the gel's grid
-    balanced: Bool[Array, "*n"]  # whether the pressure balances Fz, Mx and My
+    # Motion along -z (m), which follows the rotation.
+    sink: Float[Array, "*n"]
+    # Rotation vector about the sensor's x and y axes (rad).
+    turn: Float[Array, "*n 2"]
+    # Pressure on the cells of the gel's grid (Pa).
+    pressure: Float[Array, "*n r c"]
+    # True if the pressure balances Fz, Mx and My of the wrench.
+    balanced: Bool[Array, "*n"]
 
 
 def cell_centres(gel: Gel) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
-    """x and y of the grid's cells (m)."""
+    """x and y of the centre of each cell of the gel's grid, in the sensor frame (m)."""
     rows, columns = gel.cells
     x = ((jnp.arange(columns) + 0.5) / columns - 0.5) * gel.size[0]
     y = ((jnp.arange(rows) + 0.5) / rows - 0.5) * gel.size[1]
@@ -66,52 +74,65 @@ def cell_centres(gel: Gel) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
 
 
 def cell_area(gel: Gel) -> Float[Array, ""]:
-    """Area of one cell (m^2)."""
+    """Area of one cell of the gel's grid (m^2)."""
     return jnp.asarray(gel.size[0] * gel.size[1] / (gel.cells[0] * gel.cells[1]), float)
 
 
 def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
-    """Pressure of an object that stays in its pose, `p = k max(0, -h)`.
+    """Compute the pressure of an object that stays in its pose.
+
+    The pressure is `p = k max(0, -h)`, with the stiffness k of the gel and the heights h. Depths are clipped to the
+    gel's thickness.
 
     Args:
-        gel: constants of the gel.
-        heights: of the object's underside over the gel's face (m), `inf` where there is none.
+        gel: Constants of the gel.
+        heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
 
     Returns:
-        Equilibrium without motion, balanced because there is no wrench to balance.
+        Equilibrium without motion. `balanced` is True, because there is no wrench to balance.
     """
     pressure = gel.stiffness * jnp.clip(-heights, 0, gel.thickness)
     return Equilibrium(jnp.float32(0), jnp.zeros(2), pressure, jnp.bool_(True))
 
 
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
-    """Depth and two tilts at which the springs balance Fz, Mx and My.
+    """Find the depth and the two tilts of an object at which the gel balances Fz, Mx and My of the wrench.
 
-    The motion of the object changes its heights to `h' = h - d + a y - b x`. The pressure is `p = k max(0, -h')`, and
+    An object with heights h over the cells at x and y sinks by d, and turns by the small angles a about x and b about
+    y. With the stiffness k of the gel, its heights h' and the pressure p are then
+
+        h' = h - d + a y - b x,   p = k max(0, -h')
+
+    With the area A of a cell, the balance
 
         Fz = sum p A,   Mx = sum y p A,   My = -sum x p A
 
-    are the conditions for a minimum of `E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b`, which is convex and
-    piecewise quadratic. Projected Newton steps with a line search find it, starting at the largest depth below first
-    touch. Beyond `max_depth` the springs meet a hard bottom, which carries the rest of the load and does not count as
-    pressure. Derivatives are those of the equilibrium (implicit function theorem: one more Newton step, undamped).
+    is the condition for a minimum of the energy
+
+        E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b
+
+    which is convex and piecewise quadratic. Projected Newton steps with a line search find the minimum. The first
+    iterate is the pose at which the object's lowest point is at the depth `Gel.max_depth`. Below this depth, the
+    springs meet a hard bottom. It carries the rest of the load, which does not count as pressure. Derivatives are those
+    of the equilibrium, by the implicit function theorem.
 
     Args:
-        gel: constants of the gel.
-        heights: of the object's underside over the gel's face (m), `inf` where there is none.
-        wrench: force (N) and moment about the sensor's origin (N m) of the pad on the object. Fx, Fy and Mz are
-            friction and ignored.
+        gel: Constants of the gel.
+        heights: Heights of the object's underside above the gel's face (m), `inf` where there is no object.
+        wrench: Wrench of the pad on the object: force (N) and moment about the sensor's origin (N m). Fx, Fy and Mz are
+            due to friction and are ignored.
 
     Returns:
-        Equilibrium. With `Fz <= 0` there is no motion and no pressure. If no equilibrium exists, the result is within
-        the limits, and `balanced` is False. Reasons are a first touch farther away than `max_depth`, a centre of
-        pressure outside of the footprint, and a limit that is reached.
+        The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
+        exists within the limits of depth and tilt, the result lies within these limits and `balanced` is False. This
+        happens if the object's lowest point is more than `Gel.max_depth` above the gel, if the centre of pressure of
+        the wrench lies outside the object's footprint or the pad, or if a limit is reached.
     """
     force = wrench[2]
     pressed = force > 0
     safe_force = jnp.where(pressed, force, 1)
     load = jnp.where(pressed, force, 0) / (gel.stiffness * cell_area(gel))  # sum of the springs' compressions (m)
-    # Tilts are about the centre of pressure, in metres of height at the distance `_LEVER` from it.
+    # Tilts are about the centre of pressure. Their unit is the height (m) at the distance `_LEVER` from this centre.
     half_x, half_y = gel.size[0] / 2, gel.size[1] / 2
     wanted_x, wanted_y = -wrench[4] / safe_force, wrench[3] / safe_force
     on_pad = (jnp.abs(wanted_x) <= half_x) & (jnp.abs(wanted_y) <= half_y)
@@ -131,13 +152,12 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
     u = jnp.where(pressed & reach, u, 0)
     length = _plane(u, x, y) - height
-    # The hard bottom yields visibly where it alone carries the load. Lift the object until the deepest spring is at the
-    # limit.
+    # The hard bottom yields where it carries the load. Lift the object until the deepest spring is at the limit.
     deepest = _cpu_reductions.maximum(jnp.max(length, axis=0))
     beyond = jnp.where(pressed & reach, jnp.maximum(deepest - gel.max_depth, 0), 0)
     length = jnp.where(pressed & reach, jnp.clip(length - beyond, 0, gel.max_depth), 0)
 
-    # Moments count as forces at a lever of 1 cm.
+    # A moment is compared as the force that causes it at a lever of 1 cm.
     residual = jnp.abs(_moments(length, x, y) - target) * jnp.array([1.0, _LEVER / 0.01, _LEVER / 0.01])
     balanced = ~pressed | (reach & on_pad & jnp.all(residual <= gel.tolerance * load))
     return Equilibrium(
@@ -149,13 +169,13 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
 
 class _Descent(NamedTuple):
-    """State of Newton's method: the plane `u0 + u1 y + u2 x`, with the gradient and the Hessian of the energy at it."""
+    """State of Newton's method. The unknowns are the plane `u0 + u1 y + u2 x` by which the object moves down."""
 
-    steps: Int[Array, ""]  # taken so far
+    steps: Int[Array, ""]  # number of steps so far
     u: Float[Array, "3"]
     step: Float[Array, ""]  # m, largest component of the last step
-    gradient: Float[Array, "3"]
-    hessian: Float[Array, "3 3"]  # slightly stiffened
+    gradient: Float[Array, "3"]  # of the energy at u
+    hessian: Float[Array, "3 3"]  # of the energy at u, with small positive terms on the diagonal
 
 
 def _newton(
@@ -167,7 +187,20 @@ def _newton(
     bound: Float[Array, "3"],
     limit: Scalar,
 ) -> Float[Array, "3"]:
-    """The plane `u0 + u1 y + u2 x` whose springs to `height` have the moments `target`, or moments near them."""
+    """Find the plane `u0 + u1 y + u2 x` by which an object must move down so that the springs carry the load.
+
+    Args:
+        height: Heights of the object before the motion (m), finite.
+        x: x of the columns, relative to the centre of pressure and divided by `_LEVER`.
+        y: y of the rows, likewise.
+        target: Wanted sums of the springs' compressions, and of the compressions times y and x (m).
+        start: First iterate of u (m).
+        bound: Largest absolute values of u (m).
+        limit: Compression at which a spring meets the hard bottom (m).
+
+    Returns:
+        The unknowns u within their bounds. If the bounds exclude the target, the sums are near it.
+    """
     near_bound = 0.9999 * bound
 
     def pushed(length: Array) -> Array:
@@ -176,7 +209,7 @@ def _newton(
     def slopes(
         u: Float[Array, "3"], height: Array, x: Array, y: Array, target: Array
     ) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Gradient and slightly stiffened Hessian of the energy."""
+        """Gradient and Hessian of the energy, with small positive terms on the Hessian's diagonal."""
         length = _plane(u, x, y) - height
         weight = (length > 0) + _BOTTOM * (length > limit)
         gradient = _moments(pushed(length), x, y) - target
@@ -209,17 +242,17 @@ def _newton(
     state = _Descent(jnp.int32(0), first, jnp.array(jnp.inf), *slopes(first, *fixed))
     u = jax.lax.stop_gradient(jax.lax.while_loop(unsettled, newton, state).u)
 
-    # One more step, which carries the derivatives.
+    # One more step, through which the derivatives pass. All earlier values are constants for them.
     gradient, hessian = slopes(u, height, x, y, target)
     return jnp.clip(u - _solve(jax.lax.stop_gradient(hessian), gradient, jnp.abs(u) >= near_bound), -bound, bound)
 
 
 def _newton_step(state: _Descent, bound: Float[Array, "3"], near_bound: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The Newton step of the unknowns that are not held at their bounds, shortened so that none leaves them."""
+    """Newton step that keeps all unknowns within their bounds. Unknowns that would leave them are held fixed."""
     u, gradient = state.u, state.gradient
     held = ((u >= near_bound) & (gradient < 0)) | ((u <= -near_bound) & (gradient > 0))
     step = -_solve(state.hessian, gradient, held)
-    # Hold an unknown at its limit too if the other unknowns would drive it beyond.
+    # Also hold an unknown at its bound if the step of the other unknowns would move it beyond.
     held |= (jnp.abs(u) >= near_bound) & (jnp.abs(u + step) > bound)
     step = -_solve(state.hessian, gradient, held)
     room = (bound - u * jnp.sign(step)) / jnp.where(step == 0, 1, jnp.abs(step))
@@ -231,8 +264,8 @@ def _plane(u: Float[Array, "3"], x: Float[Array, "c"], y: Float[Array, "r"]) -> 
 
 
 def _sums(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "r"], degree: int) -> Float[Array, "k k"]:
-    """`sum value y^i x^j` at [i, j]."""
-    # One sum along columns per power: products of such narrow matrices are several times slower on a CPU.
+    """Matrix of the sums of `value y^i x^j`, at row i and column j, for powers up to `degree`."""
+    # One vector product for each power of y, because products of narrow matrices are several times slower on a CPU.
     rows = [jnp.sum(value, axis=0), *(y**power @ value for power in range(1, degree + 1))]
     return jnp.stack(rows) @ jnp.stack([x**power for power in range(degree + 1)], axis=1)
 
@@ -243,7 +276,7 @@ def _moments(value: Float[Array, "r c"], x: Float[Array, "c"], y: Float[Array, "
 
 
 def _solve(matrix: Float[Array, "3 3"], vector: Float[Array, "3"], held: Bool[Array, "3"]) -> Float[Array, "3"]:
-    """Solve for the unknowns that are not held. The others are 0."""
+    """Solve a linear system for the unknowns that are not held, by Cramer's rule. The held unknowns are 0."""
     matrix = jnp.where(held[:, None] | held[None, :], jnp.eye(3), matrix)
     vector = jnp.where(held, 0, vector)
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]

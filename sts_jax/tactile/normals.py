@@ -1,4 +1,4 @@
-"""Normals of a surface that is given by a grid of points."""
+"""Normals of a surface given by a grid of points."""
 
 import functools
 import operator
@@ -11,14 +11,17 @@ from jaxtyping import Array, Float
 def surface_normals(
     points: tuple[Float[Array, "a b *n"], Float[Array, "a b *n"], Float[Array, "a b *n"]],
 ) -> Float[Array, "h w *n 3"]:
-    """Unit normals of a grid of points: the axis of least variance of each point's 3x3 neighbourhood.
+    """Unit normals of a surface given by a grid of points.
+
+    A normal is the axis along which the 3x3 neighbourhood of a point has the least variance (paper, supplement
+    "Simulator Details").
 
     Args:
-        points: x, y, z in the sensor frame (m), with one more point on each side: `a b` is `h+2 w+2`. Further axes
-            hold further grids.
+        points: x, y and z of the points in the sensor frame (m), with one more row or column on each side of the result
+            (a = h + 2, b = w + 2). Axes *n are separate grids.
 
     Returns:
-        Unit normals towards the camera (z <= 0) (paper, supplement "Simulator Details").
+        Unit normals towards the camera (z <= 0).
     """
     height, width = (n - 2 for n in points[0].shape[:2])
     # Differences from the middle point, in millimetres, preserve the precision of float32.
@@ -52,22 +55,24 @@ def smallest_eigenvector(
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
     """Unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices A, in closed form.
 
-    The eigenvalue lambda is the smallest root of the characteristic cubic, `mean + spread b` with `b^3 - 3 b = 2 h`,
-    computed as a polynomial in `sqrt(1 - h)` and one Newton step. The vector is the largest column of
-    `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`. The derivative exists if lambda is simple.
-    The other two eigenvalues may be equal, as for points spread evenly in a plane. If lambda is not simple, the result
-    is an arbitrary unit vector with zero gradient.
+    With `m = trace(A) / 3`, `s = sqrt(trace((A - m I)^2) / 6)` and `h = det((A - m I) / s) / 2`, the smallest
+    eigenvalue is `lambda = m + s b`, where b is the smallest root of `b^3 - 3 b = 2 h`. It is computed by a polynomial
+    in `sqrt(1 - h)` and one Newton step. With the other eigenvalues lambda_1 and lambda_2, the eigenvector v is the
+    largest column of `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`, divided by its length.
+
+    The derivative exists if lambda differs from lambda_1 and lambda_2, which may be equal, as for points spread evenly
+    in a plane. Otherwise, the result is an arbitrary unit vector with zero gradient.
 
     Args:
-        xx: element (0, 0) of A. Separate arrays are faster on a CPU.
-        yy: element (1, 1).
-        zz: element (2, 2).
-        xy: element (0, 1).
-        xz: element (0, 2).
-        yz: element (1, 2).
+        xx: Elements (0, 0) of the matrices. Six separate arrays are faster on a CPU than one.
+        yy: Elements (1, 1).
+        zz: Elements (2, 2).
+        xy: Elements (0, 1).
+        xz: Elements (0, 2).
+        yz: Elements (1, 2).
 
     Returns:
-        Components x, y and z of the vector. Its sign is arbitrary.
+        Components x, y and z of the vectors. Their signs are arbitrary.
     """
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
@@ -81,7 +86,7 @@ def smallest_eigenvector(
     root = root - jnp.where(slope > 1e-3, (root * (root * root - 3) - 2 * h) / jnp.where(slope > 1e-3, slope, 1), 0)
     shift = spread * root
     a, b, c = a - shift, b - shift, c - shift
-    # The adjugate: diagonal p, q, t, off-diagonal u (01), v (02), w (12).
+    # Elements of the adjugate: p (0, 0), q (1, 1), t (2, 2), u (0, 1), v (0, 2), w (1, 2).
     p, q, t = b * c - yz * yz, a * c - xz * xz, a * b - xy * xy
     u, v, w = xz * yz - xy * c, xy * yz - xz * b, xy * xz - a * yz
     third, second = (t >= p) & (t >= q), q >= p
@@ -98,8 +103,9 @@ def smallest_eigenvector(
 
 @smallest_eigenvector.defjvp
 def _smallest_eigenvector_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[tuple, tuple]:
-    # dv = -(A - lambda I)^+ dA v, through the inverse of a 2x2 matrix on the plane orthogonal to v, which p and q span
-    # (Duff et al. 2017: a basis without singular cases).
+    # dv = -(A - lambda I)^+ dA v, where ^+ is the pseudo-inverse. It is computed as the inverse of a 2x2 matrix on the
+    # plane orthogonal to v. p and q are an orthonormal basis of this plane (Duff et al. 2017, "Building an Orthonormal
+    # Basis, Revisited").
     v = smallest_eigenvector(*primals)
     sign = jnp.where(v[2] < 0, -1.0, 1.0).astype(v[2].dtype)
     k = -1 / (sign + v[2])

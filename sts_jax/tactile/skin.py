@@ -1,6 +1,6 @@
-"""The lit skin: lateral coupling, far and near lights, shadows, Phong reflectance, darkening.
+"""Image of the lit skin: smoothing of the imprint, far and near lights, shadows, Phong reflectance, darkening.
 
-Images are float32, (height, width, 3), and not clipped to [0, 1], because a pixel first sums all its light.
+Images are float32, (height, width, 3), and not clipped to [0, 1]. `sense` clips them as its last step.
 """
 
 import dataclasses
@@ -15,8 +15,8 @@ from sts_jax import geometry
 from sts_jax._ranges import NOT_NEGATIVE, POSITIVE, STATIC
 from sts_jax._sampling import bilinear, shifted
 
-_NEAREST = 1e-4  # m, least distance between a light and a lit point
-_BRIGHTEST = 60.0  # log of the largest brightness relative to the reference distance, against overflow
+_NEAREST = 1e-4  # m, smallest distance between a light and a lit point. Smaller ones are replaced by it
+_BRIGHTEST = 60.0  # logarithm of the largest brightness relative to the reference distance, against overflow
 _FAINTEST = 1e-20  # smaller cosines make no highlight, because the gradient of their power would be NaN
 
 Scalar = float | Array
@@ -25,13 +25,18 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lights:
-    """Directional lights in the gel's plane, one from each edge: red, green, blue, white (paper's code)."""
+    """Far lights: directional lights, for any number m of lights.
 
-    # unit vectors from the skin towards the lights, sensor frame: left, right, top, bottom edge of the image
+    The defaults are those of the paper's code: four lights in the gel's plane, one from each edge of the image.
+    """
+
+    # Directions from the skin towards the lights, sensor frame. Any length > 0. Defaults: left, right, top and bottom
+    # edge of the image.
     directions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]])
     )
-    # intensity per channel, diffuse and specular alike (paper, supplement: 1.0 in each light's own channels)
+    # Intensity of each light in the red, green and blue channel, for diffuse and specular reflection alike. Defaults:
+    # red, green, blue, white (paper, supplement).
     colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), metadata=NOT_NEGATIVE
     )
@@ -40,72 +45,82 @@ class Lights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Leds:
-    """Near lights: points at a finite distance. All constants are our choice.
+    """Near lights: points at a finite distance, for any number m of lights. The defaults are our choice.
 
-    By default they shine at a grazing angle into the pad's edges, as brightly as the camera's range allows: no pixel of
-    the empty pad is clipped. Each side of the pad has its own colour, which lights the flanks that face it.
+    By default, four LEDs shine at a grazing angle into the pad's edges, red, green, blue and white. They are as bright
+    as the camera's range allows: no pixel of the empty pad is clipped.
     """
 
-    # m, sensor frame: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm under the gel's face
+    # Positions in the sensor frame (m). Defaults: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm below
+    # the gel's outer face.
     positions: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array(
             [[-0.105, 0, -0.003], [0.105, 0, -0.003], [0, -0.105, -0.003], [0, 0.105, -0.003]]
         )
     )
-    # intensity per channel at the reference distance, diffuse and specular alike
+    # Intensity of each light in the red, green and blue channel at the distance `reference`, for diffuse and specular
+    # reflection alike.
     colors: Float[Array, "*n m 3"] = dataclasses.field(
         default_factory=lambda: jnp.array([[0.7, 0, 0], [0, 0.7, 0], [0, 0, 0.7], [0.7, 0.7, 0.7]]),
         metadata=NOT_NEGATIVE,
     )
-    # exponent of the fall-off with distance. 2: a point, 1: a long strip, 0: none
+    # Exponent of the decrease of the intensity with distance: 2 for a point, 1 for a long strip, 0 for no decrease.
     falloff: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)
-    # m, distance at which a light has the intensity `colors`
+    # Distance at which a light has the intensity `colors` (m).
     reference: Scalar = dataclasses.field(default=0.08, metadata=POSITIVE)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """How the skin follows an object that presses on it, and whether its raised parts cast shadows on each other."""
+    """Shape of the skin around an imprint, and shadows that pressed parts of the skin cast on other parts."""
 
-    # m, standard deviation of the Gaussian that smooths the imprint, 0 as in the paper
+    # Standard deviation of the Gaussian that smooths the imprint (m). The default is 0, as in the paper.
     coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)
-    # steps along the way to each light, 0 for no shadows as in the paper
+    # Number of points on the way to each light at which the skin may hide it. The default is 0, no shadows, as in the
+    # paper.
     shadow_steps: int = dataclasses.field(default=0, metadata=NOT_NEGATIVE | STATIC)
-    # m along the gel's face, longest shadow of a raised part. Our choice.
+    # Length of the longest shadow along the gel's face (m). Our choice.
     shadow_reach: Scalar = dataclasses.field(default=0.02, metadata=POSITIVE)
-    # rad, angular height of a light, which is dark where all of it is hidden. Our choice.
+    # Angular height of a light, seen from the skin (rad). A point is in partial shadow if only a part of this height is
+    # visible from it. Our choice.
     penumbra: Scalar = dataclasses.field(default=0.1, metadata=POSITIVE)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Phong:
-    """Reflectance of the skin's inner side."""
+    """Constants of Phong's reflectance model for the skin's inner side."""
 
-    # k_a (paper, supplement "Simulator Details")
+    # Reflectance k_a of ambient light. Source of this and the next three: paper, supplement "Simulator Details".
     ambient: Scalar = dataclasses.field(default=0.8, metadata=NOT_NEGATIVE)
-    diffuse: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)  # k_d (paper, as above)
-    specular: Scalar = dataclasses.field(default=0.5, metadata=NOT_NEGATIVE)  # k_s (paper, as above)
-    shininess: Scalar = dataclasses.field(default=5.0, metadata=POSITIVE)  # alpha (paper, as above)
-    # i_a, per channel. A flat gel is (178, 178, 204) / 255.
+    # Diffuse reflectance k_d.
+    diffuse: Scalar = dataclasses.field(default=1.0, metadata=NOT_NEGATIVE)
+    # Specular reflectance k_s.
+    specular: Scalar = dataclasses.field(default=0.5, metadata=NOT_NEGATIVE)
+    # Exponent alpha of the specular reflection.
+    shininess: Scalar = dataclasses.field(default=5.0, metadata=POSITIVE)
+    # Ambient light i_a in the red, green and blue channel. With the default, a flat gel has the colour
+    # (178, 178, 204) / 255.
     ambient_color: tuple[Scalar, Scalar, Scalar] = dataclasses.field(
         default=(0.8725, 0.8725, 1.0), metadata=NOT_NEGATIVE
     )
-    # m, depth at which the skin is 1/e as bright (paper: a mask, without its shape)
+    # Depth of the imprint at which the skin is 1/e as bright (m). The paper has a darkening mask, but does not give its
+    # shape.
     darkening: Scalar = dataclasses.field(default=0.001, metadata=POSITIVE)
 
 
 def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"]) -> Float[Array, "h w"]:
-    """Smooth an imprint by a Gaussian. Real skin does not follow a sharp edge.
+    """Smooth an imprint with a Gaussian, because real skin does not follow a sharp edge.
 
-    The weights are `exp(-r^2 / (2 length^2))` at the pixels' distances r, divided by their sum over the image, so that
-    a uniform imprint is unchanged, at the border too. Two dense products compute this, exactly for any length.
+    The weight of a pixel at distance r is `exp(-r^2 / (2 length^2))`, divided by the sum of the weights over the image.
+    A uniform imprint is therefore unchanged, also at the border of the image.
 
     Args:
-        depth: of the imprint (m), finite.
-        length: standard deviation (m). 0, or less than a twentieth of a pixel, returns `depth` unchanged.
-        pitch: of a pixel along x and y (m).
+        depth: Depth of the imprint below the gel's undeformed face (m), finite.
+        length: Standard deviation of the Gaussian (m). If it is less than a twentieth of a pixel, the depth is
+            returned unchanged.
+        pitch: Distance between pixels along x and along y (m).
 
     Returns:
         Depth of the skin (m).
@@ -124,35 +139,37 @@ def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"])
 def shadows(
     skin: Skin, lights: Lights | Leds, depth: Float[Array, "h w"], window: Float[Array, "4"]
 ) -> Float[Array, "m h w"]:
-    """Share of each light that reaches each pixel past raised parts of the skin.
+    """Compute the share of each light that is not hidden by other parts of the skin, for each pixel.
 
-    Pressed parts of the skin stand out towards the camera, into the gel through which the light travels. Along the way
-    from a point to a light, the horizon is the steepest rise to the skin there. It hides the lower part of a light
-    whose angular height is `penumbra` and whose lower end has the elevation e over the gel's plane:
+    Pressed parts of the skin stand out into the gel, through which the light travels. They cast shadows on the skin
+    behind them. The share of a light at a point x of the skin is
 
         share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
 
-    A light in the gel's plane, such as the paper's, has e = 0. It lights only flanks, and only the parts of a flank
-    that rise above everything on the way to the light. Flat skin and the tops of pressed parts receive no light from it
-    (L . N = 0), so its shadows are visible only on flanks behind other raised parts. The shadows of a point light in
-    this plane would be endless. With a penumbra, they end where a raised part appears lower than `penumbra`. A flank
-    that faces away from a light is dark because of its normal, whether it is in shadow or not.
+    d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
+    along u. The arctangent is the elevation of the horizon: the largest elevation, above the gel's plane, under which
+    other skin appears from x. The light covers the elevations from e to e + penumbra.
+
+    A light in the gel's plane, as in the paper, has e = 0. Flat skin and the tops of pressed parts receive no light
+    from it, because it is perpendicular to their normals. Its shadows are visible only on slopes behind other pressed
+    parts. They end where these parts appear lower than `penumbra`.
 
     Args:
-        skin: number of steps, reach and penumbra. Steps are short near the point and longer away from it
-            (`t = reach (k / steps)^2`). A part narrower than a step may therefore cast no shadow far away.
-        lights: far or near. Skin behind a near light does not hide it.
-        depth: of the skin below the gel's face (m). Skin beyond the image casts no shadow.
-        window: part of the gel's face in the image, (left, top, width, height) (m).
+        skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the skin at the distance
+            `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a part narrower than a step may cast no shadow
+            there.
+        lights: Far or near lights. Skin behind a near light does not hide it.
+        depth: Depth of the skin below the gel's undeformed face (m). Skin outside the image casts no shadow.
+        window: Part of the gel's face in the image: left, top, width, height (m).
 
     Returns:
-        Shares, 1 where all of the light arrives. Ambient light (`Phong.ambient`) has no shadow.
+        Share of each light, from 0 (hidden) to 1 (fully visible). Ambient light (`Phong.ambient`) has no shadow.
     """
     rows, columns = depth.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     lengths = skin.shadow_reach * (jnp.arange(1, skin.shadow_steps + 1) / max(skin.shadow_steps, 1)) ** 2
     if isinstance(lights, Lights):
-        # The way to a far light is the same everywhere, so the whole image is shifted.
+        # The direction to a far light is the same everywhere, so the whole image is shifted.
         places = geometry.normalize(lights.directions)
         around = jnp.pad(depth, ((rows + 1, rows + 1), (columns + 1, columns + 1)))
 
@@ -194,23 +211,27 @@ def phong(
     points: Float[Array, "*n 3"],
     shares: Float[Array, "m *n"] | None = None,
 ) -> Float[Array, "*n 3"]:
-    """Phong's reflection of the lights by the skin.
+    """Light that the skin reflects to the camera, by Phong's model (paper, equation "phong").
 
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
-    Both products are clipped at 0. V is the optical axis, as for a distant viewer, so that flat skin under far lights
-    is uniform. For a near light at p_m, L_m points to p_m and the intensity is `(reference / |p_m - x|)^falloff i_m`.
+    k_a, i_a, k_d, k_s and alpha are the fields `ambient`, `ambient_color`, `diffuse`, `specular` and `shininess` of
+    `Phong`. N is the normal, L_m the unit vector to light m, and i_m the colour of light m. Both scalar products are
+    clipped at 0. V is the unit vector to the viewer. It is (0, 0, -1) at all points, as for a distant viewer, so that
+    flat skin under far lights is uniform.
+
+    For a near light at the position p_m, the colour is multiplied by `(reference / |p_m - x|)^falloff` at the point x.
     Distances below 0.1 mm count as 0.1 mm.
 
     Args:
-        phong: constants of the skin's reflectance.
-        lights: far (directions need not be of unit length) or near.
-        normals: unit, towards the camera.
-        points: of the skin, sensor frame (m). Far lights do not need them.
-        shares: share of each light that arrives, from `shadows`. Default: 1.
+        phong: Constants of the skin's reflectance.
+        lights: Far or near lights. Directions of far lights may have any length > 0.
+        normals: Unit normals towards the camera.
+        points: Points of the skin in the sensor frame (m). Only near lights use them.
+        shares: Share of each light that reaches each point, from `shadows`. None for no shadows.
 
     Returns:
-        Image, not clipped (paper, equation "phong").
+        Image of the skin, not clipped.
     """
     nx, ny, nz = (normals[..., k] for k in range(3))
     places = geometry.normalize(lights.directions) if isinstance(lights, Lights) else lights.positions
@@ -233,12 +254,12 @@ def phong(
 
 
 def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
-    """Components of a vector divided by its length, and this length, which is at least `_NEAREST`."""
+    """Divide a vector by its length, replaced by `_NEAREST` if smaller. Return the components and the length."""
     square = functools.reduce(operator.add, (p * p for p in parts))
     length = jnp.sqrt(jnp.maximum(square, _NEAREST**2))
     return (*(p / length for p in parts), length)
 
 
 def darken(phong: Phong, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Relative brightness of skin at a depth (m) of the imprint, `exp(-depth / darkening)`."""
+    """Brightness of the skin relative to flat skin, `exp(-depth / phong.darkening)`, at a depth of the imprint (m)."""
     return jnp.exp(-depth / phong.darkening)
