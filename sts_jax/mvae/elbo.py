@@ -298,8 +298,8 @@ def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
     width = 0 if condition is None else condition.shape[-1]
     if width != config.condition:
         raise ValueError(
-            f"condition has width {width}, but the model needs width {config.condition}: give an array (*batch, "
-            f"{config.condition}), or None for width 0"
+            f"condition has width {width}, but the model needs width {config.condition}: give an array of this "
+            "width, or None for width 0"
         )
     if condition is None:
         return z
