@@ -204,8 +204,8 @@ def test_a_condition_reaches_the_decoders():
     ("options", "message"),
     [
         ({"absent": ("sound",)}, "sound"),
-        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "masks are named"),
-        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "masks are named"),
+        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "present or target_present has the names"),
+        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "present or target_present has the names"),
         ({"condition": jnp.ones((BATCH, 2))}, "width 2"),
     ],
 )
@@ -219,11 +219,11 @@ def test_no_input_and_unknown_names_are_errors():
     graphdef, params, stats = mvae.init(jax.random.key(0), VECTORS)
     state = nnx.merge_state(params, stats)
     for inputs in ({}, {"sound": jnp.ones((2, 3))}):
-        with pytest.raises(ValueError, match="Give at least one"):
+        with pytest.raises(ValueError, match="give at least one"):
             mvae.predict(graphdef, state, inputs)
-    with pytest.raises(ValueError, match="targets are named"):
+    with pytest.raises(ValueError, match="targets has the names"):
         gradient(VECTORS, batch(VECTORS), {})
     with pytest.raises(ValueError, match="sound"):
         gradient(VECTORS, batch(VECTORS) | {"sound": jnp.ones((BATCH, 3))}, batch(VECTORS))
-    with pytest.raises(ValueError, match="masks"):
+    with pytest.raises(ValueError, match="present has the names"):
         mvae.infer(graphdef, state, batch(VECTORS), present={"sound": jnp.ones(BATCH, bool)})

@@ -147,10 +147,10 @@ def test_beta_warms_up_over_its_share_of_the_steps():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"absent": ("b",)}, "b is declared absent"),
+        ({"absent": ("b",)}, "absent names 'b'"),
         ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "inputs has"),
         ({"present": {"sound": np.ones(20, bool)}}, "present has masks"),
-        ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "arrays of"),
+        ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "samples have"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(tmp_path, change, message):
@@ -321,11 +321,11 @@ def test_a_state_space_model_memorises_four_samples(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"targets": {"outcome": np.full(4, 2, np.int32)}}, "outcome is int32 from 2 to 2, but the model takes whole"),
+        ({"targets": {"outcome": np.full(4, 2, np.int32)}}, "outcome is int32 from 2 to 2, but the model needs"),
         ({"targets": {"outcome": np.ones(4, np.float32)}}, "outcome is float32"),
-        ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "targets have samples of"),
-        ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "inputs have samples of"),
-        ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"empty needs .* of shape \(16, 16, 3\)"),
+        ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "targets has samples of"),
+        ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "inputs has samples of"),
+        ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"empty has .* of shape \(16, 16, 3\)"),
         ({"present": {"tactile": np.ones(4, bool)}}, r"^present has masks for \['tactile'\]"),
         ({"target_present": {"tactile": np.ones(4, bool)}}, r"target_present has masks for \['tactile'\]"),
         ({"condition": np.ones((4, 3), np.float32)}, "condition has width 3"),

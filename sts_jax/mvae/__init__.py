@@ -1,4 +1,4 @@
-"""A multimodal variational autoencoder with a product of experts, independent of the sensor."""
+"""A multimodal variational autoencoder (MVAE) for named images and vectors, with a product of experts."""
 
 from sts_jax.mvae.convolutions import conv, conv_transpose
 from sts_jax.mvae.elbo import Terms, decode, infer, loss, predict

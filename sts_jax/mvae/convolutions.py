@@ -1,9 +1,11 @@
 """Convolutions and transposed convolutions with gradients that are fast on a CPU.
 
-XLA's CPU backend is slow for convolutions with `lhs_dilation`, which transposed convolutions and the gradients of
-strided convolutions have. The convolutions here avoid it. Stride 1 does not need it, and on small grids a Fourier
-transform replaces most of the products. Arrays are `(batch, height, width, channel)`. Kernels are
-`(size, size, in, out)`, where `size` is a multiple of `stride`.
+XLA's CPU backend is slow for convolutions with `lhs_dilation`. JAX computes transposed convolutions and the gradients
+of strided convolutions in this way. The functions below use matrix products and convolutions without dilation instead.
+For small images and stride 1, a Fourier transform also saves most of the multiplications.
+
+Images have shape `(batch, height, width, channel)`. Kernels have shape `(size, size, in, out)`, and `size` must be a
+multiple of `stride`.
 """
 
 import functools
@@ -14,23 +16,26 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
-_FEW = 16  # channels, below which other forms are faster
-_SMALL = 144  # pixels of the larger image, up to which a dense Fourier transform is faster
+_FEW = 16  # channels. For fewer, `_convolve` is faster with folded pixels, and `_correlate` with a single convolution
+_SMALL = 144  # pixels of the larger image with its padding. Up to this size, a dense Fourier transform is faster
 
 
 def conv(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
-    """Convolution as in neural networks (correlation), `y[i] = sum_a x[stride i + a - padding] kernel[a]`.
+    """Convolve images as neural networks do, without flipping the kernel.
+
+    Along each axis, the output is `y[i] = sum_a x[stride i + a - padding] kernel[a]`, summed over the input channels.
 
     Args:
-        x: the input, zero outside.
-        kernel: `size` is a multiple of `stride`.
-        stride: pixels between two outputs.
-        padding: zeros added on each side, at most `size - 1`.
+        x: Images. Their values outside the image count as 0.
+        kernel: Weights. `size` must be a multiple of `stride`.
+        stride: Distance between neighbouring output pixels (input pixels).
+        padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
 
     Returns:
-        `ho = (h + 2 padding - size) // stride + 1` rows, columns likewise.
+        Images with `ho = (h + 2 padding - size) // stride + 1` rows. The number of columns follows from `w` in the same
+        way.
     """
     height, width = (n + 2 * padding - len(kernel) + 1 for n in x.shape[1:3])
     if stride == 1 and (height + len(kernel) - 1) * (width + len(kernel) - 1) <= _SMALL:
@@ -42,16 +47,19 @@ def conv(
 def conv_transpose(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
-    """The transpose of `conv`: `y[stride i + a - padding] += x[i] kernel[a]`.
+    """Apply the transpose of `conv` to images: each input pixel adds its multiple of the kernel to the output.
+
+    Along each axis, `y[stride i + a - padding] += x[i] kernel[a]`, summed over the input channels.
 
     Args:
-        x: the input.
-        kernel: `size` is a multiple of `stride`, and `in` is the number of channels of `x`.
-        stride: pixels of the output per pixel of the input.
-        padding: rows and columns cut from each side of the output.
+        x: Images.
+        kernel: Weights. `size` must be a multiple of `stride`. The third axis has the channels of `x`, as in `conv`.
+        stride: Distance in the output between the contributions of neighbouring input pixels (output pixels).
+        padding: Number of rows and columns that are cut from each side of the output.
 
     Returns:
-        `ho = stride (h - 1) + size - 2 padding` rows, columns likewise.
+        Images with `ho = stride (h - 1) + size - 2 padding` rows. The number of columns follows from `w` in the same
+        way.
     """
     height, width = (stride * (n - 1) + len(kernel) - 2 * padding for n in x.shape[1:3])
     if stride == 1 and (height + 2 * padding) * (width + 2 * padding) <= _SMALL:
@@ -62,21 +70,22 @@ def conv_transpose(
 
 @functools.cache
 def _fourier(height: int, width: int, size: int, padding: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Real matrices A, B, C that turn a convolution at stride 1 into one product per row.
+    """Real matrices A, B and C that turn a convolution with stride 1 into elementwise products.
 
-    `y = C^T ((A x) (B k))` is the transposed convolution and `x = A^T ((C y) (B k))` the convolution, because the
-    transform has the size of the wide image, `height + size - 1` by `width + size - 1`, and nothing wraps around. A
-    complex product takes three real ones (Gauss), and half of the frequencies suffice for real images. For 5x5 pixels
-    and 4x4 taps, 94 products replace 400.
+    Let x be the smaller image, y the larger image and k the kernel, each as a vector of pixels. The transposed
+    convolution is `y = C^T ((A x) * (B k))`, and the convolution is `x = A^T ((C y) * (B k))`. The matrices are
+    discrete Fourier transforms on a grid of `height + size - 1` by `width + size - 1` points. This grid contains the
+    larger image and its padding, so that no product wraps around. A complex product takes three real products (Gauss),
+    and half of the frequencies suffice for real images. For 5x5 pixels and a kernel of 4x4, 94 products replace 400.
 
     Args:
-        height: of the narrow image.
-        width: of the narrow image.
-        size: of the kernel.
-        padding: rows and columns that the wide image lacks on each side.
+        height: Height of the smaller image.
+        width: Width of the smaller image.
+        size: Side of the kernel.
+        padding: Rows and columns of the grid on each side of the larger image.
 
     Returns:
-        A for the narrow image, B for the kernel, C for the wide image, with a row per product and a column per pixel.
+        A, B and C. Each matrix has a row for every product, and a column for every pixel of its image or kernel.
     """
     n, m = height + size - 1, width + size - 1
     u, v = np.divmod(np.arange(n * m), m)
@@ -100,9 +109,9 @@ def _fourier(height: int, width: int, size: int, padding: int) -> tuple[np.ndarr
 
 
 def _bilinear(x: Array, kernel: Array, image: np.ndarray, taps: np.ndarray, back: np.ndarray) -> Array:
-    """`back^T ((image x) (taps kernel))` with the pixels on one axis, `(batch, pixel, out)`."""
+    """Compute `back^T ((image x) * (taps kernel))` with the matrices of `_fourier`, as `(batch, pixel, out)`."""
     batch, h, w, channels = x.shape
-    # With rows first, the factors of every product and of its derivatives are matrices as they lie in memory.
+    # With the rows of the transform on the first axis, all products and their derivatives multiply contiguous matrices.
     spectrum = jnp.asarray(image, x.dtype) @ x.reshape(batch, h * w, channels).swapaxes(0, 1).reshape(h * w, -1)
     weights = jnp.asarray(taps, x.dtype) @ kernel.reshape(taps.shape[1], -1)
     y = jnp.matmul(spectrum.reshape(-1, batch, channels), weights.reshape(-1, channels, kernel.shape[3]))
@@ -121,7 +130,7 @@ def _conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> Array
 
 
 def _convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """`conv`. With few channels, folding each block of `stride` x `stride` pixels into one pixel first is faster."""
+    """`conv` without a Fourier transform. Images with few channels are folded first, which is faster."""
     if stride > 1 and x.shape[3] < _FEW:
         size = kernel.shape[0]
         counts = [(n + 2 * padding - size) // stride + size // stride for n in x.shape[1:3]]
@@ -131,7 +140,7 @@ def _convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
 
 
 def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, width: int) -> Array:
-    """`conv_transpose`, cropped or padded with zeros to the given size."""
+    """`conv_transpose` without a Fourier transform, cropped or padded with zeros to `height` x `width` pixels."""
     size, _, _, out = kernel.shape
     if stride == 1:
         pads = [(size - 1 - padding, n - m + padding) for n, m in ((height, x.shape[1]), (width, x.shape[2]))]
@@ -139,7 +148,8 @@ def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, wid
         return jax.lax.conv_general_dilated(x, turned, (1, 1), pads, dimension_numbers=_LAYOUT)
     batch, h, w, _ = x.shape
     taps = size // stride
-    # One small convolution computes all phases, which are then interleaved.
+    # Output pixels with the same indices modulo `stride` form a phase. One small convolution computes all phases as
+    # channels, which the transposition interleaves.
     phases = _fold_kernel(kernel.swapaxes(2, 3), stride).swapaxes(2, 3)[::-1, ::-1]
     y = jax.lax.conv_general_dilated(x, phases, (1, 1), [(taps - 1, taps - 1)] * 2, dimension_numbers=_LAYOUT)
     y = y.reshape(*y.shape[:3], stride, stride, out).transpose(0, 1, 3, 2, 4, 5)
@@ -148,7 +158,10 @@ def _spread(x: Array, kernel: Array, stride: int, padding: int, height: int, wid
 
 
 def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int) -> Array:
-    """`k[a, A, B] = sum_i wide[stride i + a - padding, A] narrow[i, B]`, the kernel's gradient in both functions."""
+    """Gradient by the kernel, `k[a, A, B] = sum_i wide[stride i + a - padding, A] narrow[i, B]`.
+
+    `wide` is the larger and `narrow` the smaller image. A and B are their channels.
+    """
     _, h, w, channels = narrow.shape
     if stride > 1:
         counts = [h + size // stride - 1, w + size // stride - 1]
@@ -156,7 +169,7 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
         return _unfold_kernel(folded, stride)
     wide = _cut(wide, -padding, h + size - 1, w + size - 1)
     if size > 2 or wide.shape[3] < _FEW:
-        sums = ("CHWN", "IHWO", "HWNC")  # sum over the batch, in the place of the channels
+        sums = ("CHWN", "IHWO", "HWNC")  # the batch is in the place of the channels, because the sum is over the batch
         return jax.lax.conv_general_dilated(wide, narrow, (1, 1), "VALID", dimension_numbers=sums)
     flat = narrow.reshape(-1, channels)
     taps = [wide[:, a : a + h, b : b + w].reshape(len(flat), -1) for a in range(size) for b in range(size)]
@@ -165,7 +178,7 @@ def _correlate(wide: Array, narrow: Array, size: int, stride: int, padding: int)
 
 
 def _cut(x: Array, start: int, height: int, width: int) -> Array:
-    """Rows and columns from `start` on, zero outside the array."""
+    """Cut `height` x `width` pixels, beginning at row and column `start`. Pixels outside the image are 0."""
     before = max(-start, 0)
     after = [max(start + n - m, 0) for n, m in ((height, x.shape[1]), (width, x.shape[2]))]
     x = jnp.pad(x, ((0, 0), (before, after[0]), (before, after[1]), (0, 0)))
@@ -174,14 +187,18 @@ def _cut(x: Array, start: int, height: int, width: int) -> Array:
 
 
 def _fold(x: Array, stride: int, padding: int, counts: list[int]) -> Array:
-    """Turn `counts` blocks of `stride` x `stride` pixels into pixels, and the phases into channels."""
+    """Turn each block of `stride` x `stride` pixels into one pixel with more channels.
+
+    `counts` is the number of blocks along the height and the width. The first block begins `padding` pixels before the
+    image.
+    """
     h, w = counts
     x = _cut(x, -padding, stride * h, stride * w).reshape(len(x), h, stride, w, stride, -1)
     return x.transpose(0, 1, 3, 2, 4, 5).reshape(len(x), h, w, -1)
 
 
 def _fold_kernel(kernel: Array, stride: int) -> Array:
-    """The kernel that has the same result on folded pixels as `kernel` with `stride`."""
+    """The kernel that has the same result on folded images with stride 1 as `kernel` on images with `stride`."""
     size, _, channels, out = kernel.shape
     taps = size // stride
     kernel = kernel.reshape(taps, stride, taps, stride, channels, out).transpose(0, 2, 1, 3, 4, 5)

@@ -1,15 +1,21 @@
-"""The time-lagged evidence lower bound over all subsets of the modalities, and prediction.
+"""The training loss of the MVAE, a time-lagged evidence lower bound over subsets of the modalities, and predictions.
 
-`L(x_t, x_T) = sum_{X} [ sum_{m in asked(X)} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
-is minimised, where `X` runs over the non-empty subsets (paper, "Learning Intuitive Physics with MVAEs") and predicts
-the modalities `asked(X)`. `E_m` is the binary cross-entropy with logits of an image, summed over pixels and
-channels, or the mean squared error of a vector's components. The loss is averaged over the batch and summed over the
-subsets. One draw of `z` estimates the expectation.
+The model sees inputs `x_t` at the time t and predicts targets `x_T` at a later time T. Training minimises
 
-A subset is empty for a sample if none of its modalities is present in the sample. It is then left out for this sample.
-(Its posterior would be the prior, and decoders that predict the target from a random `z` learn to answer every `z` with
-a share of the mean target.) A sample without any input keeps all subsets, because the mean target is then the right
-prediction.
+`L(x_t, x_T) = sum_X [ sum_{m in asked(X)} lambda_m E_{q(z | X_t)} E_m(x_T, z) + beta KL(q(z | X_t) || N(0, I)) ]`
+
+(paper, "Learning Intuitive Physics with MVAEs"), averaged over the batch.
+
+- `X` runs over the non-empty subsets of the modalities, and `X_t` are the inputs of these modalities.
+- `asked(X)` are the modalities that the subset has to predict.
+- `q(z | X_t)` is the posterior of the latent `z`, a product of experts. One sample of `z` estimates the expectation.
+- `E_m` is the error of the prediction of modality m: the binary cross-entropy of an image (nats, summed over pixels and
+  channels), or the mean squared error of the components of a vector. `lambda_m` is `Modality.weight`.
+- `beta` weights the divergence.
+
+If a sample has no input of a subset, the subset does not count for this sample. Its posterior would be the prior.
+Decoders that have to predict the target from a random `z` learn to mix the mean target into every prediction. A sample
+without any input keeps all subsets, because the mean target is then the right prediction.
 """
 
 from typing import Literal, NamedTuple
@@ -24,22 +30,23 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 
 
 class Terms(NamedTuple):
-    """The loss, and its unweighted parts as means over the batch and over the subsets that count."""
+    """The loss of a batch and its parts. The parts are unweighted means over all samples and subsets that count."""
 
-    loss: Float[Array, ""]
-    kl: Float[Array, ""]  # nats
-    reconstruction: dict[str, Float[Array, ""]]  # nats per image, mean squared error per vector
+    loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch
+    kl: Float[Array, ""]  # divergence from the prior (nats)
+    reconstruction: dict[str, Float[Array, ""]]  # error by modality: nats per image, or mean squared error of a vector
 
 
 class _Group(NamedTuple):
-    """Subsets that are equal without the absent modalities."""
+    """Subsets that have the same members after the absent modalities are removed."""
 
     members: int  # bit m is set if modality m is a member
-    subsets: int
+    subsets: int  # number of these subsets
     asked: tuple[int, ...]  # for each modality, the number of subsets that predict it
 
 
 def _groups(config: Config, asked: Literal["all", "own"], absent: tuple[str, ...], *, empty: bool) -> list[_Group]:
+    """Group the subsets. The group without members is kept if `empty` is True or all modalities are absent."""
     count = len(config.modalities)
     kept = sum(1 << i for i, name in enumerate(config.names) if name not in absent)
     groups: dict[int, _Group] = {}
@@ -67,32 +74,40 @@ def loss(
     asked: Literal["all", "own"] = "all",
     absent: tuple[str, ...] = (),
 ) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
-    """The negative bound of one batch (module docstring), in training mode.
+    """Compute the loss of one batch in training mode, see the docstring of the module.
 
-    Each modality is encoded once. Subsets that are equal without the `absent` modalities are computed once and
-    weighted by their number, so `absent` changes the time and not the loss. In each sample, a subset is reduced to its
-    modalities that are present. All subsets are decoded in one stacked call and share batch statistics, weighted like
-    the subsets. The noise of a sample depends on the modalities that remain of a subset, so that equal subsets draw the
-    same `z`.
+    Each modality is encoded once. Subsets that are equal after the `absent` modalities are removed are computed once
+    and weighted by their number. Naming a modality in `absent` therefore gives the same loss as masking it in every
+    sample, in less time. All subsets are decoded in one stacked call and share batch statistics, in which each subset
+    has the weight that it has in the loss. Subsets that have the same present modalities in a sample use the same noise
+    for `z`.
 
     Args:
-        graphdef: definition of the model.
-        params: parameters.
-        stats: running batch statistics.
-        key: consumed for the noise of `z`.
-        inputs: `x_t` by name, `(batch, *shape)`, images in [0, 1]. A missing input counts as `absent`.
-        targets: `x_T` by name, all of them.
-        present: which samples have an input, by name. Without a mask all have it. Masked values have no influence, even
-            NaN.
-        target_present: the same for the targets. A missing target adds nothing to the sum, and the mean is still taken
+        graphdef: Definition of the model, from `init`.
+        params: Parameters of the model.
+        stats: Running batch statistics of the model.
+        key: Random key for the noise of `z`.
+        inputs: Inputs `x_t` by modality, `(batch, *shape)`. Images are in [0, 1]. A modality without an input counts as
+            absent.
+        targets: Targets `x_T` of all modalities, `(batch, *shape)`. Images are in [0, 1].
+        present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
+            a mask is present in all samples. Masked values have no influence and may be NaN.
+        target_present: Masks of the targets in the same form. A masked target adds 0 to the loss, which remains a mean
             over the whole batch.
-        condition: `(batch, condition)`, required if the model has one.
-        beta: weight of the divergence.
-        asked: `all`: every subset predicts every target. `own`: each subset predicts its own modalities (paper's code).
-        absent: names of modalities that are present in no sample.
+        condition: Numbers that are appended to the latent of each sample, `(batch, condition)`. None if
+            `config.condition` is 0.
+        beta: Weight of the divergence.
+        asked: Targets of a subset: `all` for all modalities, `own` for the members of the subset, as in the paper's
+            code.
+        absent: Names of modalities that no sample has as an input.
 
     Returns:
-        The loss, and the pair of the new batch statistics (same structure) and the parts of the loss.
+        The loss, and a pair: the new running batch statistics, with the structure of `stats`, and the parts of the
+        loss.
+
+    Raises:
+        ValueError: A name or `asked` is unknown, a target is missing, or `condition` has another width than the model
+            needs.
     """
     model = nnx.merge(graphdef, params, stats, copy=True)
     config = model.config
@@ -136,27 +151,27 @@ def infer(
     *,
     present: dict[str, Bool[Array, "batch"]] | None = None,
 ) -> Gaussian:
-    """The fused posterior `q(z | X)` with the running batch statistics.
+    """Compute the posterior `q(z | X)` of the latent from any subset X of the inputs, in evaluation mode.
 
     Args:
-        graphdef: definition of the model.
-        state: parameters and statistics, `nnx.merge_state(params, stats)`.
-        inputs: at least one modality by name, `(batch, *shape)`, images in [0, 1].
-        present: which samples have an input, by name. Without a mask all have it. A sample without inputs has the
-            prior.
+        graphdef: Definition of the model, from `init`.
+        state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
+        inputs: Inputs by modality, at least one, `(batch, *shape)`. Images are in [0, 1].
+        present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
+            a mask is present in all samples.
 
     Returns:
-        Mean and log variance, `(batch, latent)`.
+        Mean and log variance of the posterior, `(batch, latent)`. For a sample without any input, it is the prior.
 
     Raises:
-        ValueError: there is no input, or a name is unknown.
+        ValueError: `inputs` is empty, or a name is not the name of a modality.
     """
     model = nnx.merge(graphdef, state)
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
         raise ValueError(
-            f"inputs are named {list(inputs)} and masks {list(present or {})}. Give at least one input, with "
-            f"names from {list(model.config.names)}"
+            f"inputs has the names {list(inputs)} and present has the names {list(present or {})}, but the model has "
+            f"the modalities {list(model.config.names)}: give at least one input, and use only these names"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
@@ -170,16 +185,20 @@ def decode(
     *,
     condition: Float[Array, "*batch condition"] | None = None,
 ) -> dict[str, Array]:
-    """Decode every modality from a latent, with the running batch statistics.
+    """Decode every modality from a latent, in evaluation mode.
 
     Args:
-        graphdef: definition of the model.
-        state: parameters and statistics, `nnx.merge_state(params, stats)`.
-        z: latent, with any leading axes.
-        condition: with the same leading axes, required if the model has one.
+        graphdef: Definition of the model, from `init`.
+        state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
+        z: Latents, `(*batch, latent)`.
+        condition: Numbers that are appended to each latent, `(*batch, condition)`. None if `config.condition` is 0.
 
     Returns:
-        By name: logits of images (`jax.nn.sigmoid` gives the image) and values of vectors, `(*batch, *shape)`.
+        The predictions by modality, `(*batch, *shape)`. An image is given by logits: `jax.nn.sigmoid` returns values in
+        [0, 1].
+
+    Raises:
+        ValueError: `condition` has another width than the model needs.
     """
     model = nnx.merge(graphdef, state)
     z = _with_condition(model.config, z, condition)
@@ -195,7 +214,23 @@ def predict(
     present: dict[str, Bool[Array, "batch"]] | None = None,
     condition: Float[Array, "batch condition"] | None = None,
 ) -> tuple[dict[str, Array], Gaussian]:
-    """Predict from any subset of the inputs, by `decode` of the mean of `infer`. The arguments are those of both."""
+    """Predict every modality from any subset of the inputs: decode the mean of the posterior.
+
+    Args:
+        graphdef: Definition of the model, from `init`.
+        state: Parameters and running batch statistics, `nnx.merge_state(params, stats)`.
+        inputs: Inputs by modality, at least one, `(batch, *shape)`. Images are in [0, 1].
+        present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
+            a mask is present in all samples.
+        condition: Numbers that are appended to each latent, `(batch, condition)`. None if `config.condition` is 0.
+
+    Returns:
+        The predictions by modality, as from `decode`, and the posterior, as from `infer`.
+
+    Raises:
+        ValueError: `inputs` is empty, a name is not the name of a modality, or `condition` has another width than the
+            model needs.
+    """
     posterior = infer(graphdef, state, inputs, present=present)
     return decode(graphdef, state, posterior.mean, condition=condition), posterior
 
@@ -206,16 +241,22 @@ def _check(
     if asked not in ("all", "own"):
         raise ValueError(f"asked is {asked!r}, but it must be 'all' or 'own'")
     if set(absent) - set(config.names):
-        raise ValueError(f"absent is {absent}, but the model has only {config.names}")
+        raise ValueError(f"absent is {absent}, but the model has the modalities {config.names}: use only these names")
     unknown = sorted(set(given) - set(config.names))
     if unknown:
-        raise ValueError(f"inputs or masks are named {unknown}, but the model has only {config.names}")
+        raise ValueError(
+            f"inputs, present or target_present has the names {unknown}, but the model has the modalities "
+            f"{config.names}: use only these names"
+        )
     if set(targets) != set(config.names):
-        raise ValueError(f"targets are named {sorted(targets)}, but the model needs {sorted(config.names)}")
+        raise ValueError(
+            f"targets has the names {sorted(targets)}, but the loss needs a target of every modality: "
+            f"{sorted(config.names)}"
+        )
 
 
 def _over(mask: Array, like: Array) -> Array:
-    """A mask over the batch with as many axes as `like`."""
+    """Append axes to a mask over the batch, so that it broadcasts with the array `like`."""
     return mask.reshape(-1, *(1,) * (like.ndim - 1))
 
 
@@ -228,7 +269,7 @@ def _experts(
     *,
     training: bool,
 ) -> tuple[Gaussian, Array]:
-    """All experts, `(modality, batch, latent)`, and the mask of those that are present, `(modality, batch)`."""
+    """The experts of all modalities, `(modality, batch, latent)`, and the mask of the present ones."""
     nothing = jnp.zeros((batch, model.config.latent), jnp.float32)
     experts, masks = [], []
     for name in model.config.names:
@@ -244,7 +285,7 @@ def _experts(
 
 
 def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[int, ...]) -> Array:
-    """Standard normal noise `(group, batch, latent)`, a function of the modalities that remain in each sample."""
+    """Standard normal noise `(group, batch, latent)`, equal for groups with the same present modalities in a sample."""
     possible = sorted({part for g in groups for part in range(g.members + 1) if part & g.members == part})
     drawn = jnp.stack([jax.random.normal(jax.random.fold_in(key, p), shape[1:]) for p in possible])
     place = jnp.zeros(possible[-1] + 1, jnp.int32).at[jnp.array(possible)].set(jnp.arange(len(possible)))
@@ -256,14 +297,17 @@ def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[in
 def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
     width = 0 if condition is None else condition.shape[-1]
     if width != config.condition:
-        raise ValueError(f"condition has width {width}, but the model needs {config.condition}")
+        raise ValueError(
+            f"condition has width {width}, but the model needs width {config.condition}: give an array of this "
+            "width, or None for width 0"
+        )
     if condition is None:
         return z
     return jnp.concatenate([z, jnp.broadcast_to(condition, (*z.shape[:-1], width))], axis=-1)
 
 
 def _error(modality: Modality, output: Array, target: Array) -> Array:
-    """Reconstruction error of each item of the leading axes."""
+    """The error `E_m` of each item (module docstring). The leading axes remain."""
     if modality.kind == "image":
         error = jax.nn.softplus(output) - output * target
         return jnp.sum(error, axis=(-3, -2, -1))

@@ -1,4 +1,4 @@
-"""Diagonal Gaussians: the product of experts with the prior, and the divergence from the prior."""
+"""Gaussians with independent components: the product of experts, and the divergence from the standard normal prior."""
 
 from typing import NamedTuple
 
@@ -16,15 +16,17 @@ class Gaussian(NamedTuple):
 def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"]) -> Gaussian:
     """The normalised product of the standard normal prior and of every expert that is present.
 
-    `q(z | X) = N(0, I) prod_{m in X} N(mean_m, var_m) / Z`. With the precisions `T_m = 1 / var_m`,
-    `var = 1 / (1 + sum_m T_m)` and `mean = var sum_m T_m mean_m`. Without any expert it is the prior.
+    For the set X of the present experts, `q(z | X) = N(z; 0, I) prod_{m in X} N(z; mean_m, var_m) / Z`, where Z
+    normalises the product. With the precisions `T_m = 1 / var_m`, its variance is `var = 1 / (1 + sum_m T_m)`, and its
+    mean is `var sum_m T_m mean_m`. Without any expert, the product is the prior.
 
     Args:
-        experts: mean and log variance, `(modality, *batch, latent)`. Absent ones may hold any finite numbers.
-        present: which experts count, `(modality, *batch)`.
+        experts: Mean and log variance of each expert, `(modality, *batch, latent)`. Absent experts may have any finite
+            values.
+        present: True for each expert that is present, `(modality, *batch)`.
 
     Returns:
-        The product, `(*batch, latent)`.
+        Mean and log variance of the product, `(*batch, latent)`.
 
     Source: the paper's equation for PoE, and Wu and Goodman 2018, section 2.2.
     """
@@ -34,5 +36,14 @@ def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"
 
 
 def kl_standard_normal(g: Gaussian) -> Float[Array, "*batch"]:
-    """Divergence from the prior in nats, `KL(g || N(0, I)) = sum(mean^2 + var - 1 - log var) / 2`."""
+    """Kullback-Leibler divergence of a Gaussian from the standard normal prior (nats).
+
+    `KL(g || N(0, I)) = sum(mean^2 + var - 1 - log var) / 2`, summed over the latent components.
+
+    Args:
+        g: Mean and log variance, `(*batch, latent)`.
+
+    Returns:
+        The divergence of each item, `(*batch,)`.
+    """
     return 0.5 * jnp.sum(g.mean**2 + jnp.exp(g.log_var) - 1 - g.log_var, axis=-1)

@@ -1,12 +1,12 @@
 """The paper's encoders and decoders as Flax NNX modules.
 
-They are used functionally. `init` splits a model once into its definition, parameters and batch statistics, and
+The modules are used functionally. `init` splits a model once into its definition, parameters and batch statistics, and
 `flax.nnx.merge(graphdef, params, stats, copy=True)` assembles it again inside `jax.jit`.
 
-Images are `(batch, height, width, channel)`, in [0, 1] at the input and logits at the output. Vectors are
-`(batch, size)` at both.
+Images have shape `(batch, height, width, channel)`. An encoder takes values in [0, 1], and a decoder returns logits.
+Vectors have shape `(batch, size)`.
 
-Source: the paper's supplement, "Network Architecture". Hidden widths are Wu and Goodman's (2018).
+Source: the paper's supplement, "Network Architecture". The hidden widths are those of Wu and Goodman (2018).
 """
 
 import itertools
@@ -25,25 +25,29 @@ from sts_jax.mvae.gaussian import Gaussian
 
 _SIZE = 4  # side of every kernel
 _LAYERS = ((2, 1), (2, 1), (2, 1), (1, 0))  # stride and padding of the encoder, reversed in the decoder
-_EPSILON = 1e-5  # added to a variance
+_EPSILON = 1e-5  # added to the variance in batch normalisation
 _LOG_VAR_LIMIT = 8.0  # an encoder's variances lie within exp(-8) .. exp(8)
 # Only a few latents are active at initialisation, with little noise. The others start near the prior and can grow. If
 # all were active, the divergence (hundreds of nats) would outweigh the information of an image. If the noise were as
 # wide as the prior, a decoder would learn to ignore the latent. Both collapse the posterior before anything is learnt.
 _ACTIVE = 16  # active latents at initialisation
-_QUIET = 0.03  # kernels of the other latents, relative to those of an active one
-_FIRST_LOG_VAR = -4.0  # of an active latent at initialisation
+_QUIET = 0.03  # scale of the other latents' kernels at initialisation, relative to an active latent
+_FIRST_LOG_VAR = -4.0  # log variance of an active latent at initialisation
 
 
 @dataclass(frozen=True)
 class Modality:
-    """One quantity that is measured and predicted."""
+    """One quantity that is measured and predicted.
+
+    Raises:
+        ValueError: `kind` and `shape` do not fit together, or `start` is not between 0 and 1.
+    """
 
     name: str
     kind: Literal["image", "vector"]
-    shape: tuple[int, ...]  # (height, width, channel), sides >= 32 and multiples of 8, or (size,)
-    weight: float = 1.0  # lambda of its reconstruction (paper: 1 for images, 1000 for the pose)
-    start: float = 0.5  # grey value of an untrained image decoder. The background's saves many steps.
+    shape: tuple[int, ...]  # (height, width, channel), with sides >= 32 that are multiples of 8, or (size,)
+    weight: float = 1.0  # weight lambda of the reconstruction error (paper: 1 for images, 1000 for the pose)
+    start: float = 0.5  # grey value of the images of an untrained decoder. The background's value saves many steps
 
     def __post_init__(self) -> None:
         if not 0 < self.start < 1:
@@ -53,33 +57,41 @@ class Modality:
         if self.kind == "image" and len(self.shape) == 3:
             if all(side >= 32 and side % 8 == 0 for side in self.shape[:2]):
                 return
-            raise ValueError(f"{self.name}: image of {self.shape[:2]}, but sides must be multiples of 8 and >= 32")
+            raise ValueError(
+                f"{self.name}: shape is {self.shape}, but the height and the width of an image must be multiples of 8 "
+                "and >= 32"
+            )
         raise ValueError(
-            f"{self.name}: a {self.kind!r} of shape {self.shape}, but it must be an image (h, w, c) or a vector (n,)"
+            f"{self.name}: kind is {self.kind!r} and shape is {self.shape}, but it must be an 'image' of shape "
+            "(height, width, channel), or a 'vector' of shape (size,)"
         )
 
 
 @dataclass(frozen=True)
 class Config:
-    """Configuration of a model, in plain values that JSON can hold."""
+    """Configuration of a model, in plain values that JSON can hold.
+
+    Raises:
+        ValueError: There is no modality, two modalities have the same name, or `widths` has not four numbers.
+    """
 
     modalities: tuple[Modality, ...]
-    latent: int = 256  # paper
+    latent: int = 256  # components of the latent (paper)
     hidden: int = 512  # width between two fully connected layers (not in the paper)
-    widths: tuple[int, ...] = (32, 64, 128, 256)  # paper
-    condition: int = 0  # width of the condition, concatenated to the latent, 0 for none
-    momentum: float = 0.9  # of the running batch statistics, per step
+    widths: tuple[int, ...] = (32, 64, 128, 256)  # channels after each convolution of an image encoder (paper)
+    condition: int = 0  # width of the condition, which is appended to the latent, 0 for none
+    momentum: float = 0.9  # weight of the old values in the running batch statistics, per step
 
     def __post_init__(self) -> None:
         names = [m.name for m in self.modalities]
         if not names or len(set(names)) != len(names):
-            raise ValueError(f"modalities are named {names}. Give at least one, and each name once")
+            raise ValueError(f"modalities has the names {names}: give at least one modality, and each name once")
         if len(self.widths) != len(_LAYERS):
             raise ValueError(f"widths is {self.widths}, but it must have {len(_LAYERS)} numbers, one per convolution")
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the modalities, in order."""
+        """The names of the modalities, in the order of `modalities`."""
         return tuple(m.name for m in self.modalities)
 
     def to_json(self) -> dict[str, Any]:
@@ -88,7 +100,7 @@ class Config:
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
-        """The inverse of `to_json`, also for values read from a JSON file."""
+        """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
         modalities = tuple(Modality(**{**m, "shape": tuple(m["shape"])}) for m in values["modalities"])
         return cls(**{**values, "modalities": modalities, "widths": tuple(values["widths"])})
 
@@ -103,7 +115,7 @@ class _Linear(nnx.Module):
 
 
 class _ToLatent(_Linear):
-    """An encoder's last layer: mean and log variance of each latent."""
+    """The last layer of an encoder. It returns the mean and the log variance of each latent."""
 
     def __init__(self, config: Config) -> None:
         super().__init__(config.hidden, 2 * config.latent)
@@ -113,7 +125,7 @@ class _ToLatent(_Linear):
 
 
 class _FromLatent(_Linear):
-    """A decoder's first layer, from the latent followed by the condition."""
+    """The first layer of a decoder. Its input is the latent followed by the condition."""
 
     def __init__(self, config: Config, size: int) -> None:
         super().__init__(config.latent + config.condition, size)
@@ -127,9 +139,14 @@ class _FromLatent(_Linear):
 class BatchNorm(nnx.Module):
     """Batch normalisation with a weight per sample.
 
-    Training uses `mean = sum_n w_n mean_hw(x_n) / sum_n w_n` and the variance likewise, and updates the running
-    statistics to `momentum old + (1 - momentum) new`. If no sample has weight, these are used and stay unchanged.
-    Evaluation (`weights=None`) uses the running statistics.
+    In training, the mean of a channel is `sum_n w_n mean_hw(x_n) / sum_n w_n`, where `w_n` is the weight of sample n
+    and `mean_hw` is the mean over its pixels. The variance is computed in the same way. The running statistics become
+    `momentum old + (1 - momentum) new`. If all weights are 0, the running statistics are used and stay unchanged.
+    Evaluation (`weights=None`) always uses the running statistics.
+
+    Args:
+        channels: Number of channels.
+        momentum: Weight of the old values in the running statistics, from 0 to 1.
     """
 
     def __init__(self, channels: int, *, momentum: float) -> None:
@@ -142,7 +159,16 @@ class BatchNorm(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch h w channel"], weights: Float[Array, "batch"] | None
     ) -> Float[Array, "batch h w channel"]:
-        """Normalise. With `weights`, use the statistics of this batch and update the running ones."""
+        """Normalise images channel by channel.
+
+        Args:
+            x: Images.
+            weights: Weight of each sample in the statistics of this batch, which also update the running statistics.
+                None normalises by the running statistics.
+
+        Returns:
+            Normalised images, scaled and shifted by the learnt parameters.
+        """
         mean, var = self.mean[...], self.var[...]
         if weights is not None:
             total = jnp.sum(weights)
@@ -159,7 +185,7 @@ class BatchNorm(nnx.Module):
 
 
 class _ImageEncoder(nnx.Module):
-    """Four convolutions (with batch normalisation and Swish), then two fully connected layers."""
+    """Four convolutions, each with batch normalisation and Swish, then two fully connected layers."""
 
     def __init__(self, modality: Modality, config: Config) -> None:
         channels = (modality.shape[2], *config.widths)
@@ -180,7 +206,7 @@ class _ImageEncoder(nnx.Module):
 
 
 class _ImageDecoder(nnx.Module):
-    """A fully connected layer, then four transposed convolutions, of which the last is linear and gives logits."""
+    """A fully connected layer, then four transposed convolutions. The last of them is linear and returns logits."""
 
     def __init__(self, modality: Modality, config: Config) -> None:
         channels = (*config.widths[::-1], modality.shape[2])
@@ -193,7 +219,7 @@ class _ImageDecoder(nnx.Module):
             ]
         )
         self.norms = nnx.List([BatchNorm(c, momentum=config.momentum) for c in channels[1:-1]])
-        # so that the output of an untrained decoder is `start` nearly everywhere
+        # The small last kernel and the bias make the output of an untrained decoder `start` nearly everywhere.
         self.kernels[-1][...] *= 0.1
         self.bias = nnx.Param(jnp.full(channels[-1], math.log(modality.start / (1 - modality.start)), jnp.float32))
 
@@ -231,10 +257,7 @@ class _VectorDecoder(nnx.Module):
 
 
 class MVAE(nnx.Module):
-    """One encoder and one decoder per modality.
-
-    `encode` and `decode` take a weight per sample for the batch statistics, or `None` for evaluation.
-    """
+    """A multimodal variational autoencoder with one encoder and one decoder for each modality."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -244,20 +267,46 @@ class MVAE(nnx.Module):
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
 
     def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
-        """The expert of one modality, `(batch, latent)`."""
+        """Compute the expert of one modality, a Gaussian over the latent.
+
+        Args:
+            name: Name of the modality.
+            x: Images in [0, 1] or vectors, `(batch, *shape)`.
+            weights: Weight of each sample in the batch statistics, `(batch,)`. None selects evaluation mode.
+
+        Returns:
+            Mean and log variance, `(batch, latent)`.
+        """
         return self.encoders[name](x, weights)
 
     def decode(self, name: str, z: Array, weights: Array | None) -> Array:
-        """Logits of an image, or a vector, from the latent followed by the condition."""
+        """Predict one modality from latents.
+
+        Args:
+            name: Name of the modality.
+            z: Latents, each followed by the condition if the model has one, `(batch, latent + condition)`.
+            weights: Weight of each sample in the batch statistics, `(batch,)`. None selects evaluation mode.
+
+        Returns:
+            Logits of images, or vectors, `(batch, *shape)`.
+        """
         return self.decoders[name](z, weights)
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
-    """Create a model, `(graphdef, params, stats)`, and consume `key`.
+    """Create a model with random parameters.
 
-    Kernels are normal with variance `1 / fan_in`, biases 0, scales 1. All kernels are drawn in one call, because each
-    shape of a draw needs a compilation.
+    Kernels are normally distributed with variance `1 / fan_in`, and smaller for the inactive latents and the last layer
+    of an image decoder. Biases of hidden layers are 0 and scales are 1.
+
+    Args:
+        key: Random key for the kernels.
+        config: Configuration of the model.
+
+    Returns:
+        The definition `graphdef`, the parameters `params` and the running batch statistics `stats`.
     """
+    # All kernels are drawn in one call, because every shape of a draw would need a compilation of its own.
     graphdef, params, stats = nnx.split(MVAE(config), nnx.Param, nnx.BatchStat)
     leaves, tree = jax.tree.flatten(params)
     noise = np.cumsum([0] + [x.size if x.ndim > 1 else 0 for x in leaves])
@@ -272,11 +321,12 @@ def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.Sta
 
 
 def _core(modality: Modality) -> tuple[int, int]:
+    """Height and width of the feature map between the convolutions and the fully connected layers."""
     return modality.shape[0] // 8 - 3, modality.shape[1] // 8 - 3
 
 
 def _spread(shape: tuple[int, ...], fan_in: int) -> Array:
-    """The standard deviation of a kernel, in its place until `init` draws it."""
+    """A kernel whose entries are their standard deviation. `init` multiplies them by standard normal numbers."""
     return jnp.full(shape, 1 / math.sqrt(fan_in), jnp.float32)
 
 

@@ -1,4 +1,4 @@
-"""A multimodal state-space model: from any subset of vision, touch and pose to the final pose and both streams."""
+"""A state-space model that predicts final poses and images from any subset of vision, touch and pose."""
 
 from sts_jax.statespace.calibration import Calibration
 from sts_jax.statespace.calibration import fit as fit_calibration

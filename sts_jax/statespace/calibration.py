@@ -1,10 +1,12 @@
-"""Calibration of the predicted density on trajectories that the training did not see.
+"""Calibration of the predicted density of the final pose on trajectories that the training did not see.
 
-The density of the final pose is learnt on training objects, whose state the encoders estimate better than that of other
-objects. For other objects it is too narrow, by an amount that depends on the inputs. Three numbers for each subset of
-the inputs correct this: a power of the outcomes' probabilities, a power of the mixture's weights, and a factor of the
-variances. They are temperatures in the sense of Guo et al. (2017), On calibration of modern neural networks. They can
-only widen the density: the likelihood of a few objects often asks for a narrower one, which then covers too little.
+The encoders estimate the states of training objects better than the states of other objects. The transition learns its
+density from training objects, and this density is too narrow for other objects. The error depends on the inputs.
+
+Three numbers for each subset of the inputs correct the density: a power of the probabilities of the outcomes, a power
+of the weights of the mixture, and a factor of the variances. They are temperatures in the sense of Guo et al. (2017),
+"On Calibration of Modern Neural Networks". They can only widen the density. On few objects, the likelihood is often
+largest for a narrower density, which then covers too few of the true poses of other objects.
 """
 
 import functools
@@ -23,21 +25,22 @@ from sts_jax.mvae import Gaussian
 from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import experts, fuse, log_density, of_state, rotation_between
 
-_CHUNK = 64  # items of one compiled call
-# Bounds of the logarithms of the three numbers, which allow a wider density and no narrower one
+_CHUNK = 64  # items in one compiled call
+# Bounds of the logarithms of the three numbers. They allow a wider density, and no narrower one.
 _BOUNDS = ((-math.log(4), 0), (-math.log(4), 0), (0, math.log(4)))
-_PRIOR = 0.5  # standard deviation of these logarithms before the data are seen
+_PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
 
 
 class Calibration(NamedTuple):
-    """Corrections of the density from each subset of the inputs. 1 changes nothing.
+    """Corrections of the predicted density, one for each subset of the inputs. The value 1 changes nothing.
 
-    The subset of index `sum of 2**i` has the inputs `Config.inputs[i]`.
+    The correction of a subset has the index `sum of 2**i`, summed over all i for which the subset contains the input
+    `Config.inputs[i]`.
     """
 
-    outcome: Float[Array, "subsets"]  # power of the probabilities of the outcomes, in [1/4, 1]
-    weight: Float[Array, "subsets"]  # power of the weights of an outcome's components, in [1/4, 1]
-    variance: Float[Array, "subsets"]  # factor of the components' variances, in [1, 4]
+    outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 1]
+    weight: Float[Array, "subsets"]  # exponent of the weights of an outcome's mixture components, in [1/4, 1]
+    variance: Float[Array, "subsets"]  # factor of the variances of the components, in [1, 4]
 
 
 def predict(
@@ -48,15 +51,18 @@ def predict(
     condition: Float[Array, "n c"] | None = None,
     calibration: Calibration | None = None,
 ) -> tuple[Gaussian, FinalPose]:
-    """The belief about the present state and the look, and the density of the final pose.
+    """Infer the state and the appearance in the first frame, and predict the density of the final pose.
 
     Args:
         model: The networks.
-        inputs: As in `objective.experts`.
-        present: The items of each input that count.
-        empty: As in `objective.experts`.
-        condition: As in `Transition`.
-        calibration: Corrects the density of items without a true `state`.
+        inputs: Inputs by name, as in `statespace.sample`.
+        present: A mask for each of the inputs. True means that the item has the input.
+        empty: `visual` and `tactile` image of the empty sensor, in [0, 1].
+        condition: Condition of the scenario, from `training.Preprocessing.encode_condition`, or None.
+        calibration: Correction of the density, or None. Items whose true `state` is an input are not corrected.
+
+    Returns:
+        The posterior of the state code and the appearance code, `(n, code + look)`, and the density of the final pose.
     """
     belief = fuse(experts(model, inputs, present, empty), present)
     final = model.transition(of_state(belief), condition)
@@ -71,7 +77,17 @@ def predict(
 def corrected(
     final: FinalPose, outcome: Float[Array, "*n"], weight: Float[Array, "*n"], variance: Float[Array, "*n"]
 ) -> FinalPose:
-    """A density after the corrections of a `Calibration`, of all items or of each."""
+    """Correct the densities of the final poses.
+
+    Args:
+        final: Densities of n items.
+        outcome: Exponent of the probabilities of the outcomes, one for all items or `(n,)`.
+        weight: Exponent of the weights of the mixture components, one for all items or `(n,)`.
+        variance: Factor of the variances, one for all items or `(n,)`.
+
+    Returns:
+        The corrected densities.
+    """
 
     def power(log: Array, exponent: Array) -> Array:
         return jax.nn.log_softmax(log * exponent.reshape(-1, *(1,) * (log.ndim - 1)))
@@ -93,19 +109,25 @@ def fit(
     present: dict[str, np.ndarray] | None = None,
     condition: np.ndarray | None = None,
 ) -> Calibration:
-    """The calibration with the largest posterior probability of the final poses of some trajectories.
+    """Fit the calibration of a model to the final poses of trajectories that its training did not see.
+
+    The result maximises the posterior density of the correction: the likelihood of the true outcomes and final poses,
+    times a prior that keeps the corrections near 1.
 
     Args:
-        graphdef: Definition of the model.
-        params: Its parameters.
-        inputs: All inputs of the model, as in `objective.experts`. Images may be uint8.
-        targets: `state`, `pose` and `outcome`, as in `objective.loss`.
-        empty: As in `objective.experts`. May be uint8.
-        present: The items of each input that count (default: all).
-        condition: As in `Transition`.
+        graphdef: Definition of the model, from `init`.
+        params: Parameters of the model.
+        inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
+            and pose codes `pose` `(n, 12)`.
+        targets: State codes `state` of the first frame `(n, code)`, pose codes `pose` of the last frame `(n, 12)`, and
+            indices `outcome` into the outcomes of the scenario `(n,)`.
+        empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
+        present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
+            in all items.
+        condition: Condition of the scenario, `(n, c)`, from `training.Preprocessing.encode_condition`, or None.
 
     Returns:
-        The calibration. A subset of the inputs that no item has is not corrected.
+        The calibration. The correction of a subset that no item has is 1.
     """
     names = nnx.merge(graphdef, params).config.inputs
     number = len(targets["pose"])
@@ -130,7 +152,7 @@ def _densities(
     chosen: list[str],
     rows: np.ndarray,
 ) -> FinalPose:
-    """The densities of some items from some of the inputs, in chunks of one size."""
+    """Predict the densities of the items `rows` from the inputs `chosen`, in chunks of one size."""
     present = {name: np.full(_CHUNK, name in chosen) for name in inputs}
     shown = {name: _unit(image) for name, image in empty.items()}
     parts = []
@@ -154,13 +176,14 @@ def _density(
 
 
 def _unit(values: np.ndarray) -> np.ndarray:
+    """Convert uint8 images to float32 in [0, 1]. Other arrays are returned as they are."""
     return values.astype(np.float32) / 255 if values.dtype == np.uint8 else values
 
 
 def _fitted(
     final: FinalPose, code: Float[Array, "n code"], pose: Float[Array, "n 12"], outcome: Int[Array, "n"]
 ) -> np.ndarray:
-    """The three numbers of one subset."""
+    """Fit the three numbers of one subset."""
 
     def evaluated(log: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = _nats(jnp.asarray(log, jnp.float32), final, code, pose, outcome)
@@ -178,6 +201,6 @@ def _nats(
     pose: Float[Array, "n 12"],
     outcome: Int[Array, "n"],
 ) -> Float[Array, ""]:
-    """Negative logarithm of the posterior density of a calibration, up to a constant."""
+    """Negative log posterior density of the three numbers, up to a constant. `log` has their logarithms."""
     given, density = log_density(corrected(final, *jnp.exp(log)), pose, rotation_between(code, pose), outcome)
     return jnp.sum((log / _PRIOR) ** 2) / 2 - jnp.sum(given) - jnp.sum(density)

@@ -1,8 +1,9 @@
-"""Functions on the sphere as real spherical harmonics, which turn with an object.
+"""Functions on the unit sphere as sums of real spherical harmonics, and their rotation with an object.
 
-A function is a vector of coefficients of the degrees 0, 1, 2, ..., where degree n has the orders 0, 1, -1, ..., n, -n.
-A function f turned by a rotation R is d -> f(R' d). The harmonics are homogeneous polynomials of the direction d, and
-their mean square over the sphere is 1.
+A function is given by its coefficients, one for each harmonic. The harmonics are in the order of their degrees 0, 1, 2,
+..., and within degree n in the order 0, 1, -1, ..., n, -n. A positive order belongs to a cosine and a negative order to
+a sine of the angle about the z axis. The harmonics are homogeneous polynomials of the direction d, and their mean
+square over the sphere is 1. A rotation matrix R turns the function f into the function d -> f(R^T d).
 """
 
 import math
@@ -13,16 +14,19 @@ from jaxtyping import Array, Float
 
 
 def number(degree: int) -> int:
-    """Number of coefficients of a function up to a degree."""
+    """The number of spherical harmonics up to a degree, which is the number of coefficients of a function."""
     return (degree + 1) ** 2
 
 
 def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
-    """Values of all harmonics up to a degree.
+    """Evaluate all spherical harmonics up to a degree.
 
     Args:
-        direction: Unit vectors. For shorter vectors, harmonics of degree n shrink with the length to the power n.
-        degree: The largest degree.
+        direction: Unit vectors. At a shorter vector of length s, a harmonic of degree n is multiplied by s^n.
+        degree: Largest degree.
+
+    Returns:
+        Values of the harmonics at each direction, in the order of the coefficients.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     square = x**2 + y**2 + z**2
@@ -46,35 +50,62 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
 def values(
     coefficients: Float[Array, "n c k"], rotation: Float[Array, "n 3 3"], directions: Float[np.ndarray, "j 3"]
 ) -> Float[Array, "n c j"]:
-    """Values of turned functions in fixed directions.
+    """Evaluate functions at fixed directions after a rotation.
 
     Args:
-        coefficients: c functions of each of n objects.
-        rotation: The rotation of each object. A mean of rotations gives approximately the mean of the values.
+        coefficients: Coefficients of c functions for each of n objects.
+        rotation: Rotation matrix of each object. For a mean of rotation matrices, the results are approximately the
+            means of the values.
         directions: Unit vectors.
+
+    Returns:
+        Values of the rotated functions at the directions.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Coefficients of functions turned about the vertical. `angle` is the cosine and the sine."""
+    """Rotate functions about the z axis.
+
+    Args:
+        angle: Cosine and sine of the rotation angle of each object.
+        coefficients: Coefficients of c functions for each of n objects.
+
+    Returns:
+        Coefficients of the rotated functions.
+    """
     cosine, sine, partner = _about_vertical(angle, coefficients.shape[-1])
     return cosine * coefficients + sine * coefficients[..., partner]
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Variances of turned coefficients, for independent coefficients with the given variances."""
+    """Variances of the coefficients after a rotation about the z axis.
+
+    Args:
+        angle: Cosine and sine of the rotation angle of each object.
+        variance: Variances of the coefficients, which are assumed to be independent.
+
+    Returns:
+        Variances of the coefficients of the rotated functions.
+    """
     cosine, sine, partner = _about_vertical(angle, variance.shape[-1])
     return cosine**2 * variance + sine**2 * variance[..., partner]
 
 
 def _orders(degree: int) -> list[tuple[int, int]]:
+    """Degree and order of each harmonic, in the order of the coefficients."""
     return [(n, m) for n in range(degree + 1) for m in (0, *(s * a for a in range(1, n + 1) for s in (1, -1)))]
 
 
 def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Array, np.ndarray]:
-    """Factors (n, 1, k) of each coefficient and of the one of opposite order, its partner, and the partner's index."""
+    """The terms of a rotation about the z axis: `cosine * coefficients + sine * coefficients[..., partner]`.
+
+    The partner of a coefficient has the same degree and the opposite order.
+
+    Returns:
+        `cosine` and `sine`, (n, 1, k), and the indices `partner`, (k,).
+    """
     orders = _orders(math.isqrt(count) - 1)
     partner = np.array([orders.index((n, -m)) for n, m in orders])
     powers = [jnp.stack([jnp.ones_like(angle[:, 0]), jnp.zeros_like(angle[:, 0])], axis=-1)]
@@ -84,6 +115,6 @@ def _about_vertical(angle: Float[Array, "n 2"], count: int) -> tuple[Array, Arra
             jnp.stack([angle[:, 0] * cos - angle[:, 1] * sin, angle[:, 0] * sin + angle[:, 1] * cos], axis=-1)
         )
     cosine = jnp.stack([powers[abs(m)][:, 0] for _, m in orders], axis=-1)
-    # The partner of a cosine is a sine, which has a negative factor.
+    # sin(m (b - a)) = sin(m b) cos(m a) - cos(m b) sin(m a), so that a sine adds to its cosine with a minus sign.
     sine = jnp.stack([powers[abs(m)][:, 1] * (-1 if m > 0 else 1 if m < 0 else 0) for _, m in orders], axis=-1)
     return cosine[:, None], sine[:, None], partner

@@ -1,12 +1,15 @@
-"""Encoders, transition and decoder as Flax NNX modules.
+"""Encoders, transition and decoder of the state-space model as Flax NNX modules.
 
-The latent is the present state. It consists of a state code with the pose, the shape and the mass (`statespace.state`),
-and of a look, which describes all other visible or tactile properties of an object. An encoder for each image returns a
-Gaussian over both. The transition maps a belief about the present state to a density of the final pose and of the
-rotation to it. The decoder draws both streams of an object in a pose, given this rotation and the present state.
+The latent describes an object in the first frame of a trajectory. It has two parts. The state code describes the pose,
+the shape and the mass (`statespace.state`). The appearance code, which the program calls `look`, describes all other
+properties that the images show.
 
-Convolutions have stride 1, for which XLA's CPU backend is fast. Pixels are folded into channels to make an image
-smaller, and channels are unfolded into pixels to make it larger.
+- An encoder for each image returns a Gaussian over both codes. The belief is the product of these Gaussians.
+- The transition maps the belief to a density of the final pose and of the rotation from the first to the final pose.
+- The decoder renders both images of an object in a given pose, from the latent and the rotation since the first frame.
+
+All convolutions have stride 1, for which XLA's CPU backend is fast. To reduce an image, blocks of pixels are folded
+into channels. To enlarge an image, channels are unfolded into blocks of pixels.
 """
 
 import dataclasses
@@ -21,19 +24,20 @@ from sts_jax import objects
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import harmonics, poses, state, window
 
-IMAGES = ("visual", "tactile")
-INPUTS = (*IMAGES, "pose")
-UNKNOWN_LOG_VAR = 30.0  # of numbers that an input does not determine, whose precision is almost 0
-_LOG_VAR_LIMIT = 8.0  # largest absolute value for an encoder
-_FINAL_LOG_VAR = (-3.0, 5.0)  # of a component of the final pose: middle, largest distance from it
-_CONTRAST = 10.0  # factor of the outline's logits in a sample
-_OUTSIDE = 8.0  # decrease of the logit of being covered outside of the canvas
-# The tint is the mean change of the pixels that show the object, less _MIDDLE, divided by _WIDTH.
+IMAGES = ("visual", "tactile")  # names of the images
+INPUTS = (*IMAGES, "pose")  # names of all inputs that a model can have
+UNKNOWN_LOG_VAR = 30.0  # log variance of numbers that an input does not determine: their precision is almost 0
+_LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
+_FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
+_CONTRAST = 10.0  # factor of the logits in an image with sharp outlines
+_OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
+# The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
+# from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH.
 TINT = 3  # numbers of the tint
 _MIDDLE, _WIDTH = -0.3, 0.12
-_TINT_LOG_VAR = -6.0  # of the tint in an image
+_TINT_LOG_VAR = -6.0  # log variance of a tint that was measured in an image
 _BRIGHT = 0.7  # approximate brightness of the empty sensor
-_SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # of last layers
+_SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # for last layers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,93 +48,102 @@ class Config:
         ValueError: A field is out of range, or two fields contradict each other.
     """
 
-    inputs: tuple[str, ...] = ("visual", "pose")  # some of INPUTS
+    inputs: tuple[str, ...] = ("visual", "pose")  # some of `visual`, `tactile` and `pose`, in this order
     outcomes: int = 2  # number of outcomes of the scenario
-    condition: int = 0  # numbers in the scenario's condition
+    condition: int = 0  # number of values in the scenario's condition
     input_size: int = 128  # pixels, side of the input images
     image_size: int = 64  # pixels, side of the predicted images
     camera_distance: float = 0.1  # m, from the pinhole to the gel's outer face
     view: float = 0.15  # m, side of the visible square of the gel's face
-    position_scale: float = 0.05  # m, see `training.Preprocessing`
-    traits: int = 32  # numbers of the look that do not turn with the object, the tint first
-    own: int = 4  # functions on the sphere in the look, in the object's frame
-    shown: int = 4  # functions on the sphere in the look, in the sensor's frame at present
-    degree: int = 3  # of the harmonics of these functions
-    directions: int = 24  # directions in which the values of these functions are features
-    support: int = 64  # directions in which the values of the support function are features
-    components: int = 6  # Gaussians of the final pose for each outcome
-    window: int = 32  # pixels, side of the magnified part of an image
-    encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window
-    decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas
+    position_scale: float = 0.05  # m, divisor of positions in pose codes, as in `training.Preprocessing`
+    traits: int = 32  # numbers of the appearance code that do not depend on the rotation, the tint first
+    own: int = 4  # functions on the sphere in the appearance code, for directions in the mesh frame
+    shown: int = 4  # functions on the sphere in the appearance code, for directions in the sensor frame
+    degree: int = 3  # largest degree of the spherical harmonics of these functions
+    directions: int = 24  # number of directions at which the decoder sees the values of these functions
+    support: int = 64  # number of directions at which transition and decoder see the support functions
+    components: int = 6  # Gaussians in the density of the final pose for each outcome
+    window: int = 32  # pixels, side of the magnified window around the object that an encoder sees
+    encoder: tuple[int, ...] = (64, 128, 128)  # channels at 1/2, 1/4 and 1/8 of the window's resolution
+    decoder: tuple[int, ...] = (128, 64, 32)  # channels at 1/8, 1/4 and 1/2 of the canvas's resolution
     hidden: int = 384  # width of the encoders' fully connected layers
     transition: int = 512  # width of the transition's layers
-    canvas: int = 64  # pixels, side of the picture of an object before it is placed in the view
-    canvas_side: float = 0.165  # m, side of this picture on the gel's face
-    tactile_weight: float = 4.0  # of the tactile image's nats in the loss
-    state_weight: float = 16.0  # of the squared error of the first state, for the expert of each image
-    pose_weight: float = 4.0  # of the nats of the final pose, and of the experts' variances
-    outcome_weight: float = 8.0  # of the outcome's nats
-    covered_weight: float = 0.15  # of the nats of the object's outline
-    first_weight: float = 0.5  # of the nats of the first moment's images
-    look_weight: float = 0.1  # of the divergence of the look. Samples are sharper for weights below 1
-    drawn: float = 0.4375  # share of a batch whose last moment is drawn (the whole batch trains the other parts)
-    drawn_first: float = 0.125  # share of a batch whose first moment is drawn
-    vectors: int = 1  # vectors (x, y) in the plane of the pad at the begin of the condition, if there is one
+    canvas: int = 64  # pixels, side of the canvas: the image of an object before it is placed in the view
+    canvas_side: float = 0.165  # m, side of the square parallel to the pad that the canvas covers
+    tactile_weight: float = 4.0  # weight of the error of the last tactile image in the loss
+    state_weight: float = 16.0  # weight of the squared error of each encoder's state code
+    pose_weight: float = 4.0  # weight of the negative log likelihoods of the final pose and of the encoders' estimates
+    outcome_weight: float = 8.0  # weight of the negative log likelihood of the outcome
+    covered_weight: float = 0.15  # weight of the cross-entropy of the object's outline
+    first_weight: float = 0.5  # weight of the errors of the images of the first frame
+    look_weight: float = 0.1  # weight of the divergence of the appearance code. Below 1, samples are sharper
+    drawn: float = 0.4375  # share of a batch with a rendered last frame (the whole batch trains the other parts)
+    drawn_first: float = 0.125  # share of a batch with a rendered first frame
+    vectors: int = 1  # number of vectors (x, y) in the plane of the pad with which the condition begins
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
-            raise ValueError(f"inputs is {self.inputs}, but it must be at least one of {INPUTS}, in this order")
+            raise ValueError(f"inputs is {self.inputs}, but it must have at least one of {INPUTS}, in this order")
         if not set(self.inputs) & set(IMAGES):
-            raise ValueError(f"inputs is {self.inputs}, but the look needs an image: add 'visual' or 'tactile'")
+            raise ValueError(f"inputs is {self.inputs}, but one input must be an image: add 'visual' or 'tactile'")
         for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
             if getattr(self, name) % part or getattr(self, name) < part:
-                raise ValueError(f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}")
+                raise ValueError(
+                    f"{name} is {getattr(self, name)} pixels, but it must be a multiple of {part}"
+                    f"{', the image_size' if name == 'input_size' else ''}"
+                )
         if len(self.encoder) != 3 or len(self.decoder) != 3:
-            raise ValueError(f"encoder and decoder need 3 widths each, got {len(self.encoder)} and {len(self.decoder)}")
+            raise ValueError(
+                f"encoder has {len(self.encoder)} widths and decoder has {len(self.decoder)}, but each must have 3"
+            )
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
-                f"condition is {self.condition} numbers and vectors is {self.vectors}, but a condition must be 0, or "
-                "hold the 2 numbers of each vector"
+                f"condition is {self.condition} and vectors is {self.vectors}, but condition must be 0, or at least "
+                "2 * vectors, because a vector has two numbers. vectors must be >= 0"
             )
         if self.traits < TINT:
-            raise ValueError(f"traits is {self.traits}, but it must be at least {TINT}, the numbers of the tint")
+            raise ValueError(f"traits is {self.traits}, but it must be >= {TINT}: the first {TINT} traits are the tint")
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but a share must be above 0 and at most 1")
+                raise ValueError(f"{name} is {getattr(self, name)}, but it is a share and must be > 0 and <= 1")
 
     @property
     def look(self) -> int:
-        """Numbers that describe the look."""
+        """Number of components of the appearance code."""
         return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain dictionaries and lists. `vectors` is left out where it is 1, as older models do not have it."""
+        """The fields in plain dictionaries and tuples. `vectors` is left out if it is 1, as in older models."""
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> "Config":
-        """The inverse of `to_json`, also after a trip through a JSON file."""
+        """Make a configuration from the result of `to_json`, or from the same values read from a JSON file."""
         plain: dict[str, Any] = {k: tuple(value) if isinstance(value, list) else value for k, value in values.items()}
         return cls(**plain)
 
 
 class FinalPose(NamedTuple):
-    """The density of the final pose: a mixture of Gaussians over code and rotation, in the frame of a heading."""
+    """The density of the final pose: for each outcome, a mixture of Gaussians over 21 numbers.
+
+    The numbers are the final pose code and the matrix of the rotation from the first to the final pose. Both are given
+    in a coordinate frame whose x axis is `heading`.
+    """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
     weight: Float[Array, "n outcomes k"]  # log weight of each component of an outcome
-    mean: Float[Array, "n outcomes k 21"]  # code of the pose, and the rotation from the present to the final pose
-    log_var: Float[Array, "n outcomes k 21"]
-    heading: Float[Array, "n 2"]  # of the frame, see `poses.heading`
+    mean: Float[Array, "n outcomes k 21"]  # mean of each component
+    log_var: Float[Array, "n outcomes k 21"]  # log variances of each component
+    heading: Float[Array, "n 2"]  # cosine and sine of the angle from the sensor's x axis, see `state.heading`
 
 
 class Layers(NamedTuple):
-    """An object drawn in the view, to be composed with the images of the empty sensor."""
+    """The rendered object without background. `compose` adds the images of the empty sensor."""
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
-    colour: Float[Array, "n size size 3"]  # of the object, [0, 1]
-    touch: Float[Array, "n size size 3"]  # change of the tactile image, in logits
+    colour: Float[Array, "n size size 3"]  # colour of the object, [0, 1]
+    touch: Float[Array, "n size size 3"]  # change of the logits of the tactile image
 
 
 class _Residual(nnx.Module):
@@ -157,7 +170,16 @@ class _ResidualDense(nnx.Module):
 
 
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
-    """Traits (n, traits), functions in the object's frame (n, c, k) and in the sensor's frame (n, c, k) of looks."""
+    """Split appearance codes into their parts.
+
+    Args:
+        config: Configuration of the model.
+        look: Appearance codes.
+
+    Returns:
+        The traits `(n, traits)`, and the coefficients of the functions on the sphere for directions in the mesh frame
+        `(n, own, k)` and in the sensor frame `(n, shown, k)`.
+    """
     count = harmonics.number(config.degree)
     traits, own, shown = jnp.split(look, [config.traits, config.traits + config.own * count], axis=-1)
     return traits, own.reshape(len(look), -1, count), shown.reshape(len(look), -1, count)
@@ -166,7 +188,7 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
 def _shape(
     config: Config, known: state.State, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
 ) -> list[Array]:
-    """Values of both support functions of a state, `own` and `shown`."""
+    """Values of the support functions `own` and `shown` at fixed directions, after one rotation each."""
     directions = objects.lattice(config.support)
     return [
         harmonics.values(known.own[:, None], own_turn, directions),
@@ -177,18 +199,19 @@ def _shape(
 def _appearance(
     config: Config, look: Array, own_turn: Float[Array, "n 3 3"], shown_turn: Float[Array, "n 3 3"]
 ) -> list[Array]:
-    """Traits of the look, and values of its functions in the object's frame and in the sensor's frame."""
+    """Traits of appearance codes, and values of their functions at fixed directions, after one rotation each."""
     traits, own, shown = parts(config, look)
     directions = objects.lattice(config.directions)
     return [traits, harmonics.values(own, own_turn, directions), harmonics.values(shown, shown_turn, directions)]
 
 
 def _joined(*features: Float[Array, "n ..."]) -> Float[Array, "n k"]:
+    """Flatten and concatenate the features of each item."""
     return jnp.concatenate([x.reshape(len(x), -1) for x in features], axis=-1)
 
 
 def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h//2 w//2 4*c"]:
-    """Blocks of 2x2 pixels as channels."""
+    """Turn each block of 2x2 pixels into one pixel with four times as many channels."""
     n, h, w, c = x.shape
     return x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
 
@@ -200,9 +223,9 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 
 
 class Encoder(nnx.Module):
-    """The expert of one stream: a Gaussian over state code and look for each image.
+    """Estimates the state code and the appearance code from a visual or from a tactile image.
 
-    The tint is computed from a visual image and unknown from a tactile one.
+    The tint is measured in a visual image. A tactile image does not determine it.
     """
 
     def __init__(self, config: Config, name: str, rngs: nnx.Rngs) -> None:
@@ -222,13 +245,13 @@ class Encoder(nnx.Module):
         self.last = nnx.Linear(config.hidden, 2 * (state.CODE + config.look), kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, change: Float[Array, "n size size 3"]) -> Gaussian:
-        """The expert of each image.
+        """Estimate the codes of each image.
 
         Args:
-            change: Images less that of the empty sensor.
+            change: Images minus the image of the empty sensor, both in [0, 1].
 
         Returns:
-            A Gaussian over state code and look, `(n, code + look)`.
+            A Gaussian over the state code and the appearance code, `(n, code + look)`.
         """
         config = self.config
         place = window.locate(jax.lax.stop_gradient(change))
@@ -239,7 +262,7 @@ class Encoder(nnx.Module):
         for layer in self.quarters:
             x = layer(x)
         x = jax.nn.swish(self.eighth(self.to_eighth(_fold(x))))
-        # All numbers are estimated in the frame of the silhouette, and turned into the sensor's frame at the end.
+        # The network works in the coordinate frame of the silhouette. The estimate is rotated into the sensor frame.
         centre = poses.turn_back(place.angle, (place.centre - 0.5) * config.view / config.position_scale)
         side = place.side[:, None]
         features = jnp.concatenate([centre, 0.25 * centre / side, jnp.log(side), place.angle], axis=-1)
@@ -262,7 +285,7 @@ class Encoder(nnx.Module):
         )
 
     def _tint(self, change: Float[Array, "n size size 3"]) -> tuple[Float[Array, "n 3"], float]:
-        """The tint of each image, and the logarithm of its variance."""
+        """The tint of the object in each image, and its log variance."""
         if self.name == "tactile":
             return jnp.zeros((len(change), TINT)), UNKNOWN_LOG_VAR
         seen = window.shows(change)[..., None]
@@ -271,9 +294,10 @@ class Encoder(nnx.Module):
 
 
 class Transition(nnx.Module):
-    """Maps a belief about the present state and the condition to the density of the final pose.
+    """Predicts the density of the final pose from a belief about the first state.
 
-    The look is no input, because the transition would recognise training objects by it (see docs/trials.md).
+    The appearance code is not an input, because the transition would recognise training objects by their appearance
+    (see docs/trials.md).
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -287,14 +311,15 @@ class Transition(nnx.Module):
         self.mixture = nnx.Linear(config.transition, components, kernel_init=_SMALL, rngs=rngs)
 
     def __call__(self, belief: Gaussian, condition: Float[Array, "n c"] | None) -> FinalPose:
-        """The density of the final pose.
+        """Predict the density of the final pose.
 
         Args:
-            belief: Fused posterior over the state code, `(n, code)`.
-            condition: Each number divided by its typical size, or None if the scenario has no condition.
+            belief: Posterior of the state code, `(n, code)`.
+            condition: Condition of the scenario, each number divided by its typical size. None if the scenario has no
+                condition.
 
         Returns:
-            The density in the frame of the heading of the belief's mean.
+            The density, in a coordinate frame whose x axis is the heading of the mean state.
         """
         config = self.config
         known = state.split(belief.mean)
@@ -333,11 +358,11 @@ class Transition(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """Draws an object with a given state and look in a pose.
+    """Renders an object in a given pose, from its state code and its appearance code.
 
-    A picture of the object is drawn on a canvas that follows its heading. The canvas is placed in the view under the
-    object's origin, at the height of the object's lowest point, because the camera sees the object from below.
-    `compose` adds the images of the empty sensor.
+    The network renders a square image of the object, the canvas, which follows the object's heading. The canvas is then
+    placed in the view below the mesh origin, at the height of the object's lowest point, because the camera sees the
+    object from below. `compose` adds the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -359,13 +384,16 @@ class Decoder(nnx.Module):
         known: Float[Array, "n code"],
         look: Float[Array, "n look"],
     ) -> Layers:
-        """Draw each object.
+        """Render each object.
 
         Args:
-            pose: Pose codes.
-            turn: Rotations since the present moment.
-            known: Present state codes, which provide the shapes.
-            look: Present looks.
+            pose: Pose codes of the frame to render.
+            turn: Rotation matrices from the first frame to the frame to render.
+            known: State codes of the first frame. Only the shapes are used.
+            look: Appearance codes of the first frame.
+
+        Returns:
+            The outline, the colour and the change of the tactile image of each object.
         """
         config = self.config
         heading = poses.heading(pose)
@@ -383,7 +411,7 @@ class Decoder(nnx.Module):
         depth = config.camera_distance + jnp.maximum(pose[:, 2] * config.position_scale - state.reach(shape, turn), 0)
         x = window.sample(x, _on_canvas(config, pose, heading, depth))
         x = x.reshape(len(x), config.image_size, config.image_size, -1)
-        # Before training, an object has its present colour, and hardly any pixel is covered.
+        # An untrained decoder renders an object in its mean colour in the input image, and covers hardly any pixel.
         tint = jnp.clip(_BRIGHT + _MIDDLE + _WIDTH * look[:, None, None, :TINT], 0.03, 0.97)
         colour = jax.nn.sigmoid(x[..., :3] + jnp.log(tint / (1 - tint)))
         return Layers(covered=x[..., 3:4] - _OUTSIDE - 3, colour=colour, touch=x[..., 4:7])
@@ -394,17 +422,17 @@ def compose(
     empty: dict[str, Float[Array, "size size 3"]],
     level: Float[Array, "n"] | None = None,
 ) -> dict[str, Float[Array, "n size size 3"]]:
-    """Both images of each object.
+    """Combine the rendered objects with the images of the empty sensor.
 
     Args:
-        layers: The result of the decoder.
-        empty: Both images of the untouched sensor, of the same size.
-        level: A threshold from 0 to 1. Pixels whose probability of being covered is above it are covered, so that
-            outlines are sharp. For uniformly drawn levels, each pixel is covered with its probability. None draws the
-            mean image.
+        layers: Rendered objects, from the decoder.
+        empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size.
+        level: Threshold for each object, from 0 to 1. The object covers the pixels whose probability of being covered
+            is above the threshold, so that its outline is sharp. If the thresholds are drawn uniformly, each pixel is
+            covered as often as its probability predicts. With None, the colour of a pixel is the expected colour.
 
     Returns:
-        `visual` and `tactile`, in [0, 1].
+        The images `visual` and `tactile` of each object, in [0, 1].
     """
     logit = layers.covered
     if level is not None:
@@ -421,13 +449,16 @@ def compose(
 def _on_canvas(
     config: Config, pose: Float[Array, "n 12"], heading: Float[Array, "n 2"], depth: Float[Array, "n"]
 ) -> Float[Array, "n m 2"]:
-    """Column and row on the canvas of each pixel of the view. Whole numbers are pixel centres.
+    """Find the place on the canvas that each pixel of the view shows.
 
     Args:
-        config: The configuration of the model.
+        config: Configuration of the model.
         pose: Pose codes.
-        heading: Headings of the canvas.
-        depth: Distance (m) of the canvas from the pinhole along the optical axis.
+        heading: Cosine and sine of the angle from the x axis to the heading of each object.
+        depth: Distances of the canvases from the pinhole along the optical axis (m).
+
+    Returns:
+        Column and row on the canvas for each of m pixels. Whole numbers are pixel centres.
     """
     position = pose[:, :2] * config.position_scale
     shrunk = (config.camera_distance / depth)[:, None]
@@ -438,7 +469,7 @@ def _on_canvas(
 
 
 class Model(nnx.Module):
-    """The transition, the decoder, and an encoder for each input that is an image."""
+    """The networks of a state-space model: an encoder for each image that is an input, a transition and a decoder."""
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config
@@ -448,7 +479,16 @@ class Model(nnx.Module):
 
 
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.State, nnx.State]:
-    """A new model as `(graphdef, params, stats)`. Consumes `key`. `stats` is empty (no running statistics)."""
+    """Create a model with random parameters.
+
+    Args:
+        key: Random key for the parameters.
+        config: Configuration of the model.
+
+    Returns:
+        The definition `graphdef`, the parameters `params`, and an empty state `stats`, because the model has no running
+        batch statistics.
+    """
 
     @jax.jit
     def draw(key: PRNGKeyArray) -> nnx.State:

@@ -1,21 +1,25 @@
 """The loss of a state-space model.
 
-For a batch of first moments with their last moments, it is the sum of
+A batch has the first and the last frames of some trajectories. The inputs are from the first frame, and the targets are
+the true state in the first frame, and the images, the pose and the outcome of the last frame. The loss is the weighted
+sum of these terms. NLL is a negative log likelihood.
 
-- the squared error of the state of each image's expert, and the nats of its variance
-- the nats of the transition at the true outcome, the true final pose and the rotation to it, for the belief of every
-  non-empty subset of the inputs
-- the excess cross-entropy of the last moment, drawn in the true final pose with a sample of the look, and that of the
-  first moment, drawn in the true first pose. Both include the colours of the pixels that show the object, and the
-  tactile image
-- the cross-entropy of the probability that a pixel shows the object, in these pictures
-- beta times the divergence of the look from its prior, in nats
+- `state` and `doubt`: the squared error of the state code that each encoder estimates, and the NLL by which the encoder
+  learns the variance of this error
+- `outcome` and `pose`: the NLL of the true outcome, and of the true final pose with the rotation to it, under the
+  transition's density. The belief of every non-empty subset of the inputs counts
+- `visual` and `tactile`: the cross-entropy of the rendered images of the last frame, minus the entropy of the targets.
+  In the visual image, the colours of the pixels that show the object count. In the tactile image, all pixels count
+- `first`: the sum of both errors for the images of the first frame
+- `covered`: the cross-entropy of the probability that a pixel shows the object, for both frames
+- `look`: the divergence of the appearance code from its prior, multiplied by `beta` in the loss
 
-A moment is drawn in its true pose, so that the decoder never averages over places. For each sample, the look comes from
-the belief of a random subset with an image.
+Both frames are rendered in their true poses, so that the decoder never averages over several places of an object. The
+appearance code of a sample is drawn from the belief of a random subset of its inputs that contains an image.
 
-First moments without an end (views) contribute to the first part, and replace the first moments that are drawn.
-Trajectories without images (falls) contribute to the second part, with beliefs around the true state.
+Two further kinds of data train some of the terms. *Views* are first frames without a trajectory. They count for `state`
+and `doubt`, and take the place of the first frames of the trajectories in `first` and `covered`. *Falls* are
+trajectories without images. They count for `outcome` and `pose`, with beliefs around the true state.
 """
 
 import itertools
@@ -32,8 +36,8 @@ from sts_jax.mvae import Gaussian, kl_standard_normal, product_of_experts
 from sts_jax.statespace import poses, state, window
 from sts_jax.statespace.networks import IMAGES, TINT, UNKNOWN_LOG_VAR, Config, FinalPose, Model, compose
 
-EXACT_LOG_VAR = -9.2  # of a pose that is an input, 0.5 mm
-_LEAST = 1 / 1020  # least distance of predicted images from 0 and 1
+EXACT_LOG_VAR = -9.2  # log variance of a pose that is an input: 0.5 mm for a position scale of 50 mm
+_LEAST = 1 / 1020  # rendered images are clipped to this distance from 0 and 1
 
 
 def experts(
@@ -42,16 +46,20 @@ def experts(
     counts: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Gaussian]:
-    """The Gaussian of each input over state code and look.
+    """Compute the expert of each input: a Gaussian over the state code and the appearance code.
 
     Args:
         model: The networks.
-        inputs: Some of `visual` and `tactile` `(n, size, size, 3)` in [0, 1], the pose code `pose` `(n, 12)` and, if it
-            is known, the true `state` `(n, code)`.
-        counts: The items of each input that count. All others have no influence and may be NaN.
-        empty: Both images of the untouched sensor, of the same size.
+        inputs: Inputs by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1], pose codes `pose`
+            `(n, 12)` and, if they are known, true state codes `state` `(n, code)`.
+        counts: A mask for each of the inputs. True means that the item has the input. Values of other items have no
+            influence and may be NaN.
+        empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size as the inputs.
+
+    Returns:
+        The experts by input, `(n, code + look)`. A pose or a state does not determine the other numbers.
     """
-    # Items that do not count are zero before the networks, because 0 * NaN would spoil the product and its gradient.
+    # Masked items are set to zero before the networks, because 0 * NaN would make the product and its gradient NaN.
     change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
     found = {name: model.encoders[name](x) for name, x in change.items()}
     for name in ("pose", "state"):
@@ -64,25 +72,43 @@ def experts(
 
 
 def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gaussian:
-    """The product of the standard normal prior and of the experts that count, for each sample."""
+    """Multiply the standard normal prior by the experts that each item has.
+
+    Args:
+        found: Experts by input, from `experts`.
+        counts: A mask for each of these inputs. True means that the item has the input.
+
+    Returns:
+        The belief: a Gaussian over the state code and the appearance code.
+    """
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
 
 
 def of_state(belief: Gaussian) -> Gaussian:
-    """The marginal over the state code of a belief over state code and look."""
+    """The belief about the state code, from a belief about the state code and the appearance code."""
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
 
 def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """The values, with zeros for items that do not count."""
+    """Set the values of masked items to zero."""
     return jnp.where(counts.reshape(-1, *(1,) * (values.ndim - 1)), values, 0)
 
 
 def log_density(
     final: FinalPose, code: Float[Array, "n 12"], turn: Float[Array, "n 3 3"], outcome: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """The log probability of an outcome, and the log density of the pose code given the outcome."""
+    """Evaluate a predicted density at a final pose.
+
+    Args:
+        final: Density of the final pose.
+        code: Final pose codes.
+        turn: Rotation matrices from the first to the final poses.
+        outcome: Indices into the outcomes of the scenario.
+
+    Returns:
+        The log probability of the outcome, and the log density of the pose code and the rotation given the outcome.
+    """
 
     def of_outcome(x: Array) -> Array:
         return jnp.take_along_axis(x, outcome.reshape(-1, *(1,) * (x.ndim - 1)), axis=1)[:, 0]
@@ -101,7 +127,16 @@ def excess(
     target: Float[Array, "n h w c"],
     counts: Float[Array, "n h w"] | None = None,
 ) -> Float[Array, "n"]:
-    """Binary cross-entropy minus the entropy of the target, in nats, summed over channels and the pixels that count."""
+    """Binary cross-entropy of images, minus the entropy of the targets.
+
+    Args:
+        image: Rendered images in [0, 1].
+        target: Target images in [0, 1].
+        counts: Weight of each pixel. None weights all pixels by 1.
+
+    Returns:
+        The difference for each image (nats), summed over pixels and channels.
+    """
     image = jnp.clip(image, _LEAST, 1 - _LEAST)
     cross = target * jnp.log(image) + (1 - target) * jnp.log1p(-image)
     inside = jnp.clip(target, 1e-6, 1 - 1e-6)
@@ -111,31 +146,31 @@ def excess(
 
 
 def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
-    """Means over blocks of pixels. The sides of the images must be multiples of `size`."""
+    """Reduce images to `size` x `size` pixels by means over blocks. `size` must divide their height and width."""
     *lead, height, width, channels = images.shape
     blocks = images.reshape(*lead, size, height // size, size, width // size, channels)
     return jnp.mean(blocks, axis=(-4, -2))
 
 
 class _Ends(NamedTuple):
-    """Beliefs about first moments, with the true ends."""
+    """Beliefs about the first frames of trajectories, with the true first states and final poses."""
 
-    belief: Gaussian  # over the state code
-    state: Float[Array, "n code"]
-    pose: Float[Array, "n 12"]  # final pose codes
-    outcome: Int[Array, "n"]
+    belief: Gaussian  # of the state code
+    state: Float[Array, "n code"]  # true state codes of the first frame
+    pose: Float[Array, "n 12"]  # pose codes of the last frame
+    outcome: Int[Array, "n"]  # index of the outcome
     condition: Float[Array, "n c"] | None
-    counts: Bool[Array, "n"]
+    counts: Bool[Array, "n"]  # False for items without an input
 
 
 class _Pictures(NamedTuple):
-    """Objects to be drawn, and the target images."""
+    """Objects to render, and the target images."""
 
-    pose: Float[Array, "n 12"]
-    turn: Float[Array, "n 3 3"]  # since the moment of the belief
-    belief: Gaussian
-    images: dict[str, Float[Array, "n size size 3"]]
-    counts: dict[str, Bool[Array, "n"]]
+    pose: Float[Array, "n 12"]  # pose codes of the frame to render
+    turn: Float[Array, "n 3 3"]  # rotation from the frame of the belief to the frame to render
+    belief: Gaussian  # of the state code and the appearance code
+    images: dict[str, Float[Array, "n size size 3"]]  # targets
+    counts: dict[str, Bool[Array, "n"]]  # False for items without the target
 
 
 def loss(
@@ -152,29 +187,32 @@ def loss(
     falls: dict[str, Array] | None = None,
     beta: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """The loss of one batch, see the docstring of the module.
+    """Compute the loss of one batch, see the docstring of the module.
 
     Args:
-        graphdef: Definition of the model.
-        params: Its parameters.
-        key: Consumed.
-        inputs: All inputs of the model, as in `experts`.
-        targets: `visual` and `tactile` `(n, size, size, 3)` in [0, 1] at the predicted size, the state code `state`
-            `(n, code)` of the first moment, the pose code `pose` `(n, 12)` of the last moment, and `outcome` `(n,)`, an
-            index into the outcomes of the scenario.
-        empty: As in `experts`.
-        present: The samples `(n,)` of each input that count (default: all). Each sample needs one input. Inputs that do
-            not count have no influence and may be NaN.
-        condition: As in `Transition`.
-        views: Further first moments without an end: `visual` `(m, size, size, 3)` and `state` `(m, code)`.
-        falls: Further trajectories without images: `state`, `pose`, `outcome` and, if the model has a condition,
-            `condition`, as above.
-        beta: Weight of the divergence of the look.
+        graphdef: Definition of the model, from `init`.
+        params: Parameters of the model.
+        key: Random key.
+        inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1] with the
+            side `input_size`, and pose codes `pose` `(n, 12)`.
+        targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
+            `image_size`, state codes `state` of the first frame `(n, code)`, pose codes `pose` of the last frame
+            `(n, 12)`, and indices `outcome` into the outcomes of the scenario `(n,)`.
+        empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
+        present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
+            in all items. Each item must have at least one input. Masked values have no influence and may be NaN.
+        condition: Condition of the scenario, each number divided by its typical size. None if the model has no
+            condition.
+        views: First frames without a trajectory: images `visual` `(m, size, size, 3)` in [0, 1] with the side
+            `input_size`, and state codes `state` `(m, code)`. The model must have the input `visual`.
+        falls: Trajectories without images: `state`, `pose` and `outcome` as in `targets` and, if the model has a
+            condition, `condition`.
+        beta: Weight of the divergence of the appearance code.
 
     Returns:
-        The loss, and its parts: means over the items that count, before weighting. `state` is in squared units of the
-        code, and all others are in nats. `state`, `doubt` and `first` are sums over the input images, and `covered` is
-        a sum over the first and the last moment.
+        The loss, and its terms by name: means over the items that have the input or the target, before they are
+        weighted. `state` is in squared units of the code, and all other terms are in nats. `state`, `doubt` and `first`
+        are sums over the input images, and `covered` is a sum over the first and the last frame.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
@@ -195,7 +233,7 @@ def loss(
     terms |= _end_terms(model, jax.tree.map(lambda *x: jnp.concatenate(x), *ends))
 
     belief = _drawn_belief(choice, images, members, beliefs)
-    # The divergence excludes the tint, which is computed and not learnt.
+    # The divergence excludes the tint, because the encoder measures it and does not learn it.
     terms["look"] = jnp.mean(kl_standard_normal(jax.tree.map(lambda x: x[:, state.CODE + TINT :], belief)))
     last = math.ceil(config.drawn * number)
     turn = rotation_between(targets["state"], targets["pose"])
@@ -223,7 +261,7 @@ def loss(
 
 
 def _weighted(config: Config, terms: dict[str, Float[Array, ""]], beta: float | Float[Array, ""]) -> Float[Array, ""]:
-    """The loss of some terms."""
+    """The weighted sum of the terms."""
     return (
         terms["visual"]
         + config.tactile_weight * terms["tactile"]
@@ -237,7 +275,15 @@ def _weighted(config: Config, terms: dict[str, Float[Array, ""]], beta: float | 
 
 
 def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
-    """The rotation from a state to a final pose."""
+    """The rotation matrices from the first to the final pose.
+
+    Args:
+        code: State codes of the first frame.
+        pose: Pose codes of the last frame.
+
+    Returns:
+        Matrices that rotate vectors in the sensor frame.
+    """
     return poses.matrix(pose) @ jnp.swapaxes(poses.matrix(code[:, : poses.CODE]), -1, -2)
 
 
@@ -248,7 +294,7 @@ def _state_terms(
     seen: dict[str, Gaussian],
     views: dict[str, Array] | None,
 ) -> dict[str, Float[Array, ""]]:
-    """`state` and `doubt`, summed over the experts of all images, for first moments and views."""
+    """The terms `state` and `doubt`, summed over the encoders, for first frames and views."""
     errors, doubts = [], []
     for name in (name for name in IMAGES if name in found):
         expert, code, valid = found[name], truth, counts[name]
@@ -263,10 +309,11 @@ def _state_terms(
 
 
 def _state_error(expert: Gaussian, code: Float[Array, "n code"], counts: Bool[Array, "n"]) -> tuple[Array, Array]:
-    """Squared error of an expert's state, and the nats of its variance, as means over the samples that count.
+    """Squared error of an encoder's state codes, and the negative log likelihood of its variances.
 
-    The mean is learnt from the squared error alone. The nats of a Gaussian would weigh each component by its precision.
-    The position would soon outweigh the rotation, which is harder to learn.
+    Both are means over the items that have the image. The mean of the Gaussian is learnt from the squared error alone.
+    The likelihood of a Gaussian would weight each component by its precision, and the position would soon outweigh the
+    rotation, which is harder to learn.
     """
     mean, log_var = (x[:, : state.CODE] for x in expert)
     error = jnp.sum((code - mean) ** 2, axis=-1)
@@ -282,7 +329,7 @@ def _ends(
     targets: dict[str, Array],
     condition: Float[Array, "n c"] | None,
 ) -> _Ends:
-    """The trajectories of a batch, predicted from the inputs that count."""
+    """The trajectories of a batch with their belief from some of the inputs. `counts` has the masks of these inputs."""
     counted = jnp.any(jnp.stack(list(counts.values())), axis=0)
     return _Ends(of_state(belief), targets["state"], targets["pose"], targets["outcome"], condition, counted)
 
@@ -293,7 +340,7 @@ def _drawn_belief(
     members: Sequence[dict[str, Bool[Array, "n"]]],
     beliefs: Sequence[Gaussian],
 ) -> Gaussian:
-    """Each sample's belief from a random subset of the inputs with an image, which the look of a picture comes from."""
+    """Choose a random subset of the inputs with an image for each item, and return the belief from this subset."""
     usable = jnp.stack([jnp.any(jnp.stack([own[name] for name in images]), axis=0) for own in members], axis=1)
     chosen = jax.random.categorical(key, jnp.where(usable, 0.0, -jnp.inf))
     stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=1), *beliefs)
@@ -301,7 +348,10 @@ def _drawn_belief(
 
 
 def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
-    """Trajectories with a known first state. In every second one, shape and mass have noise of known variance."""
+    """Trajectories without images, with a belief about the true first state.
+
+    In every second belief, the numbers of shape and mass have noise of random size, whose variance the belief states.
+    """
     code = falls["state"]
     number = len(code)
     size, noise = jax.random.split(key)
@@ -328,7 +378,7 @@ def _known_ends(key: PRNGKeyArray, falls: dict[str, Array]) -> _Ends:
 
 
 def _end_terms(model: Model, ends: _Ends) -> dict[str, Float[Array, ""]]:
-    """The nats of the outcomes and of the final poses."""
+    """The terms `outcome` and `pose`."""
     weights = ends.counts / jnp.maximum(jnp.sum(ends.counts), 1)
     final = model.transition(ends.belief, ends.condition)
     outcome, pose = log_density(final, ends.pose, rotation_between(ends.state, ends.pose), ends.outcome)
@@ -341,7 +391,7 @@ def _present_pictures(
     images: dict[str, Array],
     counts: dict[str, Bool[Array, "n"]],
 ) -> _Pictures:
-    """Pictures of the present moment, to which the belief belongs."""
+    """First frames to render, from a belief about the same frames."""
     stays = jnp.broadcast_to(jnp.eye(3), (len(code), 3, 3))
     return _Pictures(code[:, : poses.CODE], stays, belief, images, counts)
 
@@ -353,7 +403,7 @@ def _picture_terms(
     before: _Pictures,
     empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Float[Array, ""]]:
-    """`visual` and `tactile` of the last moment, `first`, the sum of both for the first moment, and `covered`."""
+    """The terms `visual`, `tactile`, `first` and `covered`. `after` has last frames, and `before` has first frames."""
     size = model.config.image_size
     small = {name: reduced(x, size) for name, x in empty.items()}
 
@@ -364,7 +414,7 @@ def _picture_terms(
     layers = model.decoder(
         jnp.concatenate([after.pose, before.pose]),
         jnp.concatenate([after.turn, before.turn]),
-        # Pictures do not train the shape, because the state has its own target.
+        # The images do not train the state code, because it has its own target.
         jax.lax.stop_gradient(jnp.concatenate([x.belief.mean[:, : state.CODE] for x in (after, before)])),
         jnp.concatenate([looks(key, x.belief) for key, x in zip(keys, (after, before), strict=True)]),
     )
@@ -391,7 +441,7 @@ def _picture_terms(
 
 
 def _outline_nats(logit: Float[Array, "n h w 1"], seen: Float[Array, "n h w"]) -> Float[Array, "n"]:
-    """Cross-entropy of the probability that a pixel shows the object, summed over pixels.
+    """Cross-entropy of the probability that a pixel shows the object (nats), summed over pixels.
 
     Args:
         logit: Logit of the probability.

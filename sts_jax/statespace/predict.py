@@ -1,4 +1,4 @@
-"""Predictions of a state-space model: samples of the final pose and of both streams, from any subset of the inputs."""
+"""Predictions of a state-space model: samples of the final pose and of both images, from any subset of the inputs."""
 
 from typing import NamedTuple
 
@@ -14,13 +14,13 @@ from sts_jax.statespace.objective import reduced
 
 
 class Samples(NamedTuple):
-    """k samples of the last moment of each of n items, of which the first few have images."""
+    """k samples of the last frame for each of n items. The first `drawn` samples have images."""
 
-    belief: Gaussian  # over the present state code and the look, (n, code + look)
+    belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
-    pose: Float[Array, "k n 12"]  # codes of final poses
-    images: dict[str, Float[Array, "drawn n size size 3"]]  # of the first `drawn` poses, with sharp outlines
-    mean: dict[str, Float[Array, "n size size 3"]]  # of the images
+    pose: Float[Array, "k n 12"]  # pose codes of the last frame
+    images: dict[str, Float[Array, "drawn n size size 3"]]  # `visual` and `tactile` images with sharp outlines, [0, 1]
+    mean: dict[str, Float[Array, "n size size 3"]]  # expected images: means over the `drawn` samples
 
 
 def sample(
@@ -36,19 +36,27 @@ def sample(
     num: int,
     drawn: int,
 ) -> Samples:
-    """Sample the end of each first moment.
+    """Sample final poses and images of the last frame, given inputs of the first frame.
 
     Args:
-        graphdef: Definition of the model.
-        params: Its parameters.
-        key: Consumed.
-        inputs: Some of the model's inputs, as in `objective.experts`.
-        present: The items of each input that count.
-        empty: As in `objective.experts`.
-        condition: As in `Transition`.
-        correction: Corrects the density of the final pose.
-        num: Number of final poses.
-        drawn: Number of these poses for which both images are drawn, each with its own look (at most `num`).
+        graphdef: Definition of the model, from `init`.
+        params: Parameters of the model.
+        key: Random key.
+        inputs: Inputs by name, some of `model.config.inputs`: images `visual` and `tactile` `(n, size, size, 3)` in
+            [0, 1] with the side `input_size`, and pose codes `pose` `(n, 12)`. If the true state codes `state`
+            `(n, code)` are known, they may be an input too.
+        present: A mask for each of the inputs. True means that the item has the input. Values of other items have no
+            influence and may be NaN.
+        empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].
+        condition: Condition of the scenario, from `training.Preprocessing.encode_condition`. None if the model has no
+            condition.
+        correction: Calibration of the density of the final pose, from `fit_calibration`. None changes nothing.
+        num: Number of final poses for each item.
+        drawn: Number of these poses for which both images are rendered, at most `num`. Each image has its own sample
+            of the appearance.
+
+    Returns:
+        The samples, the expected images and the probabilities of the outcomes.
     """
     model = nnx.merge(graphdef, params)
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
@@ -64,7 +72,8 @@ def sample(
         looks.reshape(-1, looks.shape[-1]),
     )
     shown = {name: reduced(x, model.config.image_size) for name, x in empty.items()}
-    # The levels of each item are equally spaced, in random order.
+    # An image is sharp because pixels are covered above a level of probability. The levels of an item are equally
+    # spaced, in random order.
     order = jax.vmap(lambda key: jax.random.permutation(key, drawn))(jax.random.split(outline, len(mean)))
     sharp = compose(layers, shown, (order.T.reshape(-1) + 0.5) / drawn)
     soft = compose(layers, shown)
@@ -78,7 +87,7 @@ def sample(
 
 
 def _final_pose(key: PRNGKeyArray, final: FinalPose) -> tuple[Float[Array, "n 12"], Float[Array, "n 3 3"]]:
-    """Draw a final pose. Returns its code and the rotation from the present pose to it."""
+    """Draw a final pose for each item. Return its code and the rotation matrix from the first to the final pose."""
     which, noise = jax.random.split(key)
     number = len(final.outcome)
     joint = (final.outcome[:, :, None] + final.weight).reshape(number, -1)

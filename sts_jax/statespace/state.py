@@ -1,16 +1,18 @@
-"""State codes: pose, shape and mass of an object, and its shape in the sensor's frame.
+"""State codes: numbers that describe the pose, the shape and the mass of an object in the first frame of a trajectory.
 
-A state code has these parts, in this order:
+The shape is described by the support function of the object's convex hull: `h(d)` is the maximum of `x . d` over all
+points x of the hull, that is, how far the hull reaches from the mesh origin in the direction d. A state code has these
+parts, in this order:
 
 - `pose`: the pose code, see `statespace.poses`
-- `own`: the support function of the object's hull about the mesh origin, as harmonics in the object's frame
-- `com`: the centre of mass in the object's frame
+- `own`: the support function as coefficients of spherical harmonics, for directions in the mesh frame
+- `com`: the centre of mass in the mesh frame
 - `mass`: the logarithm of the mass
-- `shown`: the support function in the sensor's frame, for the present rotation
-- `low`: the centre of mass relative to the mesh origin, in the sensor's frame
+- `shown`: the support function for directions in the sensor frame, which depends on the object's rotation
+- `low`: the vector from the mesh origin to the centre of mass, in the axes of the sensor frame
 
-The last two follow from the others. They are parts of the code because an image shows them directly, even if the
-rotation is uncertain.
+`shown` and `low` follow from the other parts. The code includes them because an image determines them directly, even
+if the rotation of the mesh frame is uncertain.
 """
 
 import functools
@@ -24,17 +26,17 @@ from jaxtyping import Array, Float
 from sts_jax import objects
 from sts_jax.statespace import harmonics, poses
 
-DEGREE = 6  # of the support function's harmonics
-SUPPORT = harmonics.number(DEGREE)
-LENGTH = 0.01  # m, unit of the support function and of the centre of mass
-MEAN = 3.0  # of the support function, in this unit
+DEGREE = 6  # largest degree of the spherical harmonics of a support function
+SUPPORT = harmonics.number(DEGREE)  # number of coefficients of a support function
+LENGTH = 0.01  # m, unit of support functions and of centres of mass
+MEAN = 3.0  # subtracted from support functions, in units of LENGTH
 MASS = 0.05  # kg, unit of the mass
-SIZES = (poses.CODE, SUPPORT, 3, 1, SUPPORT, 3)
+SIZES = (poses.CODE, SUPPORT, 3, 1, SUPPORT, 3)  # numbers of each part
 CODE = sum(SIZES)  # numbers in a state code
 
 
 class State(NamedTuple):
-    """The parts of a state code, or of its variance."""
+    """The parts of state codes, as in the docstring of the module, or the variances of these parts."""
 
     pose: Float[Array, "n 12"]
     own: Float[Array, "n k"]
@@ -46,18 +48,18 @@ class State(NamedTuple):
 
 @functools.cache
 def _fit() -> np.ndarray:
-    """Matrix (128, k) of the least-squares fit of harmonics to values in `objects.DIRECTIONS`."""
+    """Matrix (128, k) that maps values at `objects.DIRECTIONS` to coefficients, as a least-squares fit."""
     with jax.ensure_compile_time_eval():
         return np.linalg.pinv(np.asarray(harmonics.basis(jnp.asarray(objects.DIRECTIONS), DEGREE))).T
 
 
 def split(code: Float[Array, "n code"]) -> State:
-    """The parts of state codes."""
+    """Split state codes into their parts."""
     return State(*jnp.split(code, np.cumsum(SIZES)[:-1], axis=-1))
 
 
 def join(state: State) -> Float[Array, "n code"]:
-    """The inverse of `split`."""
+    """Join parts to state codes. This is the inverse of `split`."""
     return jnp.concatenate(state, axis=-1)
 
 
@@ -67,13 +69,16 @@ def encode(
     mass: Float[Array, "n"],
     com: Float[Array, "n 3"],
 ) -> Float[Array, "n code"]:
-    """State codes.
+    """Encode the true states of objects.
 
     Args:
-        pose: Pose codes.
-        support: Support function (m) of the hull in `objects.DIRECTIONS`, see `objects.support`.
-        mass: Mass (kg).
-        com: Centre of mass (m) in the mesh frame.
+        pose: Pose codes, from `training.Preprocessing.encode_pose`.
+        support: Support functions at `objects.DIRECTIONS`, from `objects.support` (m).
+        mass: Masses (kg).
+        com: Centres of mass in the mesh frame (m).
+
+    Returns:
+        State codes with the parts that the docstring of the module lists.
     """
     own = (support / LENGTH - MEAN) @ _fit()
     rotation = poses.matrix(pose)
@@ -84,7 +89,15 @@ def encode(
 
 
 def turn(angle: Float[Array, "n 2"], state: State) -> State:
-    """States after a rotation of the scene about the vertical through the sensor's origin."""
+    """Rotate the scene about the z axis of the sensor frame.
+
+    Args:
+        angle: Cosine and sine of the rotation angle.
+        state: Parts of state codes.
+
+    Returns:
+        Parts of the state codes after the rotation.
+    """
     return state._replace(
         pose=poses.turn_code(angle, state.pose),
         shown=harmonics.turn(angle, state.shown[:, None])[:, 0],
@@ -93,7 +106,15 @@ def turn(angle: Float[Array, "n 2"], state: State) -> State:
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
-    """Variances of the parts of turned states, for independent numbers with the given variances."""
+    """Variances of state codes after a rotation about the z axis of the sensor frame.
+
+    Args:
+        angle: Cosine and sine of the rotation angle.
+        variance: Variances of the numbers of the state codes, which are assumed to be independent.
+
+    Returns:
+        Variances of the numbers after the rotation.
+    """
     cos, sin, (x, y, z) = angle[:, 0] ** 2, angle[:, 1] ** 2, variance.low.T
     return variance._replace(
         pose=poses.turn_variance(angle, variance.pose),
@@ -103,20 +124,34 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
 
 
 def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
-    """Distance (m) of an object's lowest point below its origin, after a rotation from the present state."""
+    """Height of the mesh origin above the lowest point of an object, after a further rotation.
+
+    Args:
+        state: Parts of state codes.
+        rotation: Rotation matrices from the orientation in `state` to the new one.
+
+    Returns:
+        Heights along the z axis of the sensor frame (m).
+    """
     down = np.array([[0.0, 0.0, -1.0]], np.float32)
     return LENGTH * (MEAN + harmonics.values(state.shown[:, None], rotation, down)[:, 0, 0])
 
 
 def heading(state: State) -> Float[Array, "n 2"]:
-    """The direction of the object in the pad's plane, as cosine and sine of its angle from x.
+    """The heading of each object: a direction in the plane of the pad that turns with the object.
 
-    It is the direction of an axis of the mesh, see `poses.heading`. If the rotation is too uncertain, it is the long
-    axis of the shown shape, with an arbitrary sign. No gradient flows through it.
+    It is the direction of one of the mesh axes, see `poses.heading`. If the rotation is too uncertain, it is the long
+    axis of `shown` in the plane of the pad, with an arbitrary sign. No gradient flows through the heading.
+
+    Args:
+        state: Parts of state codes, or their means under a belief.
+
+    Returns:
+        Cosine and sine of the angle from the x axis to the heading.
     """
     state = jax.lax.stop_gradient(state)
-    certain = poses.certainty(state.pose)[:, None] > 0.5
-    # Order 2 of degree 2 is the second moment about the vertical.
+    certain = poses.certainty(state.pose)[:, None] > 0.5  # 0 for an unknown rotation, at least 0.8 for a known one
+    # The harmonics of degree 2 and orders 2 and -2 give twice the angle of the long axis.
     twice = jnp.arctan2(state.shown[:, 8], state.shown[:, 7])
     long = jnp.stack([jnp.cos(twice / 2), jnp.sin(twice / 2)], axis=-1)
     return jnp.where(certain, poses.heading(state.pose), long)

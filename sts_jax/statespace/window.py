@@ -1,4 +1,7 @@
-"""Windows around the changed part of an image, aligned with its principal axes and magnified."""
+"""Windows around the object in an image, aligned with the principal axes of its silhouette, and magnified.
+
+The silhouette is the set of all pixels that differ from the image of the empty sensor.
+"""
 
 from typing import NamedTuple
 
@@ -8,33 +11,39 @@ from jaxtyping import Array, Float
 from sts_jax._sampling import bilinear_batch
 from sts_jax.statespace import poses
 
-THRESHOLD = 12 / 255  # a pixel shows the object if a channel differs by more than this (shadows differ by less)
-MARGIN = 1.1  # side of the window, divided by the larger extent of the silhouette
+THRESHOLD = 12 / 255  # a pixel is in the silhouette if a channel differs by more than this (shadows differ by less)
+MARGIN = 1.1  # side of a window, divided by the larger extent of the silhouette
 SMALLEST = 0.08  # side of the smallest window, divided by the side of the image
 
 
 class Window(NamedTuple):
-    """A square in each image, along the principal axes of the silhouette. Lengths are shares of the image's side."""
+    """A square in each of n images, along the principal axes of the silhouette. Lengths are in sides of the image."""
 
-    centre: Float[Array, "n 2"]  # column, row
-    angle: Float[Array, "n 2"]  # cosine and sine of the angle from the columns to the long axis
-    side: Float[Array, "n"]
+    centre: Float[Array, "n 2"]  # column and row of the centre, from the left and the upper border of the image
+    angle: Float[Array, "n 2"]  # cosine and sine of the angle from the direction of increasing columns to the long axis
+    side: Float[Array, "n"]  # side of the square
 
 
 def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
-    """1 for pixels that differ from the empty sensor, else 0.
+    """Find the pixels that show the object.
 
     Args:
-        change: Images less that of the empty sensor.
+        change: Images minus the image of the empty sensor, both in [0, 1].
+
+    Returns:
+        1 for pixels that differ from the empty sensor by more than THRESHOLD in any channel, else 0.
     """
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """The window around all pixels that differ from the empty sensor, or the whole image if there are none.
+    """Find the window around the silhouette in each image.
 
     Args:
-        change: Square images less that of the empty sensor.
+        change: Square images minus the image of the empty sensor, both in [0, 1].
+
+    Returns:
+        The windows. For an image without a silhouette, the window is the whole image.
     """
     size = change.shape[1]
     weight = shows(change)
@@ -65,12 +74,17 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """The windows at another resolution. A pixel is the mean of four interpolated values, 0 outside of the image.
+    """Cut the windows out of images and resample them.
+
+    A pixel is the mean of four values, which are interpolated bilinearly. Values outside the image are 0.
 
     Args:
         images: Square images.
-        window: The window of each image.
-        side: Side of the result in pixels.
+        window: Window in each image.
+        side: Side of the resampled windows (pixels).
+
+    Returns:
+        Contents of the windows. Their columns run along the long axis of the silhouette.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5
@@ -81,6 +95,14 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Bilinear interpolation at columns and rows, where whole numbers are pixel centres. Zero outside of the image."""
+    """Interpolate images bilinearly at m places each.
+
+    Args:
+        images: Images.
+        places: Column and row of each place (pixels). Whole numbers are pixel centres.
+
+    Returns:
+        Values at the places. Outside the image they are 0.
+    """
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)

@@ -1,4 +1,4 @@
-"""Training of `sts_jax.statespace` and `sts_jax.mvae` models: arrays, loop, schedules and checkpoints."""
+"""Training of `sts_jax.statespace` and `sts_jax.mvae` models: training arrays, the training loop and checkpoints."""
 
 from sts_jax.training.arrays import Arrays, order
 from sts_jax.training.calibrating import calibrate

@@ -1,4 +1,4 @@
-"""The training set in memory, its batches and their order."""
+"""A training set in memory, its batches, and the order of the samples."""
 
 import zlib
 from collections.abc import Iterator
@@ -8,39 +8,57 @@ from typing import Any
 import jax
 import numpy as np
 
-Batch = dict[str, Any]  # dictionaries by name as in `Arrays`, and `condition`, an array or None
+Batch = dict[str, Any]  # the fields of `Arrays` by name, with the samples of one batch
 
 
 @dataclass(frozen=True)
 class Arrays:
-    """A training set in memory: arrays `(samples, *shape)` by modality. Images are uint8, or float32 in [0, 1].
+    """A training set in memory. Each dictionary has arrays `(samples, *shape)` by modality.
+
+    Images are uint8, or float32 in [0, 1].
 
     Raises:
-        ValueError: the numbers of samples differ, or are 0.
+        ValueError: The arrays have different numbers of samples, or no samples.
     """
 
-    inputs: dict[str, np.ndarray]
-    targets: dict[str, np.ndarray]  # for state-space models also the codes `state` and `pose`, and the index `outcome`
-    present: dict[str, np.ndarray] = field(default_factory=dict)  # (samples,) bool, True if not given
-    target_present: dict[str, np.ndarray] = field(default_factory=dict)
-    condition: np.ndarray | None = None  # (samples, condition)
-    empty: dict[str, np.ndarray] = field(default_factory=dict)  # images of the untouched sensor, for state-space models
-    # For state-space models: first moments without a last one, `visual` and the code `state`, (views, *shape)
+    inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
+    # Targets of the model, from last frames. A state-space model also needs the state codes `state` of the first
+    # frames, pose codes `pose`, and indices `outcome` into the outcomes of the scenario.
+    targets: dict[str, np.ndarray]
+    # bool (samples,): True if a sample has the input. An input without a mask is present in all samples.
+    present: dict[str, np.ndarray] = field(default_factory=dict)
+    target_present: dict[str, np.ndarray] = field(default_factory=dict)  # the same for targets, for `mvae` models only
+    condition: np.ndarray | None = None  # (samples, condition), encoded condition of the scenario
+    # For state-space models: `visual` and `tactile` image of the empty sensor, (size, size, 3)
+    empty: dict[str, np.ndarray] = field(default_factory=dict)
+    # For state-space models: first frames without a trajectory, as `visual` and `state`, (views, *shape)
     views: dict[str, np.ndarray] = field(default_factory=dict)
-    # For state-space models: trajectories without images, with the codes `state` and `pose`, `outcome`, and `condition`
-    # if the model has one
+    # For state-space models: trajectories without images, as `state`, `pose`, `outcome` and, if the model has a
+    # condition, `condition`, (falls, *shape)
     falls: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sizes = {len(x) for x in jax.tree.leaves(self._tree())}
         if len(sizes) != 1 or 0 in sizes:
-            raise ValueError(f"arrays have {sorted(sizes)} samples, but all must have the same number, at least one")
+            raise ValueError(
+                f"inputs, targets, present, target_present and condition have {sorted(sizes)} samples, but all arrays "
+                "must have the same number of samples, at least 1"
+            )
 
     def __len__(self) -> int:
         return len(next(iter(self.targets.values())))
 
     def take(self, index: np.ndarray, **further: np.ndarray) -> Batch:
-        """The batch of samples `index`, and of the given rows of `views` and `falls`."""
+        """Select the samples of one batch.
+
+        Args:
+            index: Indices of the samples.
+            further: Indices into the rows of `views` and `falls`, by these names. A name that is not given is not part
+                of the batch.
+
+        Returns:
+            The selected arrays by field, and all of `empty`.
+        """
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
 
@@ -58,10 +76,20 @@ class Arrays:
 
 
 def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
-    """Indices of the samples of batches `start` to `stop - 1`, a function of the seed and the step alone.
+    """Iterate over the batches of a training as arrays of sample indices.
 
-    Each epoch has a permutation of the samples, and a batch may straddle two epochs. Every sample is seen once per
-    epoch and none is dropped.
+    Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the begin of the
+    next, so that no sample is dropped. A batch depends only on `seed` and its number, and not on `start`.
+
+    Args:
+        seed: Seed of the permutations.
+        samples: Number of samples.
+        batch_size: Number of samples in a batch.
+        start: Number of the first batch, from 0.
+        stop: Number after the last batch.
+
+    Yields:
+        Indices of the samples of one batch, `(batch_size,)`.
     """
     permutations: dict[int, np.ndarray] = {}
     for number in range(start, stop):

@@ -1,4 +1,4 @@
-"""The calibration of a trained state-space model on trajectories that its training did not see."""
+"""Calibrate a trained state-space model on trajectories that its training did not see."""
 
 import os
 from pathlib import Path
@@ -13,27 +13,31 @@ from sts_jax.training.model import Model, load
 
 
 def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
-    """Fit the calibration of a trained state-space model and write `calibration.json`, see `statespace.calibration`.
+    """Fit the calibration of a trained state-space model, and write it to `calibration.json` in its folder.
 
-    A model that was calibrated on the same trajectories is only read.
+    The calibration corrects the width of the predicted density of the final pose, see `statespace.fit_calibration`. If
+    the model was calibrated on the same arrays before, nothing is fitted and nothing is written.
 
     Args:
-        workdir: the folder of the model.
-        arrays: the trajectories, from `state_moments`, of objects that are in no training set.
+        workdir: Folder of the model.
+        arrays: Trajectories of objects that the model was not trained on, from `state_moments`.
 
     Returns:
         The model with its calibration.
 
     Raises:
-        FileNotFoundError: the folder holds no trained model.
-        ValueError: the model is of another kind, or the arrays do not fit it.
-        OSError: a file is damaged or cannot be written.
-        LockedError: another process works in the folder.
+        FileNotFoundError: The folder has no trained model.
+        ValueError: The model is not a state-space model, or the arrays do not fit the model.
+        OSError: A file is damaged or cannot be written.
+        LockedError: Another process works in the folder.
     """
     folder = Path(workdir)
     model = load(folder)
     if not isinstance(model.config, statespace.Config):
-        raise ValueError(f"{folder} holds a model of the kind mvae, but only a state-space model can be calibrated")
+        raise ValueError(
+            f"{folder} has a model of the kind mvae, but only a state-space model can be calibrated: give the folder "
+            "of a state-space model"
+        )
     learner(model.config).check(arrays)
     there, data = calibration.read(folder), arrays.checksum()
     if there is not None and there[1] == data:

@@ -1,7 +1,7 @@
-"""`calibration.json`, the calibration of a state-space model in the model's folder.
+"""Read and write `calibration.json`, the calibration of a state-space model in the model's folder.
 
-The file holds a checksum of its content, and the checksums of the checkpoint that it belongs to. It is written as a
-whole after the training, so that an interruption leaves the model as it was.
+The file contains a checksum of its content, and a checksum of the model's other files at the time of the fit. It is
+written as a whole after the training, so that an interruption leaves the model unchanged.
 """
 
 from pathlib import Path
@@ -18,16 +18,16 @@ _FORMAT = 1
 
 
 def write(folder: Path, calibration: statespace.Calibration, inputs: tuple[str, ...], data: int | None = None) -> None:
-    """Write the calibration of the current checkpoint.
+    """Write the calibration of a model's current checkpoint to `calibration.json`.
 
     Args:
-        folder: the model's folder.
-        calibration: the calibration.
-        inputs: the inputs of the model.
-        data: the checksum of the trajectories, from `Arrays.checksum`, or None if it is unknown.
+        folder: Folder of the model.
+        calibration: Calibration, from `statespace.fit_calibration`.
+        inputs: Inputs of the model, `Config.inputs`.
+        data: Checksum of the arrays that the calibration was fitted to, from `Arrays.checksum`. None if it is unknown.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file cannot be written.
     """
     subsets = {}
     for number, row in enumerate(np.asarray(calibration).T.tolist()):
@@ -38,13 +38,17 @@ def write(folder: Path, calibration: statespace.Calibration, inputs: tuple[str, 
 
 
 def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
-    """Read the calibration of the current checkpoint and the checksum of its trajectories.
+    """Read the calibration of a model's current checkpoint.
+
+    Args:
+        folder: Folder of the model.
 
     Returns:
-        None if there is none, or if it belongs to an earlier checkpoint.
+        The calibration, and the checksum of the arrays that it was fitted to (None if unknown). None instead of both if
+        the folder has no calibration, or if the model's files changed after the fit.
 
     Raises:
-        TornFileError: the file is damaged.
+        TornFileError: The file is damaged, or was written by another version of sts_jax.
     """
     path = folder / NAME
     remedy = "restore it from a copy, or delete it and calibrate again (--only train, or training.calibrate)"
@@ -62,6 +66,6 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
 
 
 def _weights(folder: Path) -> str | None:
-    """A checksum of the checkpoint that the manifest names."""
+    """A checksum of the files that the manifest lists, or None without a manifest."""
     listed = manifest.read(folder)
     return None if listed is None else _files.digest(sorted(listed.files.items()))

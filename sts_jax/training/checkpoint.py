@@ -1,12 +1,17 @@
-"""Training states on disk.
+"""Write and read checkpoints of a training.
 
-A model's folder holds `config.json` (the model, the run and the caller's preprocessing), `metrics.jsonl`,
-`checkpoints/STEP/` and `manifest.json`, which names the current checkpoint and holds the checksums of its files
-(`sts_jax.training.manifest`). If the process is killed while it writes a checkpoint, the previous one stays current.
+The folder of a model contains
 
-A checkpoint has two parts, `weights` and `optimiser`. A prediction reads the first part alone, so that another
-optimiser, or another version of optax, leaves every model readable. Orbax writes both parts. The weights may instead be
-one small file (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 hold both parts in one, which is still read.
+- `config.json`: the model, the options of the training and the preprocessing
+- `metrics.jsonl`: the training log
+- `checkpoints/STEP/`: the current checkpoint
+- `manifest.json`: the name of the current checkpoint and the checksums of its files (`sts_jax.training.manifest`)
+
+If the process is killed while it writes a checkpoint, the previous checkpoint stays the current one.
+
+A checkpoint has two parts, `weights` and `optimiser`. A prediction reads only the weights, so that a model stays
+readable with another optimiser or another version of optax. Orbax writes both parts. The weights may instead be one
+small file (`sts_jax.training.rounded`). Checkpoints of sts_jax 0.1 have a single part with both, and can still be read.
 """
 
 import contextlib
@@ -27,40 +32,41 @@ from sts_jax import _files
 from sts_jax.training import manifest, rounded
 
 WEIGHTS, OPTIMISER = "weights", "optimiser"  # the parts of a checkpoint
-_UNDIVIDED = "state"  # the only part in checkpoints of sts_jax 0.1
+_UNDIVIDED = "state"  # the only part of checkpoints of sts_jax 0.1
 
 
 class TrainState(NamedTuple):
     """Everything that changes during training."""
 
-    params: nnx.State
+    params: nnx.State  # parameters
     stats: nnx.State  # running batch statistics
-    optimiser: optax.OptState
+    optimiser: optax.OptState  # state of the optimiser
     step: Int[Array, ""]  # gradient steps done
 
 
 class Weights(NamedTuple):
     """The part of a `TrainState` that a prediction needs."""
 
-    params: nnx.State
-    stats: nnx.State
-    step: Int[Array, ""]
+    params: nnx.State  # parameters
+    stats: nnx.State  # running batch statistics
+    step: Int[Array, ""]  # gradient steps done
 
 
 State = TypeVar("State", TrainState, Weights)
 
 
 def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) -> None:
-    """Write `folder/checkpoints/STEP` and its checksums, then delete older checkpoints.
+    """Write a checkpoint with its checksums to `folder/checkpoints/STEP`, then delete older checkpoints.
 
     Args:
-        folder: the model's folder.
-        state: the state to write.
-        compact: whether to round the weights and write one small file, see `training.rounded`.
+        folder: Folder of the model.
+        state: State of the training, or its weights alone.
+        compact: True writes rounded weights in one small file, see `training.rounded`.
 
     Raises:
-        OSError: the disk is full or the folder is not writable. The previous checkpoint stays valid.
-        ValueError: the folder holds a checkpoint without a manifest.
+        OSError: The checkpoint cannot be written, for example because the disk is full. The previous checkpoint stays
+            valid.
+        ValueError: The folder has a checkpoint but no manifest.
     """
     before = _manifest(folder)
     if before is None:
@@ -68,7 +74,7 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
     step, kept = int(state.step), before.step
     path = manifest.checkpoint(folder, step)
     try:
-        _keep_only(folder, kept)  # an interrupted call may have left a checkpoint that the manifest does not name
+        _keep_only(folder, kept)  # deletes a checkpoint that an interrupted call may have left
         try:
             if compact:
                 path.mkdir(parents=True)
@@ -90,28 +96,35 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
 
 
 def restore(folder: Path, like: State) -> State | None:
-    """Restore the newest state in `folder`, or return None if there is none yet.
+    """Read the state of the current checkpoint, after comparing all files with their checksums.
 
     Args:
-        folder: the model's folder.
-        like: a state, or the `jax.eval_shape` of one, with the structure, shapes and dtypes to restore.
+        folder: Folder of the model.
+        like: A state, or the result of `jax.eval_shape` for a state. It sets the structure, the shapes and the dtypes.
 
     Returns:
-        A state of the same structure and dtypes.
+        A state of the same structure, or None if the folder has no checkpoint.
 
     Raises:
-        TornFileError: a file is damaged, missing or not listed in the manifest.
-        ValueError: the checkpoint belongs to another model, or has no manifest.
+        TornFileError: A file is damaged, missing or not listed in the manifest.
+        ValueError: The checkpoint was written for another model or optimiser, or has no manifest.
     """
     path = verified(folder)
     return None if path is None else read(path, like)
 
 
 def verified(folder: Path) -> Path | None:
-    """Compare all files of a model with their checksums, and return its current checkpoint, or None before the first.
+    """Compare all files of a model with their checksums.
+
+    Args:
+        folder: Folder of the model.
+
+    Returns:
+        The folder of the current checkpoint, or None if there is no checkpoint.
 
     Raises:
-        TornFileError, ValueError: as `restore`.
+        TornFileError: A file is damaged, missing or not listed in the manifest.
+        ValueError: The folder has a checkpoint but no manifest.
     """
     listed = _manifest(folder)
     if listed is None:
@@ -121,10 +134,17 @@ def verified(folder: Path) -> Path | None:
 
 
 def read(path: Path, like: State) -> State:
-    """Read the arrays of a checkpoint that `like` contains, and no others.
+    """Read those arrays of a checkpoint that `like` contains.
+
+    Args:
+        path: Folder of the checkpoint.
+        like: A state, or the result of `jax.eval_shape` for a state. It sets the structure, the shapes and the dtypes.
+
+    Returns:
+        A state of the same structure.
 
     Raises:
-        ValueError: the checkpoint lacks one of them, or has it with another shape or dtype. The message names the part.
+        ValueError: The checkpoint cannot be read, or an array is missing or has another shape or dtype.
     """
     loaded: dict[str, Array] = {}
     for part, wanted in _parts(like).items():
@@ -137,14 +157,14 @@ def read(path: Path, like: State) -> State:
             reason = f"({type(error).__name__}: {_first_line(error)})"
             if part == OPTIMISER:
                 raise ValueError(
-                    f"{path} has no state of this optimiser {reason}: its training used another optimiser, or "
-                    "Predictor.save wrote it, which leaves the optimiser's state out. Give the optimiser that the "
+                    f"{path} has no state of this optimiser {reason}: the training used another optimiser, or the "
+                    "model was written by Predictor.save, which leaves out the optimiser. Give the optimiser that the "
                     "training began with, or train in another folder. Predictor.load reads this model either way."
                 ) from None
             raise ValueError(
-                f"{path} cannot be read {reason}: it was damaged before its checksums were taken, or belongs to "
-                "another model, or to a version of sts_jax with other networks. Give another folder, load it with the "
-                "version that trained it, or delete it and train again."
+                f"{path} cannot be read {reason}: it was damaged before its checksums were taken, or it belongs to "
+                "another model, or to a version of sts_jax with other networks. Give another folder, load the model "
+                "with the version that trained it, or delete the folder and train again."
             ) from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
@@ -152,17 +172,17 @@ def read(path: Path, like: State) -> State:
 def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Array]:
     stored = part if (path / part).is_dir() else _UNDIVIDED
     if not wanted and stored != part:
-        return {}  # of an optimiser without arrays
+        return {}  # an optimiser without arrays has no part of its own
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     abstract = {name: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device) for name, x in wanted.items()}
     context = ocp.Context()
     context.pytree.loading.partial_load = True
     with _quiet_orbax():
-        # Compare first, because Orbax cuts or pads arrays of another shape, or prints thousands of lines.
+        # Compare the shapes first. Orbax cuts or pads arrays of another shape, or prints thousands of lines.
         there = ocp.metadata(str(path.absolute()), stored).metadata
         _compare(there, wanted)
         if stored == OPTIMISER and there.keys() != wanted.keys():
-            raise ValueError(f"{min(there.keys() - wanted.keys())} belongs to another optimiser than the given one")
+            raise ValueError(f"{min(there.keys() - wanted.keys())} is not part of the state of the given optimiser")
         with context:
             return ocp.load(str(path.absolute()), abstract, checkpointable_name=stored)
 
@@ -176,21 +196,25 @@ def _read_rounded(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
 def _compare(there: dict[str, Any], wanted: dict[str, Any]) -> None:
     for name, x in wanted.items():
         if name not in there or (there[name].shape, there[name].dtype) != (x.shape, x.dtype):
-            raise ValueError(f"{name} is missing or has another shape")
+            raise ValueError(f"{name} is missing, or has another shape or dtype")
 
 
 def seal(folder: str | os.PathLike[str]) -> None:
-    """Write a manifest of the present files of a model that was trained by sts_jax 0.1, which wrote none.
+    """Write the missing manifest of a model that was trained by sts_jax 0.1, with the checksums of its present files.
+
+    Args:
+        folder: Folder of the model.
 
     Raises:
-        FileNotFoundError: the folder has no checkpoint.
-        ValueError: the folder has a manifest.
+        FileNotFoundError: The folder has no checkpoint.
+        ValueError: The folder already has a manifest.
+        OSError: The manifest cannot be written.
     """
     folder = Path(folder)
     if (folder / manifest.NAME).exists():
         raise ValueError(
-            f"{folder} has a {manifest.NAME} already, and its files are verified whenever it is loaded: there is "
-            f"nothing to seal. If you changed a file on purpose, delete {manifest.NAME} first."
+            f"{folder} already has a {manifest.NAME}, which verifies the files whenever the model is loaded: nothing "
+            f"has to be done. If you changed a file on purpose, delete {manifest.NAME} first."
         )
     steps = _steps(folder)
     if not steps:
@@ -199,33 +223,36 @@ def seal(folder: str | os.PathLike[str]) -> None:
 
 
 def _manifest(folder: Path) -> manifest.Manifest | None:
+    """Read the manifest. Raise a ValueError if there is none although the folder has a checkpoint."""
     found = manifest.read(folder)
     if found is None and _steps(folder):
         raise ValueError(
-            f"{folder} has a checkpoint but no {manifest.NAME}: it was trained by an earlier version of sts_jax, or "
-            "the file was deleted, and nothing shows that its files are undamaged. Delete the folder and train again, "
-            f"or, if you trust these files, call training.seal({str(folder)!r}) once."
+            f"{folder} has a checkpoint but no {manifest.NAME}: the model was trained by an earlier version of "
+            "sts_jax, or the file was deleted. Damage to the other files cannot be found without it. Delete the folder "
+            f"and train again or, if you trust the files, call training.seal({str(folder)!r}) once."
         )
     return found
 
 
 def _steps(folder: Path) -> list[int]:
+    """The steps of all checkpoints in a model's folder."""
     checkpoints = folder / "checkpoints"
     return [int(path.name) for path in checkpoints.iterdir() if path.name.isdigit()] if checkpoints.is_dir() else []
 
 
 def _keep_only(folder: Path, step: int | None) -> None:
+    """Delete all checkpoints in a model's folder but that of one step. None deletes all."""
     checkpoints = folder / "checkpoints"
     for path in checkpoints.iterdir() if checkpoints.is_dir() else ():
         if step is None or path != manifest.checkpoint(folder, step):
-            shutil.rmtree(path, ignore_errors=True)  # a leftover does no harm, because the manifest does not name it
+            shutil.rmtree(path, ignore_errors=True)  # a folder that remains is ignored: the manifest does not name it
 
 
 @contextlib.contextmanager
 def _quiet_orbax() -> Iterator[None]:
-    """Silence the log in which Orbax prints the tracebacks of its threads before it raises their error.
+    """Silence the log in which Orbax prints the tracebacks of its threads, for example 237 lines if the disk is full.
 
-    A full disk gives 237 lines of them. A thread that fails after the error was raised still logs its traceback.
+    Orbax also raises the error. A thread that fails after the error was raised still logs its traceback.
     """
     logger = logging.getLogger("absl")
     disabled, logger.disabled = logger.disabled, True
@@ -241,13 +268,13 @@ def _first_line(error: Exception) -> str:
 
 
 def _plain(state: TrainState | Weights) -> dict[str, Any]:
-    """The leaves by path, so that the files do not depend on the classes of Flax and optax."""
+    """The arrays of a state by their paths, so that the files do not depend on the classes of Flax and optax."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
 def _parts(state: TrainState | Weights) -> dict[str, dict[str, Any]]:
-    """The leaves of each part of a checkpoint."""
+    """The arrays of a state by part of the checkpoint, then by path."""
     leaves = _plain(state)
     optimiser = {name: leaf for name, leaf in leaves.items() if name.startswith(f"{OPTIMISER}/")}
     weights = {name: leaf for name, leaf in leaves.items() if name not in optimiser}

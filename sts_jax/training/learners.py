@@ -1,4 +1,4 @@
-"""The parts of a training that differ between the kinds of models: initialisation, loss and the check of the arrays."""
+"""The parts of a training that differ between `mvae` and `statespace` models: initialisation, loss, check of arrays."""
 
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -10,13 +10,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from sts_jax import mvae, statespace
 from sts_jax.training.arrays import Arrays, Batch
 
-Config = mvae.Config | statespace.Config  # of a model of either kind
-Terms = dict[str, Array]  # the parts of a loss, scalars by name
+Config = mvae.Config | statespace.Config  # configuration of a model of either kind
+Terms = dict[str, Array]  # scalars by name: the loss and its parts
 
 
 @runtime_checkable
 class Loss(Protocol):
-    """The loss of one batch, a pure function that `jax.grad` and `jax.jit` trace."""
+    """Type of a loss: a pure function of one batch, which `jax.grad` and `jax.jit` can trace."""
 
     def __call__(
         self,
@@ -27,39 +27,46 @@ class Loss(Protocol):
         batch: Batch,
         beta: Float[Array, ""],
     ) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
-        """Compute the loss.
+        """Compute the loss of one batch.
 
         Args:
-            graphdef: definition of the model.
-            params: parameters, by which the loss is differentiated.
-            stats: running batch statistics.
-            key: a key of this step, consumed.
-            batch: from `Arrays.take`, with images in float32, [0, 1].
-            beta: weight of the divergence, which rises from 0 to 1 over `TrainConfig.beta_warmup`.
+            graphdef: Definition of the model.
+            params: Parameters of the model. The loss is differentiated by them.
+            stats: Running batch statistics of the model.
+            key: Random key, another one in every step.
+            batch: Arrays of the batch, from `Arrays.take`, with images as float32 in [0, 1].
+            beta: Weight of the divergence, which rises from 0 to 1 over the share `TrainConfig.beta_warmup` of the
+                steps.
 
         Returns:
-            The loss, and a pair: the new batch statistics (`stats` if the loss changes none), and the scalars of a
-            record by name. One of them is `loss`, which must be finite.
+            The loss, and a pair: the new running batch statistics (`stats` if the loss does not change them), and
+            scalars by name for the training log. One of the scalars must be `loss`. The training stops with an error if
+            it is not finite.
         """
         ...
 
 
 class Learner(NamedTuple):
-    """Initialisation, loss and check of one model."""
+    """The functions that train one model: initialisation, loss and check of the training set."""
 
-    config: Config
-    init: Callable[[Array], tuple[nnx.GraphDef[Any], nnx.State, nnx.State]]  # from a key: definition, params, stats
+    config: Config  # configuration of the model
+    # Takes a random key. Returns the definition of the model, its parameters and its running batch statistics
+    init: Callable[[Array], tuple[nnx.GraphDef[Any], nnx.State, nnx.State]]
     loss: Loss
-    check: Callable[[Arrays], None]  # raises ValueError for arrays that do not fit
+    check: Callable[[Arrays], None]  # raises a ValueError if a training set does not fit the model
 
 
 def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
-    """The learner of a model.
+    """Make the learner of a model, with the loss of `mvae.loss` or `statespace.loss`.
 
     Args:
-        model: the configuration of the model.
-        targets: for `mvae` models, the argument `asked` of `mvae.loss`.
-        absent: for `mvae` models, the argument `absent` of `mvae.loss`.
+        model: Configuration of the model.
+        targets: For `mvae` models: `all` if every subset of the modalities predicts all modalities, `own` if it
+            predicts its members.
+        absent: For `mvae` models: names of modalities that no sample has as an input.
+
+    Returns:
+        The learner.
     """
 
     def paper_loss(
@@ -89,12 +96,12 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
 
 
 def _check_state(model: statespace.Config, arrays: Arrays) -> None:
-    """Raise a ValueError if the arrays do not fit a state-space model."""
+    """Raise a ValueError if a training set does not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
             f"present has masks for {sorted(arrays.present)}, target_present has masks for "
-            f"{sorted(arrays.target_present)}, but the "
-            f"model takes masks only of its inputs {list(model.inputs)}: remove the others"
+            f"{sorted(arrays.target_present)}, but a state-space model has masks only in `present`, for its inputs "
+            f"{list(model.inputs)}: remove all other masks"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES
@@ -106,10 +113,14 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         found = {name: x.shape[1:] for name, x in values.items()}
         if found != expected[kind]:
             raise ValueError(
-                f"{kind} have samples of {found}, but the model takes {expected[kind]}: make them with state_moments"
+                f"{kind} has samples of the shapes {found}, but the model needs {expected[kind]}: make the arrays with "
+                "training.state_moments"
             )
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
-        raise ValueError(f"empty needs `visual` and `tactile` of shape {(*size, 3)}, from dataset.empty_frame")
+        raise ValueError(
+            f"empty has the shapes { {name: x.shape for name, x in arrays.empty.items()} }, but it must have `visual` "
+            f"and `tactile` images of shape {(*size, 3)}: make them with dataset.empty_frame"
+        )
     further = {
         "views": {"visual": (*size, 3), "state": (statespace.STATE_CODE,)},
         "falls": {**codes, "outcome": (), **({"condition": (model.condition,)} if model.condition else {})},
@@ -119,53 +130,54 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         if values and (found != further[kind] or len({len(x) for x in values.values()}) > 1):
             shapes = {name: x.shape for name, x in values.items()}
             raise ValueError(
-                f"{kind} has {shapes}, but it takes equally many samples of {further[kind]}: make them with "
-                "state_moments"
+                f"{kind} has arrays of the shapes {shapes}, but it must have samples of the shapes {further[kind]}, "
+                "equally many in all arrays: make them with training.state_moments"
             )
     for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
             raise ValueError(
-                f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}, but the model takes whole "
-                f"numbers from 0 to {model.outcomes - 1}: give such numbers, or a model of more outcomes"
+                f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}, but the model needs integers "
+                f"from 0 to {model.outcomes - 1}: give such indices, or a model with more outcomes"
             )
     _check_condition(model.condition, arrays)
 
 
 def _check_condition(expected: int, arrays: Arrays) -> None:
-    """Raise a ValueError if the condition has another width than that of the model."""
+    """Raise a ValueError if the condition of the training set has another width than the model needs."""
     width = 0 if arrays.condition is None else arrays.condition.shape[1]
     if width != expected:
         raise ValueError(
-            f"condition has width {width}, but the model takes {expected}: give arrays of this width, or a model with "
-            f"condition={width}"
+            f"condition has width {width}, but the model needs width {expected}: give a condition of this width (None "
+            f"for 0), or a model with condition={width}"
         )
 
 
 def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
-    """Raise a ValueError if the arrays do not fit an `mvae` model."""
+    """Raise a ValueError if a training set does not fit an `mvae` model."""
     for name in absent:
         if np.any(arrays.present.get(name, False)):
             raise ValueError(
-                f"{name} is declared absent, but {int(np.sum(arrays.present[name]))} samples have it: remove it from "
-                "`absent`"
+                f"absent names {name!r}, but present[{name!r}] marks {int(np.sum(arrays.present[name]))} samples that "
+                "have it: remove the name from `absent`"
             )
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())
         if not needed <= set(values) <= set(model.names):
             raise ValueError(
-                f"{kind} has {sorted(values)}, but the model {sorted(model.names)} needs {sorted(needed)}: give these, "
-                "or name the missing inputs in `absent`"
+                f"{kind} has the modalities {sorted(values)}, but the model with the modalities {sorted(model.names)} "
+                f"needs {sorted(needed)}: give these, or name the missing inputs in `absent`"
             )
     for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
         if not set(masks) <= set(model.names):
             raise ValueError(
-                f"{kind} has masks for {sorted(masks)}, but the model has {sorted(model.names)}: remove the others"
+                f"{kind} has masks for {sorted(masks)}, but the model has the modalities {sorted(model.names)}: remove "
+                "all other masks"
             )
     for modality in model.modalities:
         for values in (arrays.inputs, arrays.targets):
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
                 raise ValueError(
-                    f"{modality.name}: arrays of shape {values[modality.name].shape[1:]}, but the model's Modality has "
-                    f"shape {modality.shape}: give arrays of that shape, or a model with the arrays' shape"
+                    f"{modality.name}: the samples have the shape {values[modality.name].shape[1:]}, but the modality "
+                    f"of the model has the shape {modality.shape}: give samples of this shape, or another model"
                 )
     _check_condition(model.condition, arrays)

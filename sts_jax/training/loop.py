@@ -1,4 +1,7 @@
-"""The training loop: a Python loop over one compiled step, because convolutions in `lax.scan` are slow on a CPU."""
+"""The training loop.
+
+It is a Python loop over one compiled step, because convolutions in `lax.scan` are slow on a CPU.
+"""
 
 import json
 import os
@@ -22,14 +25,24 @@ from sts_jax.training.config import TrainConfig
 from sts_jax.training.learners import Config, Learner, Loss, Terms, learner
 from sts_jax.training.model import KINDS, Model, load
 
-Progress = Callable[[int, int, dict[str, float]], None]  # takes the steps done, their total, and the latest record
-Log = Callable[[int, dict[str, float]], None]  # takes the step of a record, and its other numbers by name
+Progress = Callable[[int, int, dict[str, float]], None]  # arguments: steps done, steps in total, latest record
+Log = Callable[[int, dict[str, float]], None]  # arguments: step of a record, its other numbers by name
 
 
 def initial(
     config: TrainConfig, learner: Learner, total: int, optimiser: optax.GradientTransformation | None = None
 ) -> tuple[nnx.GraphDef[Any], TrainState]:
-    """Initialise a model and its training state from `config.seed`. The arguments are those of `step`."""
+    """Initialise a model and the state of its training from `config.seed`.
+
+    Args:
+        config: Options of the training.
+        learner: Initialisation and loss of the model, from `learner`.
+        total: Number of steps of the whole training.
+        optimiser: Optimiser (default: that of `training.optimiser`).
+
+    Returns:
+        The definition of the model, and the state before the first step.
+    """
     graphdef, params, stats = learner.init(jax.random.key(config.seed))
     optimiser = optimiser or optimisers.optimiser(config, total)
     return graphdef, TrainState(params, stats, optimiser.init(params), jnp.zeros((), jnp.int32))
@@ -44,22 +57,25 @@ def step(
     batch: Batch,
     optimiser: optax.GradientTransformation | None = None,
 ) -> tuple[TrainState, Terms]:
-    """Take one gradient step. The state keeps its structure and dtypes.
+    """Make one gradient step.
 
     Args:
-        learner: the loss.
-        graphdef: definition of the model.
-        config: options of the training run.
-        total: steps of the whole run, which determine beta and the learning rate.
-        state: the state before the step.
-        batch: from `Arrays.take`. Images in uint8 become float32 in [0, 1] here.
-        optimiser: the optimiser of `state` (default: that of `training.optimiser`).
+        learner: Loss of the model, from `learner`.
+        graphdef: Definition of the model.
+        config: Options of the training.
+        total: Number of steps of the whole training, which determines `beta` and the learning rate.
+        state: State before the step.
+        batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
+        optimiser: Optimiser that made `state` (default: that of `training.optimiser`).
 
     Returns:
-        The state after the step, and the parts of the loss before it.
+        The state after the step, with the same structure and dtypes, and the parts of the loss before the step.
+
+    Raises:
+        ValueError: The loss function returns no part with the name `loss`.
     """
     batch = jax.tree.map(lambda x: x.astype(jnp.float32) / 255 if x.dtype == jnp.uint8 else x, batch)
-    # Half of the split is unused. Another stream would be as good, but the published results were made with this one.
+    # The second key is unused. Without the split, the noise would differ from that of the published results.
     noise, _ = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step))
     warmup = max(config.beta_warmup * total, 1)
     beta = jnp.minimum(state.step.astype(jnp.float32) / warmup, 1)
@@ -69,7 +85,9 @@ def step(
 
     gradient, (stats, terms) = jax.grad(objective, has_aux=True)(state.params)
     if "loss" not in terms:
-        raise ValueError(f"loss returned the parts {sorted(terms)}, but one of them must be `loss`: add it, see Loss")
+        raise ValueError(
+            f"loss returned the parts {sorted(terms)}, but one of them must be `loss`: add it, see training.Loss"
+        )
     optimiser = optimiser or optimisers.optimiser(config, total)
     update, rest = optimiser.update(gradient, state.optimiser, state.params)
     return TrainState(optax.apply_updates(state.params, update), stats, rest, state.step + 1), terms
@@ -90,40 +108,42 @@ def train(
     progress: Progress | None = None,
     log: Log | None = None,
 ) -> Model:
-    """Train a model in `workdir`, or resume where an earlier call stopped.
+    """Train a model in the folder `workdir`, or resume its training where an earlier call stopped.
 
-    On one machine, a run that was killed and resumed gives the same parameters, to the last bit, as an uninterrupted
-    one. A finished run is only read. Other entries in `workdir` are not changed. One process at a time can train in a
-    folder.
+    On one machine, a training that was killed and resumed ends with the same bits as an uninterrupted training. If the
+    training in `workdir` has finished, the model is loaded and nothing is written. Files of other names in `workdir`
+    are not changed. Only one process at a time can train in a folder.
 
     Args:
-        config: options of the training run.
-        model: configuration of the model.
-        arrays: the training set.
-        workdir: the model's folder, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
-        absent: for `mvae` models, modalities that no sample has. `arrays.inputs` may lack them.
-        targets: for `mvae` models, `all` or `own`, see `mvae.loss`.
-        preprocessing: plain values for `config.json` that describe how images and vectors were made.
-        loss: another loss than that of `training.learner`. Its dependence on `targets` and `absent` is up to the
-            caller.
-        optimiser: another optimiser than that of `training.optimiser`. The fields of `config` for Adam, the learning
-            rate and the clipping are then not used.
-        notes: plain values for `config.json` that name the given loss and optimiser. Functions cannot be compared, but
-            a folder with other notes is refused.
-        progress: called after every step with the steps done, their total, and the latest record of
-            `metrics.jsonl` (empty before the first).
-        log: called with the step and the values of each record. Records of earlier calls on the same folder come
-            first, so that every call passes the records of the whole run, once each and in order.
+        config: Options of the training.
+        model: Configuration of the model.
+        arrays: Training set.
+        workdir: Folder of the model, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
+        absent: For `mvae` models: names of modalities that no sample has as an input. `arrays.inputs` need not have
+            them.
+        targets: For `mvae` models: `all` if every subset of the modalities predicts all modalities, `own` if it
+            predicts its members.
+        preprocessing: Plain values that describe how images and vectors were made. They are stored in `config.json`.
+        loss: Loss that replaces the loss of the model (default: that of `training.learner`). `targets` and `absent` are
+            not passed to it.
+        optimiser: Optimiser that replaces Adam (default: that of `training.optimiser`). The fields of `config` for
+            Adam, the learning rate and the clipping are then not used.
+        notes: Plain values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
+            must have the same notes, because the functions themselves cannot be compared.
+        progress: Function that is called after every step with the number of steps done, their total number, and the
+            latest record of `metrics.jsonl` (empty before the first record).
+        log: Function that is called with the step and the values of each record. In a resumed training, the records of
+            earlier calls come first, so that every call of `train` passes all records of the training in order.
 
     Returns:
         The trained model.
 
     Raises:
-        ValueError: `workdir` was made with other settings or data, or holds a checkpoint without a manifest or of
-            another optimiser, or the arrays contradict `absent` or lack a modality.
-        OSError: a file in `workdir` is damaged or cannot be written.
-        LockedError: another process trains in `workdir`.
-        FloatingPointError: the loss is no longer finite.
+        ValueError: `workdir` has a training with other settings, other data or another optimiser, or a checkpoint
+            without a manifest, or `arrays` does not fit the model.
+        OSError: A file in `workdir` is damaged or cannot be written.
+        LockedError: Another process trains in `workdir`.
+        FloatingPointError: The loss is not finite.
     """
     workdir = Path(workdir)
     total = config.total(len(arrays))
@@ -147,7 +167,7 @@ def train(
         settings["notes"] = notes
     settings = json.loads(json.dumps(settings))
     there = manifest.read(workdir)
-    if there is not None and there.step == total:  # takes no lock, because a lock writes a file
+    if there is not None and there.step == total:  # without a lock, because a lock would write a file
         _files.claim(workdir / "config.json", settings)
         _send(records.read(workdir / records.NAME, total), log)
         return load(workdir)
@@ -172,10 +192,10 @@ def _run(
     progress: Progress | None,
     log: Log | None,
 ) -> TrainState:
-    """Take the remaining steps, with a record every `log_every` and a checkpoint every `checkpoint_every` steps."""
+    """Make the remaining steps, with a record every `log_every` and a checkpoint every `checkpoint_every` steps."""
     start, total, path = int(state.step), config.total(len(arrays)), workdir / records.NAME
     kept = records.read(path, start)
-    records.write(path, kept)  # drops the records after the checkpoint, which the steps below write again
+    records.write(path, kept)  # without the records after the checkpoint, which the steps below write again
     _send(kept, log)
     record = kept[-1] if kept else {}
     further = {
@@ -196,8 +216,8 @@ def _run(
             if not np.isfinite(record["loss"]):
                 raise FloatingPointError(
                     f"{workdir}: the loss is {record['loss']} at step {done}: lower TrainConfig.learning_rate (now "
-                    f"{config.learning_rate}) or TrainConfig.clip (now {config.clip}). An optimiser of your own uses "
-                    "neither: change it instead"
+                    f"{config.learning_rate}), or set a lower TrainConfig.clip (now {config.clip}). If you gave an "
+                    "optimiser, change the optimiser instead, because it uses neither"
                 )
         if done % config.checkpoint_every == 0 or done == total:
             save(workdir, state)
@@ -207,6 +227,7 @@ def _run(
 
 
 def _send(some: list[records.Record], log: Log | None) -> None:
+    """Call `log` with each record."""
     if log is not None:
         for record in some:
             log(int(record["step"]), {name: value for name, value in record.items() if name != "step"})

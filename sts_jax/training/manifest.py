@@ -1,8 +1,8 @@
-"""Checksums of a model's folder.
+"""Read and write `manifest.json`, the checksums of the files of a model.
 
-`manifest.json` holds the SHA-256 of `config.json`, of `blank.npz` if the folder has one, and of every file of the
-current checkpoint. A new checkpoint is written first, then the manifest is replaced as a whole, then the older
-checkpoint is deleted. The files of the manifest are therefore complete whenever the process is killed.
+The manifest has the SHA-256 of `config.json`, of `blank.npz` if the folder has one, and of every file of the current
+checkpoint. A new checkpoint is written first, then the manifest is replaced as a whole, then the older checkpoint is
+deleted. If the process is killed at any time, all files that the manifest lists are complete.
 """
 
 from pathlib import Path
@@ -16,22 +16,22 @@ _BESIDE = ("config.json", "blank.npz")  # files outside the checkpoint that a ma
 
 
 class Manifest(NamedTuple):
-    """The files that belong to a model."""
+    """The files of a model and their checksums."""
 
-    step: int | None  # of the current checkpoint, None before the first one
-    files: dict[str, str]  # SHA-256 by path relative to the folder
+    step: int | None  # step of the current checkpoint, None before the first checkpoint
+    files: dict[str, str]  # SHA-256 (hexadecimal) by path relative to the folder
 
 
 def checkpoint(folder: Path, step: int) -> Path:
-    """The folder of one checkpoint."""
+    """The folder of the checkpoint of a step, inside the folder of a model."""
     return folder / "checkpoints" / f"{step:08d}"
 
 
 def read(folder: Path) -> Manifest | None:
-    """Read the manifest of a model's folder. Return None if there is none.
+    """Read the manifest in the folder of a model, or return None if there is no manifest.
 
     Raises:
-        TornFileError: the manifest is damaged.
+        TornFileError: The manifest is damaged, or was written by another version of sts_jax.
     """
     path, remedy = folder / NAME, _remedy(folder)
     if not path.exists():
@@ -43,13 +43,21 @@ def read(folder: Path) -> Manifest | None:
 
 
 def write(folder: Path, step: int | None) -> Manifest:
-    """Write a manifest that makes a checkpoint the current one.
+    """Write a manifest that names another checkpoint as the current one.
 
-    The checksums of `config.json` and `blank.npz` are kept from the previous manifest, so that damage in between is
-    still found.
+    The checksums of `config.json` and `blank.npz` are copied from the previous manifest, so that damage to them since
+    then is still found.
+
+    Args:
+        folder: Folder of the model.
+        step: Step of the checkpoint, or None if there is no checkpoint.
+
+    Returns:
+        The new manifest.
 
     Raises:
-        OSError: the manifest cannot be written.
+        TornFileError: The previous manifest is damaged.
+        OSError: The manifest cannot be written.
     """
     old = read(folder)
     files = {} if old is None else {name: digest for name, digest in old.files.items() if name in _BESIDE}
@@ -60,7 +68,15 @@ def write(folder: Path, step: int | None) -> Manifest:
 
 
 def add(folder: Path, name: str) -> None:
-    """Record the checksum of a file outside the checkpoint, if the folder has a manifest."""
+    """Add the checksum of a file outside the checkpoint to the manifest, if the folder has a manifest.
+
+    Args:
+        folder: Folder of the model.
+        name: Name of the file in the folder.
+
+    Raises:
+        OSError: A file cannot be read or written, or the manifest is damaged.
+    """
     old = read(folder)
     if old is not None:
         files = old.files | {name: _files.sha256(folder / name)}
@@ -68,17 +84,21 @@ def add(folder: Path, name: str) -> None:
 
 
 def verify(folder: Path, manifest: Manifest) -> None:
-    """Compare every file with its checksum.
+    """Compare the files of a model with their checksums.
+
+    Args:
+        folder: Folder of the model.
+        manifest: Manifest of the folder.
 
     Raises:
-        TornFileError: a file is changed, missing or not listed. The message names it and the remedy.
+        TornFileError: A file has changed, is missing or is not listed. The message names the file and the remedy.
     """
     remedy = _remedy(folder)
     for name in _there(folder, manifest.step):
         if name not in manifest.files:
             raise _files.TornFileError(
-                f"{folder / name} is not listed in {NAME}: it does not belong to this model. Move it elsewhere, or "
-                f"{remedy}."
+                f"{folder / name} is not listed in {NAME}: the file does not belong to this model. Move it elsewhere, "
+                f"or {remedy}."
             )
     for name, digest in manifest.files.items():
         path = folder / name
@@ -97,7 +117,7 @@ def verify(folder: Path, manifest: Manifest) -> None:
 
 
 def _is_manifest(content: Any) -> bool:
-    """Whether the content has the fields of a manifest, and lists files of no other checkpoint."""
+    """Return whether a JSON value has the fields of a manifest, and lists the files of its own checkpoint only."""
     if not isinstance(content, dict) or content.keys() != {"format", "step", "files"} or content["format"] != _FORMAT:
         return False
     step, files = content["step"], content["files"]
@@ -111,7 +131,7 @@ def _is_manifest(content: Any) -> bool:
 
 
 def _there(folder: Path, step: int | None) -> list[str]:
-    """The files that a manifest has to list, relative to the folder."""
+    """The existing files that a manifest has to list, as paths relative to the folder."""
     found = [folder / name for name in _BESIDE if (folder / name).exists()]
     if step is not None:
         found += sorted(path for path in checkpoint(folder, step).rglob("*") if not path.is_dir())
@@ -119,4 +139,5 @@ def _there(folder: Path, step: int | None) -> list[str]:
 
 
 def _remedy(folder: Path) -> str:
+    """The remedy with which the error messages end."""
     return f"restore it from a copy, or delete {folder} and train again"

@@ -1,4 +1,4 @@
-"""Trained models, and their loading from a folder. The optimiser plays no part in it."""
+"""Trained models, and their loading from a folder without the optimiser."""
 
 import os
 from pathlib import Path
@@ -13,18 +13,23 @@ from sts_jax.training import calibration, manifest
 from sts_jax.training.checkpoint import Weights, read, verified
 from sts_jax.training.learners import Config, learner
 
-KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.Config}  # by `kind` in `config.json`
+# The configuration class of each `kind` in `config.json`
+KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.Config}
 
 
 class Model(NamedTuple):
-    """A trained model. `mvae.predict` and `statespace.sample` take its `graphdef` and `state`."""
+    """A trained model.
 
-    config: Config
-    graphdef: nnx.GraphDef[Any]
+    `graphdef` and `state` are the arguments of `mvae.predict` for an `mvae` model, and of `statespace.sample` for a
+    state-space model.
+    """
+
+    config: Config  # configuration of the model
+    graphdef: nnx.GraphDef[Any]  # definition of the model
     state: nnx.State  # parameters and running batch statistics
     step: int  # gradient steps done
     settings: dict[str, Any]  # content of config.json: `model`, `training`, `preprocessing`, ...
-    calibration: statespace.Calibration | None = None  # of a state-space model, from `calibrate`
+    calibration: statespace.Calibration | None = None  # from `calibrate`, for state-space models
 
     def __repr__(self) -> str:
         config, numbers = self.config, sum(x.size for x in jax.tree.leaves(self.state))
@@ -36,21 +41,21 @@ class Model(NamedTuple):
 
 
 def load(workdir: str | os.PathLike[str]) -> Model:
-    """Load a trained model from its folder alone.
+    """Load a trained model from its folder.
 
-    Every file is compared with its checksum before it is used. A training may run in the folder meanwhile. The
-    optimiser's state is not read, so that it may be of any optimiser, or missing.
+    All files are compared with their checksums first. A training may run in the folder at the same time. The state of
+    the optimiser is not read, so that any optimiser may have trained the model.
 
     Args:
-        workdir: the `workdir` that was given to `train`.
+        workdir: Folder of the model, which was the `workdir` of `train`.
 
     Returns:
-        The model at its newest checkpoint.
+        The model at its current checkpoint.
 
     Raises:
-        FileNotFoundError: the folder has no `config.json` or no checkpoint.
-        OSError: a file is damaged, missing or not listed in `manifest.json`.
-        ValueError: `config.json` was written by another version of sts_jax, or the folder has no manifest.
+        FileNotFoundError: The folder has no `config.json` or no checkpoint.
+        OSError: A file is damaged, missing or not listed in `manifest.json`.
+        ValueError: The model was written by another version of sts_jax, or the folder has no manifest.
     """
     workdir = Path(workdir)
     while True:
@@ -60,7 +65,7 @@ def load(workdir: str | os.PathLike[str]) -> Model:
         except (OSError, ValueError):
             if manifest.read(workdir) == before:
                 raise
-            # A training has replaced the checkpoint while it was read, so read the new one.
+            # A training replaced the checkpoint while it was read. The loop reads the new one.
 
 
 def _load(workdir: Path) -> Model:
@@ -70,15 +75,15 @@ def _load(workdir: Path) -> Model:
     checkpoint = verified(workdir)
     settings = _files.read_json(path, f"delete {workdir} and train again")
     if checkpoint is None:
-        raise FileNotFoundError(f"{workdir} has no checkpoint: run its training to the first one")
+        raise FileNotFoundError(f"{workdir} has no checkpoint: run its training until the first checkpoint is written")
     try:
         kind = settings.get("kind", "mvae")  # version 0.1 had no other kind
         model = KINDS[kind].from_json(settings["model"])
         like = jax.eval_shape(lambda: Weights(*learner(model).init(jax.random.key(0))[1:], jnp.zeros((), jnp.int32)))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}): load it with the "
-            f"version that trained it, or delete {workdir} and train again"
+            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}): load the model "
+            f"with the version that trained it, or delete {workdir} and train again"
         ) from error
     weights = read(checkpoint, like)
     graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))

@@ -9,11 +9,14 @@ from sts_jax.training.config import TrainConfig
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
-    """Adam as configured, with `encoder_epsilon` for the encoders of an `mvae` model.
+    """Make the optimiser of a training: Adam, with `encoder_epsilon` for the encoders of an `mvae` model.
 
     Args:
-        config: options of the training run.
-        total: steps of the whole run, at the end of which a cosine schedule reaches 0.
+        config: Options of the training.
+        total: Number of steps of the whole training. A cosine schedule reaches 0 after it.
+
+    Returns:
+        The optimiser, with the learning rate schedule and the clipping of `config`.
     """
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":
@@ -32,7 +35,7 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
 
 
 def _labels(params: Any) -> Any:
-    """The label `encoders` for the encoders of an `mvae` model, and `others` for all other parameters."""
+    """Label the parameters: `encoders` for the encoders of an `mvae` model, `others` for all others."""
     paper = "decoders" in params
     return jax.tree_util.tree_map_with_path(
         lambda path, _: "encoders" if paper and path[0].key == "encoders" else "others", params

@@ -1,4 +1,4 @@
-"""Preprocessing of measurements for the networks, stored with every model."""
+"""The preprocessing of measurements for the networks, which is stored with every model."""
 
 import dataclasses
 import io
@@ -13,57 +13,77 @@ from jaxtyping import Array, Bool, Float, UInt8
 from sts_jax import _files, geometry
 from sts_jax.training import manifest
 
-# The contact test of noisy images, with the values of the contact test during a collection (`hardware.GuideConfig`)
-_NOISY_BLOCK = 2  # pixels
-_NOISY_BLOCKS = 3
-_DEVIATIONS = 6.0  # standard deviations of a block's mean
-_SMALLEST, _LARGEST = 3.0, 24.0  # of 255, limits of the threshold
-_NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+# The contact test of noisy images. It has the same values as the contact test of the collection of recordings
+# (`hardware.GuideConfig`).
+_NOISY_BLOCK = 2  # pixels, side of a block
+_NOISY_BLOCKS = 3  # least number of blocks that differ
+_DEVIATIONS = 6.0  # threshold in standard deviations of a block's mean
+_SMALLEST, _LARGEST = 3.0, 24.0  # limits of the threshold, in steps of 1/255
+_NORMAL = 1.4826  # standard deviation of a normal distribution divided by its median absolute deviation
 
 
 @dataclasses.dataclass(frozen=True)
 class Preprocessing:
-    """The view that a model was trained on, its units of pose and condition, and its criterion for a touch."""
+    """How images, poses and conditions are encoded for a model, and which tactile images show a contact.
 
-    resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
-    crop: bool = False  # the square around the object instead of the whole pad
-    position_scale: float = 0.05  # m, divisor of positions, which makes them as large as entries of a rotation matrix
+    Raises:
+        ValueError: `rotation` is unknown, `touch_block` does not divide `resolution`, or `touch_blocks` is below 1.
+    """
+
+    resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
+    crop: bool = False  # True: images show the square around the object. False: images show the whole pad
+    position_scale: float = 0.05  # m, divisor of positions, so that they are as large as entries of a rotation matrix
     # A matrix is a continuous function of the rotation, and rotated points are linear in it. A quaternion jumps where
     # its sign changes (Zhou et al. 2019, "On the Continuity of Rotation Representations in Neural Networks").
     rotation: Literal["matrix", "quaternion"] = "matrix"
-    mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is, as in the paper)
-    touch_threshold: float = 3 / 255  # blocks of a touch differ from those of the blank image by more than this
-    # The defaults are for simulated images. `touch_of_noisy_images` sets these fields for images of a camera.
-    touch_block: int = 1  # pixels, side of the blocks whose means are compared
-    touch_blocks: int = 1  # number of blocks that differ in a touch
-    touch_level: bool = False  # subtract the median change first, so that a change of the whole light is no touch
-    absent: tuple[str, ...] = ()  # modalities that no training input had
+    mask_blank_touch: bool = True  # a tactile image without contact is not an input (False: it is, as in the paper)
+    touch_threshold: float = 3 / 255  # a block differs from the blank image if a channel differs by more than this
+    # The defaults are for simulated images. `touch_of_noisy_images` sets the touch fields for images of a camera.
+    touch_block: int = 1  # pixels, side of the square blocks whose means are compared with the blank image
+    touch_blocks: int = 1  # least number of differing blocks in an image with a contact
+    touch_level: bool = False  # subtract the median change first, so that a change of all light is not a contact
+    absent: tuple[str, ...] = ()  # modalities that no training sample had as an input
     condition_scale: tuple[float, ...] = ()  # SI units, divisors of the numbers of the scenario's condition
 
     def __post_init__(self) -> None:
         if self.rotation not in ("matrix", "quaternion"):
             raise ValueError(f"rotation must be 'matrix' or 'quaternion', got {self.rotation!r}")
         if self.touch_block < 1 or any(side % self.touch_block for side in self.resolution):
-            raise ValueError(f"touch_block must divide the resolution {self.resolution}, got {self.touch_block}")
+            raise ValueError(
+                f"touch_block must divide height and width of the resolution {self.resolution}, got {self.touch_block}"
+            )
         if self.touch_blocks < 1:
             raise ValueError(f"touch_blocks must be >= 1, got {self.touch_blocks}")
 
     @property
     def pose_size(self) -> int:
-        """Number of entries in the code of a pose."""
+        """Number of values in an encoded pose: 12 with a rotation matrix, 7 with a quaternion."""
         return 3 + {"matrix": 9, "quaternion": 4}[self.rotation]
 
     def encode_pose(self, pose: Float[Array, "*n 7"]) -> Float[Array, "*n code"]:
-        """Encode a pose (m, quaternion) for the networks as `pose_size` numbers."""
+        """Encode poses for the networks.
+
+        Args:
+            pose: Position (m) and quaternion of each pose. Quaternions are normalised.
+
+        Returns:
+            Position divided by `position_scale`, followed by the rotation matrix row by row, or by the unit quaternion
+            with `w >= 0`.
+        """
         position, quat = pose[..., :3] / self.position_scale, geometry.quat_canonical(pose[..., 3:])
         if self.rotation == "matrix":
             quat = geometry.quat_to_matrix(quat).reshape(*quat.shape[:-1], 9)
         return jnp.concatenate([position, quat], axis=-1)
 
     def decode_pose(self, code: Float[Array, "*n code"]) -> Float[Array, "*n 7"]:
-        """Decode the output of a network to a pose: metres and a unit quaternion with `w >= 0`.
+        """Decode poses from the output of a network.
 
-        Nine numbers that are not a rotation matrix are replaced by the nearest one. Zeros become the identity.
+        Args:
+            code: Encoded poses. The numbers of a rotation need not be an exact rotation matrix or a unit quaternion:
+                the nearest rotation is used, and the identity if all numbers are 0.
+
+        Returns:
+            Position (m) and unit quaternion with `w >= 0` of each pose.
         """
         quat = code[..., 3:]
         if self.rotation == "matrix":
@@ -75,11 +95,27 @@ class Preprocessing:
         return jnp.concatenate([code[..., :3] * self.position_scale, quat], axis=-1)
 
     def encode_condition(self, condition: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
-        """Encode a condition (SI units) for the networks."""
+        """Encode conditions for the networks.
+
+        Args:
+            condition: Conditions of a scenario (SI units).
+
+        Returns:
+            The numbers divided by `condition_scale`.
+        """
         return condition / jnp.array(self.condition_scale, jnp.float32)
 
     def touched(self, tactile: Float[Array, "*n h w 3"], blank: Float[Array, "h w 3"]) -> Bool[Array, "*n"]:
-        """Whether a tactile image differs somewhere from the blank one, or True if blank touches are not masked."""
+        """Find the tactile images that show a contact.
+
+        Args:
+            tactile: Tactile images in [0, 1].
+            blank: Tactile image of the empty sensor in [0, 1].
+
+        Returns:
+            True for images that differ from the blank image in at least `touch_blocks` blocks. True for all images if
+            `mask_blank_touch` is False.
+        """
         if not self.mask_blank_touch:
             return jnp.ones(tactile.shape[:-3], bool)
         change = _block_means(tactile - blank, self.touch_block)
@@ -92,26 +128,29 @@ class Preprocessing:
 def touch_of_noisy_images(
     preprocessing: Preprocessing, tactile: UInt8[np.ndarray, "n h w 3"], blank: UInt8[np.ndarray, "h w 3"]
 ) -> Preprocessing:
-    """Set the criterion for a touch by the noise of a camera's images.
+    """Adapt the contact test of a preprocessing to the noise of a camera's images.
 
-    A touch differs from the blank image in three blocks of 2 x 2 pixels by more than six standard deviations of the
-    noise of a block's mean, and by at least 3 of 255. The noise is 1.4826 times the median absolute difference from the
-    blank image, so that contacts on less than half of the pad do not count. Slow changes of the light since the blank
-    image count as noise.
+    An image then shows a contact if at least three blocks of 2 x 2 pixels differ from the blank image by more than a
+    threshold. The threshold is six standard deviations of the noise of a block's mean, limited to 3/255 to 24/255. The
+    standard deviation is estimated as 1.4826 times the median absolute difference from the blank image. Contacts on
+    less than half of the pad hardly change this median. Slow changes of the light since the blank image increase it.
 
     Args:
-        preprocessing: The other fields.
-        tactile: Images of the empty pad, or with contacts on less than half of it.
-        blank: The tactile image of the untouched sensor, a mean over many frames.
+        preprocessing: Preprocessing whose other fields are kept.
+        tactile: Images of the empty pad, or of contacts on less than half of the pad.
+        blank: Tactile image of the empty sensor, a mean over many frames.
+
+    Returns:
+        The preprocessing with new fields `touch_threshold`, `touch_block`, `touch_blocks` and `touch_level`.
 
     Raises:
-        ValueError: The images have another resolution than the preprocessing, or there are none.
+        ValueError: `tactile` has no images, or the images have another resolution than the preprocessing.
     """
     shape = (*preprocessing.resolution, 3)
     if tactile.shape[1:] != shape or blank.shape != shape or not len(tactile):
         raise ValueError(
             f"tactile has shape {tactile.shape} and blank has shape {blank.shape}, but they must be (n, "
-            f"{', '.join(map(str, shape))}) with n >= 1 and {shape}: reduce the images to the resolution"
+            f"{', '.join(map(str, shape))}) with n >= 1 and {shape}: resize the images to preprocessing.resolution"
         )
     change = _block_means(tactile.astype(np.float32) - blank, _NOISY_BLOCK)
     change = change - np.median(change, axis=(-3, -2), keepdims=True)
@@ -127,7 +166,7 @@ def touch_of_noisy_images(
 
 
 def _block_means(images: Any, side: int) -> Any:
-    """Means over blocks of `side` x `side` pixels of images (*n, h, w, 3), of NumPy or JAX."""
+    """Means over blocks of `side` x `side` pixels. `images` is a NumPy or JAX array (*n, h, w, 3)."""
     if side == 1:
         return images
     height, width = images.shape[-3] // side, images.shape[-2] // side
@@ -135,20 +174,20 @@ def _block_means(images: Any, side: int) -> Any:
 
 
 def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
-    """Write `folder/blank.npz`, the images of the untouched sensor. An existing file is not changed.
+    """Write the images of the empty sensor to `folder/blank.npz`. An existing file is not changed.
 
     Args:
-        folder: the model's folder.
-        visual: `uint8 (height, width, 3)`.
-        tactile: `uint8 (height, width, 3)`.
+        folder: Folder of the model.
+        visual: Visual image, uint8 `(height, width, 3)`.
+        tactile: Tactile image, uint8 `(height, width, 3)`.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file cannot be written, or the manifest of the model is damaged.
     """
     path = folder / "blank.npz"
 
     def write(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # NumPy adds `.npz` to a name without it
+        with temporary.open("wb") as file:  # an open file, because NumPy would add `.npz` to the name
             np.savez(file, visual=visual, tactile=tactile)
 
     new = not path.exists()
@@ -160,11 +199,17 @@ def save_blank(folder: Path, visual: np.ndarray, tactile: np.ndarray) -> None:
 
 
 def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the visual and the tactile image of the untouched sensor, `uint8 (height, width, 3)` each.
+    """Read the images of the empty sensor from `folder/blank.npz`.
+
+    Args:
+        folder: Folder of the model.
+
+    Returns:
+        The visual and the tactile image, uint8 `(height, width, 3)`.
 
     Raises:
-        FileNotFoundError: the file is missing.
-        TornFileError: the file is damaged.
+        FileNotFoundError: The file is missing.
+        TornFileError: The file is damaged.
     """
     path = folder / "blank.npz"
     if not path.exists():
@@ -183,10 +228,16 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def preprocessing_from_json(content: dict) -> Preprocessing:
-    """The inverse of `dataclasses.asdict`, also after a round trip through JSON.
+    """Make a preprocessing from the result of `dataclasses.asdict`, or from the same values read from a JSON file.
+
+    Args:
+        content: Values of the fields of a `Preprocessing` by name.
+
+    Returns:
+        The preprocessing.
 
     Raises:
-        ValueError: a field is missing, unknown or of another type.
+        ValueError: The values do not describe a preprocessing.
     """
     try:
         content = json.loads(json.dumps(content))
@@ -196,6 +247,6 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
         return Preprocessing(**content)
     except (KeyError, TypeError) as error:
         raise ValueError(
-            f"{content!r} is no preprocessing ({type(error).__name__}: {error}): give dataclasses.asdict of a "
-            "training.Preprocessing as preprocessing= to training.train."
+            f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): give dataclasses.asdict "
+            "of a training.Preprocessing as preprocessing= to training.train."
         ) from error

@@ -1,4 +1,4 @@
-"""The records of a training, `metrics.jsonl`: one line of JSON per record, with the step and the parts of the loss."""
+"""The training log `metrics.jsonl`. Each line is a record in JSON: a step, and the parts of the loss at this step."""
 
 import json
 from pathlib import Path
@@ -10,20 +10,35 @@ from sts_jax import _files
 from sts_jax.training.learners import Terms
 
 NAME = "metrics.jsonl"
-Record = dict[str, float]  # `step` and the parts of the loss by name
+Record = dict[str, float]  # `step`, and the parts of the loss by name
 
 
 def mean(step: int, recent: list[Terms]) -> Record:
-    """The record of a step: means over the steps since the previous record."""
+    """Make the record of a step.
+
+    Args:
+        step: Number of steps done.
+        recent: Parts of the loss in each step since the previous record.
+
+    Returns:
+        The step, and the mean of each part.
+    """
     return {"step": step, **jax.tree.map(lambda *x: float(np.mean(x)), *recent)}
 
 
 def read(path: Path, last: int) -> list[Record]:
-    """Read the records up to step `last`, or none if there is no file. A torn last line is left out.
+    """Read the records up to a step. A damaged last line is left out, because an interruption may have cut it.
+
+    Args:
+        path: Training log. It need not exist.
+        last: Last step whose record is returned.
+
+    Returns:
+        The records in the order of the file.
 
     Raises:
-        TornFileError: another line is damaged.
-        OSError: the file cannot be read.
+        TornFileError: A line other than the last is damaged.
+        OSError: The file cannot be read.
     """
     try:
         lines = path.read_bytes().splitlines() if path.exists() else []
@@ -37,7 +52,7 @@ def read(path: Path, last: int) -> list[Record]:
             record = json.loads(line.decode())
             keep = record["step"] <= last
         except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
-            if number == len(lines):  # torn by a kill
+            if number == len(lines):  # the process was killed while it wrote this line
                 break
             raise _files.TornFileError(
                 f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): delete this line, or the "
@@ -49,19 +64,19 @@ def read(path: Path, last: int) -> list[Record]:
 
 
 def write(path: Path, records: list[Record]) -> None:
-    """Replace the file by these records.
+    """Replace the training log by these records.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file cannot be written.
     """
     _files.write_bytes(path, "".join(json.dumps(record) + "\n" for record in records).encode())
 
 
 def append(path: Path, record: Record) -> None:
-    """Append one record.
+    """Append one record to the training log.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: The file cannot be written.
     """
     try:
         with path.open("a") as file:

@@ -1,4 +1,4 @@
-"""Training arrays and models from the first and last moments of trajectories."""
+"""Training arrays and model configurations from the first and the last frames of trajectories."""
 
 import dataclasses
 
@@ -13,22 +13,23 @@ from sts_jax.sensor import Sensor
 from sts_jax.training.arrays import Arrays
 from sts_jax.training.preprocess import Preprocessing
 
-SOME = 512  # items that are encoded at once
+SOME = 512  # number of items that are encoded at once
 
 
 def moments(
     pairs: Pairs, modalities: tuple[str, ...], preprocessing: Preprocessing, blank: np.ndarray
 ) -> tuple[Arrays, Preprocessing]:
-    """Make training arrays, with first moments as inputs and last moments as targets.
+    """Make the training arrays of an `mvae` model: inputs from first frames, targets from last frames.
 
     Args:
-        pairs: trajectories, from `dataset.Dataset.pairs`.
-        modalities: modalities of the model, some of `visual`, `tactile` and `pose`.
-        preprocessing: how measurements are encoded for the networks.
-        blank: the tactile image of the untouched sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
+        pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
+        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
+        preprocessing: Preprocessing of poses and conditions, with the criterion for a contact.
+        blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:
-        The arrays, and the preprocessing with `absent` set: touch is not an input if no first moment has a contact.
+        The arrays, and the preprocessing with a new field `absent`. `absent` is `("tactile",)` if `tactile` is a
+        modality and no first frame shows a contact. The arrays then have no input `tactile`.
     """
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -43,17 +44,22 @@ def image_moments(
     preprocessing: Preprocessing,
     blank: UInt8[np.ndarray, "h w 3"],
 ) -> tuple[Arrays, Preprocessing]:
-    """`moments` of images without poses, such as those of a real sensor (`hardware.moments`).
+    """Make the training arrays of an `mvae` model from images without poses, as from a real sensor.
 
     Args:
-        visual: first and last images.
-        tactile: first and last images.
-        modalities: modalities of the model, some of `visual` and `tactile`.
-        preprocessing: its criterion for a touch decides which first touches are inputs, see `touch_of_noisy_images`.
-        blank: the tactile image of the untouched sensor.
+        visual: First and last visual image of each trajectory, for example from `hardware.moments`.
+        tactile: First and last tactile image of each trajectory.
+        modalities: Modalities of the model, one or both of `visual` and `tactile`.
+        preprocessing: Preprocessing with the criterion for a contact, see `touch_of_noisy_images`. First tactile images
+            without contact are not inputs.
+        blank: Tactile image of the empty sensor.
+
+    Returns:
+        The arrays, and the preprocessing with a new field `absent`, as from `moments`.
 
     Raises:
-        ValueError: another modality is asked for, or the images have not all the shape of the preprocessing.
+        ValueError: `modalities` has another name or none, or the images have another type or shape than
+            `preprocessing.resolution` requires.
     """
     found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
     if not modalities or not set(modalities) <= set(found):
@@ -61,8 +67,8 @@ def image_moments(
     for name, images in found.items():
         if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
             raise ValueError(
-                f"{name} is {images.dtype} of shape {images.shape}, but it must be uint8 of shape (n, "
-                f"{', '.join(map(str, shape))}) with the same n >= 1 for both streams"
+                f"{name} is {images.dtype} of shape {images.shape}, but visual and tactile must be uint8 of shape (n, "
+                f"{', '.join(map(str, shape))}) with the same n >= 1"
             )
     return _moments(found, modalities, preprocessing, blank, None)
 
@@ -74,6 +80,7 @@ def _moments(
     blank: np.ndarray,
     condition: np.ndarray | None,
 ) -> tuple[Arrays, Preprocessing]:
+    """Make the training arrays of an `mvae` model from encoded first and last frames by modality."""
     touched = _touched(found["tactile"], preprocessing, blank)
     absent = ("tactile",) if "tactile" in modalities and not touched.any() else ()
     arrays = Arrays(
@@ -86,7 +93,15 @@ def _moments(
 
 
 def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mvae.Config:
-    """The paper's networks for some modalities. The weight lambda is 1 for images and 1000 for the pose."""
+    """Make the configuration of the paper's networks. The weight lambda is 1 for images and 1000 for the pose.
+
+    Args:
+        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
+        preprocessing: Preprocessing of the training arrays.
+
+    Returns:
+        The configuration of an `mvae` model.
+    """
     pose = mvae.Modality("pose", "vector", (preprocessing.pose_size,), weight=1000.0)
     shape = (*preprocessing.resolution, 3)
     images = {name: mvae.Modality(name, "image", shape, start=0.7) for name in ("visual", "tactile")}
@@ -104,19 +119,25 @@ def state_moments(
     views: Views | None = None,
     falls: Ends | None = None,
 ) -> Arrays:
-    """Make the arrays that train a state-space model.
+    """Make the training arrays of a state-space model.
 
     Args:
-        pairs: trajectories, from `dataset.Dataset.pairs`, with images of the model's `input_size`.
-        model: from `state_model`.
-        scenario: the scenario of the trajectories.
-        preprocessing: how measurements are encoded for the networks.
-        empty: the images of the untouched sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
-        views: pictures at further starts, from `dataset.Dataset.views`, used if the model takes `visual`.
-        falls: further trajectories without images, from `dataset.Dataset.ends`.
+        pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`. The side of their images must be
+            `model.input_size`.
+        model: Configuration of the model, from `state_model`.
+        scenario: Scenario of the trajectories.
+        preprocessing: Preprocessing of poses and conditions, with the criterion for a contact.
+        empty: `visual` and `tactile` image of the empty sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
+        views: Images of objects at further starts without a trajectory, from `dataset.Dataset.views`. They are used
+            only if `visual` is an input of the model.
+        falls: Further trajectories without images, from `dataset.Dataset.ends`.
+
+    Returns:
+        The arrays.
 
     Raises:
-        ValueError: a trajectory has an outcome that the scenario does not have.
+        ValueError: A trajectory has an outcome that the scenario does not have, or the images cannot be reduced to
+            `model.image_size`.
     """
     ends: list[Pairs | Ends] = [pairs] if falls is None else [pairs, falls]
     outcome, *other_outcomes = (_outcome_index(own.outcome, scenario) for own in ends)
@@ -156,11 +177,12 @@ def state_moments(
 
 
 def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarray:
+    """Convert the numbers of outcomes to indices into `scenario.outcomes`."""
     numbers = np.array([int(known) for known in scenario.outcomes])
     if not np.isin(outcome, numbers).all():
         raise ValueError(
-            f"pairs have the outcomes {np.unique(outcome).tolist()}, but {type(scenario).__name__} has the outcomes "
-            f"{numbers.tolist()}: give the scenario of the collection"
+            f"the trajectories have the outcomes {np.unique(outcome).tolist()}, but the scenario "
+            f"{type(scenario).__name__} has the outcomes {numbers.tolist()}: give the scenario of the dataset"
         )
     return (outcome[:, None] == numbers).argmax(1).astype(np.int32)
 
@@ -168,14 +190,17 @@ def _outcome_index(outcome: np.ndarray, scenario: physics.Scenario) -> np.ndarra
 def state_codes(
     preprocessing: Preprocessing, pose: np.ndarray, support: np.ndarray, mass: np.ndarray, com: np.ndarray
 ) -> np.ndarray:
-    """Encode true states as codes (n, code) of a state-space model, see `statespace.encode`.
+    """Encode the true states of objects for a state-space model.
 
     Args:
-        preprocessing: the preprocessing of the model.
-        pose: (n, 7), m and unit quaternion.
-        support: (n, 128), m. This and the following arguments are as in `dataset.Pairs`.
-        mass: (n,), kg.
-        com: (n, 3), m, mesh frame.
+        preprocessing: Preprocessing of the model.
+        pose: Positions (m) and unit quaternions, `(n, 7)`.
+        support: Support functions of the convex hulls at `objects.DIRECTIONS`, `(n, 128)` (m).
+        mass: Masses, `(n,)` (kg).
+        com: Centres of mass in the mesh frame, `(n, 3)` (m).
+
+    Returns:
+        State codes, `(n, code)`, see `statespace.encode`.
     """
     encode = jax.jit(statespace.encode)
     parts = []
@@ -195,23 +220,28 @@ def state_model(
     *,
     image_size: int = 64,
 ) -> tuple[statespace.Config, Preprocessing]:
-    """A state-space model of the size that the experiments use, and the preprocessing with `absent` set.
-
-    Touch is not an input if no first moment has a contact. The other arguments are those of `state_moments`, and the
-    sensor.
+    """Make the configuration of a state-space model of the size that the experiments use.
 
     Args:
-        image_size: side of the predicted images, pixels.
+        pairs: First and last frames of the training trajectories, from `dataset.Dataset.pairs`.
+        sensor: Sensor of the images.
+        scenario: Scenario of the trajectories.
+        preprocessing: Preprocessing of poses and conditions, with square images of the whole view.
+        empty: `visual` and `tactile` image of the empty sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
+        image_size: Side of the predicted images (pixels). It must divide the side of the input images.
+
+    Returns:
+        The configuration, and the preprocessing with a new field `absent`. If no first frame shows a contact, `tactile`
+        is not an input of the model, and `absent` is `("tactile",)`.
 
     Raises:
-        ValueError: the images are not square, or are cropped (the model finds the object itself), or their side is no
-            multiple of `image_size`.
+        ValueError: The images are not square or are cropped, or their side is not a multiple of `image_size`.
     """
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
         raise ValueError(
-            f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}, but a state-space model "
-            "takes square images of the whole view: give a preprocessing with resolution=(n, n) and crop=False"
+            f"resolution is {preprocessing.resolution} and crop is {preprocessing.crop}, but a state-space model needs "
+            "square images of the whole view: give a preprocessing with resolution=(n, n) and crop=False"
         )
     absent = () if _touched(pairs.tactile, preprocessing, empty["tactile"]).any() else ("tactile",)
     model = statespace.Config(
@@ -229,7 +259,8 @@ def state_model(
 
 
 def _touched(tactile: np.ndarray, preprocessing: Preprocessing, blank: np.ndarray) -> np.ndarray:
-    """Whether the first tactile image of each trajectory shows a contact. Images are split to bound the memory."""
+    """Return whether the first tactile image of each trajectory shows a contact."""
+    # The images are processed in parts to bound the memory.
     parts = np.array_split(tactile[:, 0], max(len(tactile) // 256, 1))
     return np.concatenate(
         [
