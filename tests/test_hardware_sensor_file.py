@@ -152,7 +152,7 @@ def test_a_truncated_file_is_refused(tmp_path, size):
         ("leds", "", "leds must not be empty"),
         ("fps", 0, "fps must be > 0"),
         ("fps", "30", "device.fps is '30', but it must be a finite number"),
-        ("settle_on_s", -0.1, "settle_on_s must be >= 0"),
+        ("settle_on_s", -0.1, r"settle_on_s must be in \(0, 60\) s"),
         ("settle_off_s", float("nan"), "settle_off_s is nan, but it must be a finite number"),
         ("levels", [255, 255, 0], "levels is .* must be a list of 4 numbers"),
         ("levels", [255, 255, 0, 0.5], "levels is 0.5, but it must be a whole number"),

@@ -73,6 +73,7 @@ class ProvenFrames:
         self._departed = 0  # successive frames since the switch that show its effect. From 2 on, none is compared
         self._doubtful = False  # True if the lights may have switched without an answer, which late frames could show
         self._stopping = False  # True if `shot` must end in the thread that takes images
+        self._lost_s = 0.0  # time spent in reconnections to the controller (s)
         self.stream: Stream = "visual"  # stream for which the lights were set last
         self.discarded = 0  # frames that `shot` did not return
 
@@ -147,8 +148,7 @@ class ProvenFrames:
         The first image is of the stream for which the lights are already set.
 
         Args:
-            deadline: Latest time on the clock `time.monotonic` (s). A reconnection extends it only for the image that
-                is being taken.
+            deadline: Latest time on the clock `time.monotonic` (s). A reconnection extends it.
 
         Raises:
             LightError, LedError, CameraError: The causes are those of `STS.read`.
@@ -156,7 +156,9 @@ class ProvenFrames:
         first = self.stream
         second: Stream = "tactile" if first == "visual" else "visual"
         while True:
+            lost_s = self._lost_s
             one = self.shot(first, deadline, after_s=time.monotonic(), then=second)
+            deadline += self._lost_s - lost_s
             two = self.shot(second, deadline)
             if one.epoch == two.epoch and one.before.boot == two.before.boot:
                 return Pair(one, two) if first == "visual" else Pair(two, one)
@@ -184,10 +186,11 @@ class ProvenFrames:
                 before, frame = self._frame(stream, deadline, after_s)
                 until_s = self._proof(before, then)
             except (DisconnectedError, LedTimeoutError):
-                lost_s = time.monotonic()
+                began_s = time.monotonic()
                 self._lit, self._doubtful = None, True
                 self._leds.reconnect(limit_s=self._reconnect_s)
-                deadline += time.monotonic() - lost_s
+                reconnected_s = time.monotonic() - began_s
+                self._lost_s, deadline = self._lost_s + reconnected_s, deadline + reconnected_s
                 continue
             if until_s is not None:
                 self._black[stream], self._looks[stream] = frame.black, thumbnail(frame.image)

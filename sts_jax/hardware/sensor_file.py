@@ -106,8 +106,8 @@ class Device:
             if value is not None and not math.isfinite(value):
                 raise ValueError(f"{name} must be finite, got {value}")
         for name in ("settle_on_s", "settle_off_s"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
+            if not 0 < getattr(self, name) < 60:
+                raise ValueError(f"{name} must be in (0, 60) s, got {getattr(self, name)}")
         if not all(0 <= level <= 255 for level in self.levels) or not any(self.levels):
             raise ValueError(f"levels must be in 0..255 and not all 0, got {self.levels}")
         try:

@@ -80,7 +80,8 @@ class STS:
         Args:
             camera: A `Camera`, its `CameraConfig`, or the `source` of a `CameraConfig`: the index or path of a device,
                 or the URL of a stream.
-            leds: An open LED controller, or the name of its port. `disconnect` closes the controller in both cases.
+            leds: An open LED controller, or the name of its port. `disconnect` closes the controller in both cases, and
+                a later `connect` opens its port again.
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255. All are 0 in the visual stream.
             settling: Times for which frames are discarded after a switch of the lights, from an earlier measurement
                 with the same devices. None: `connect` measures them, which needs a scene at rest.
@@ -105,7 +106,7 @@ class STS:
         else:
             config = camera if isinstance(camera, CameraConfig) else CameraConfig(camera)
             self._camera = Camera(dataclasses.replace(config, buffer=max(config.buffer, 8)))
-        self._port = leds
+        self._port = leds.port if isinstance(leds, Leds) else leds
         self._leds: Leds | None = leds if isinstance(leds, Leds) else None
         self._settling = settling
         self._exposures = exposures
@@ -236,7 +237,7 @@ class STS:
             if self._device is not None and not self._port:
                 self._leds = Leds.find(self._device.leds)
             else:
-                self._leds = Leds.connect(str(self._port))
+                self._leds = Leds.connect(self._port)
         try:
             if self._device is not None:
                 self._device.check_identity(leds=self._leds.serial_number)
@@ -275,7 +276,7 @@ class STS:
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times `timeout_s`. A reconnection to the controller
-                extends only the wait for the image that is being taken. The last request to the controller may exceed
+                extends the wait. The last request to the controller may exceed
                 the limit.
 
         Returns:
@@ -374,7 +375,7 @@ class STS:
             The last image of this time.
 
         Raises:
-            NotStillError: The view still changes after `timeout_s`.
+            NotStillError: The view was not still for `window_s` within `timeout_s`.
             LightError, LedError, CameraError: The causes are those of `read`.
         """
         self._stop_background()
@@ -484,7 +485,7 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: The view still changes after `timeout_s`, or there are no more images.
+        NotStillError: The view was not still for `window_s` within `timeout_s`, or there are no more images.
     """
     started_s: float | None = None
     first, look, change, allowed = None, None, 0.0, _STILL
@@ -500,8 +501,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"the view still changes after {timeout_s:g} s: one block of the last image differs by {change:.0f} of 255 "
-        f"(at most {allowed:.0f} counts as still). Keep the scene at rest, raise timeout_s, or check whether the "
+        f"the view was not still for {window_s:g} s within {timeout_s:g} s: one block of the last image differs by "
+        f"{change:.0f} of 255 from an image before it (at most {allowed:.0f} counts as still). Keep the scene at rest, raise timeout_s, or check whether the "
         "light of the room changes."
     )
 

@@ -52,12 +52,17 @@ def sample(
             condition.
         correction: Calibration of the density of the final pose, from `fit_calibration`. None changes nothing.
         num: Number of final poses for each item.
-        drawn: Number of these poses for which both images are rendered, at most `num`. Each image has its own sample
+        drawn: Number of these poses for which both images are rendered, from 1 to `num`. Each image has its own sample
             of the appearance.
 
     Returns:
         The samples, the expected images and the probabilities of the outcomes.
+
+    Raises:
+        ValueError: `drawn` is out of range.
     """
+    if not 1 <= drawn <= num:
+        raise ValueError(f"drawn must be from 1 to num ({num}), got {drawn}")
     model = nnx.merge(graphdef, params)
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)
