@@ -181,9 +181,9 @@ def rigid(
     """Compute mass, centre of mass and inertia of a body whose contents fill a share of its interior.
 
     The shell has the mass m_s, the centre of mass c_s and the inertia I_s. The contents have the density rho, the
-    volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. With the factor s on the shell's
-    mass, the mass m and the centre of mass c follow from m = s m_s + rho V and m c = s m_s c_s + rho V c_c. The inertia
-    is I = s I_s + rho (tr(C) 1 - C) plus the terms of Steiner's theorem that refer both masses to c.
+    volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. Let s be the factor on the shell's
+    mass. The mass is m = s m_s + rho V. The centre of mass c follows from m c = s m_s c_s + rho V c_c. The inertia is
+    I = s I_s + rho (tr(C) 1 - C) plus the terms of Steiner's theorem that refer both masses to c.
 
     Args:
         body: One body.

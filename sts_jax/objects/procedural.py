@@ -107,8 +107,8 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Raises:
         TypeError: `key` is not a JAX key.
-        ValueError: `category` is unknown, or the parts of its family are invalid: no parts, values that are not finite,
-            too many faces, a longest side below 5 mm or above 0.15 m, or more than one interior.
+        ValueError: `category` is unknown, or the parts of its family are invalid. There are no parts, values that are
+            not finite, too many faces or more than one interior, or the longest side is below 5 mm or above 0.15 m.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category

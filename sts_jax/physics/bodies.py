@@ -35,8 +35,8 @@ def check_bodies(bodies: Sequence[Any]) -> None:
 
     Raises:
         TypeError: An item is not a `Body`.
-        BodyError: The hulls of a body have another shape than the padding classes allow or are not finite, its shell
-            mass is not > 0 and finite, or `Body.check` finds another bad value.
+        BodyError: The hulls of a body are not of a size class or not finite, or its shell mass is not > 0 and finite.
+            Also raised for an error of `Body.check`.
     """
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):

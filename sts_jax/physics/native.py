@@ -194,7 +194,7 @@ def roll(
     Args:
         models: One copy of the result of `compile_body` per trajectory. The gravity of the copy is overwritten.
         points: Vertices of the hull in the mesh frame (m).
-        start: n starts.
+        start: Starts of the n trajectories.
         gravity: Gravity for each of the s steps of each of the f frames' intervals (m/s^2, sensor frame).
         velocity: Velocity on release: linear, of the mesh frame's origin (m/s), and angular (rad/s), in the sensor
             frame. None for objects at rest.
