@@ -73,7 +73,7 @@ def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason
         ("webcam", "c"),
     ]
     assert listed.classes == ("bottle", "camera", "mouse", "scissors", "webcam")
-    assert listed.items[3].notes == ("no front in the table: ShapeNet's default",)
+    assert listed.items[3].notes == ("metadata.csv has no front: ShapeNet's default is used",)
     reasons = dict(listed.skipped)
     for name, reason in (
         ("h", "it has several classes (fork, spoon)"),
@@ -113,7 +113,7 @@ def test_images_are_found_in_the_folder_of_textures(tmp_path):
     np.testing.assert_allclose(entry.body.texture[128, 128], linear(np.array(paint) / 255), atol=1e-5)
     np.testing.assert_allclose(entry.body.colors[0], 1)  # and not the Kd
     (tmp_path / "models-textures" / "textures" / "a.png").unlink()
-    assert "a.png, not found" in objects.read(objects.library(tmp_path), 0).notes[0]
+    assert "a.png, which does not exist" in objects.read(objects.library(tmp_path), 0).notes[0]
 
 
 def test_a_larger_object_is_scaled_down_with_a_note(tmp_path):
@@ -129,7 +129,7 @@ def test_a_size_that_differs_from_the_table_is_noted(tmp_path):
     dims = r"5.08\,5.08\,10.16"  # cm
     assert objects.read(only(tmp_path / "a", box((2, 2, 4)), **{"aligned.dims": dims}), 0).notes == ()
     (note,) = objects.read(only(tmp_path / "b", box((2, 2, 3)), **{"aligned.dims": dims}), 0).notes
-    assert note == "the table's aligned.dims give a longest side of 102 mm"
+    assert note == "its longest side in metadata.csv (aligned.dims) is 102 mm"
 
 
 def test_cutlery_is_solid_and_of_steel(tmp_path):
@@ -156,5 +156,5 @@ def test_missing_columns_are_named(tmp_path):
 
 def test_a_table_without_a_usable_object_is_refused(tmp_path):
     shapenet.build(tmp_path, [shapenet.row("a", "Watch", unit="")], {"a": box()})
-    with pytest.raises(ValueError, match=r"holds no mesh that can be used.*\n  a: its unit is missing"):
+    with pytest.raises(ValueError, match=r"contains no mesh that can be used.*\n  a: its unit is missing"):
         objects.library(tmp_path)

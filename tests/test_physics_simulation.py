@@ -436,7 +436,7 @@ def test_errors_name_bad_hidden_values(bodies: list[objects.Body]) -> None:
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.ones((2, 3))))
     with pytest.raises(ValueError, match=r"hidden.up has shape \(2, 2\)"):
         physics.simulate(jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(up=np.eye(2)))
-    with pytest.raises(ValueError, match=r"hidden.fill reaches from 0.0 to 1.5"):
+    with pytest.raises(ValueError, match=r"hidden.fill has values from 0.0 to 1.5"):
         physics.simulate(
             jax.random.key(0), bodies[0], Sensor(), SCENARIO, 2, hidden=good._replace(fill=np.array([0, 1.5]))
         )

@@ -1,4 +1,4 @@
-"""Rigid objects that fall on the sensor, generated from a key or loaded from a mesh file."""
+"""Rigid objects for the simulation and the renderer, generated from a random key or loaded from mesh files."""
 
 from sts_jax.objects.body import (
     CATEGORIES,

@@ -1,4 +1,4 @@
-"""Assembly of a body from a surface and its material."""
+"""Assembly of a `Body` from a surface, its colours and its masses."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +10,10 @@ from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, Body, pad, size_cla
 from sts_jax.objects.hulls import convex_hull
 from sts_jax.objects.moments import PAIRS, solid_moments, surface_moments
 
-WALL = 1.2  # kg/m^2, default shell of a hollow object: plastic about 1.2 mm thick
-STEEL = 5.9  # kg/m^2 of each face: stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301) x 1.5 mm, on two faces
-CONTENTS = 1000.0  # kg/m^3, water
-CREASE = np.deg2rad(40.0)  # rad, edges sharper than this stay sharp when corner normals are computed
+WALL = 1.2  # kg/m^2, default mass per area of the shell of a hollow object: plastic about 1.2 mm thick
+STEEL = 5.9  # kg/m^2 on each side of a sheet: 1.5 mm of stainless steel, 7,900 kg/m^3 (EN 10088-1, grade 1.4301)
+CONTENTS = 1000.0  # kg/m^3, density of the contents: water
+CREASE = np.deg2rad(40.0)  # rad, faces that meet at a larger angle do not share a corner normal
 
 
 def assemble(
@@ -30,26 +30,29 @@ def assemble(
     two_sided: Bool[np.ndarray, ""] | bool = False,
     category: int = -1,
 ) -> Body:
-    """Assemble a padded `Body` from a surface and its material, with the hull's centroid as the origin.
+    """Assemble a padded `Body` from a surface, its colours and its masses.
+
+    The origin moves to the centroid of the collision hull.
 
     Args:
-        vertices: m, +z up.
-        faces: counter-clockwise from outside, at most FACE_CLASSES[-1] of them.
-        colors: [0, 1], linear light, of each corner.
-        density: kg/m^2 of each face.
-        interior: a closed mesh in the same frame that bounds the contents, or None for a solid object.
-        contents_density: kg/m^3.
-        mass: kg, of the shell. None takes area times density.
-        uv: texture coordinates of each corner, v = 0 at the texture's top row.
-        texture: [0, 1], linear light, of one of TEXTURE_CLASSES.
-        two_sided: whether the surface is visible from behind too.
-        category: index into CATEGORIES, or -1.
+        vertices: Vertices of the surface (m), with +z up.
+        faces: Vertex indices of each face, counter-clockwise seen from outside, at most FACE_CLASSES[-1] faces.
+        colors: Colour of each corner of each face, in linear light, [0, 1].
+        density: Mass per area of each face (kg/m^2).
+        interior: Vertices and faces of a closed mesh in the same frame that bounds the contents. None for a solid
+            object.
+        contents_density: Density of the contents (kg/m^3).
+        mass: Mass of the shell (kg). None computes the mass from area and density.
+        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row.
+        texture: Square texture in linear light, [0, 1], with a side of TEXTURE_CLASSES.
+        two_sided: True if faces are also visible from behind.
+        category: Index into CATEGORIES, or -1 for an object of no category.
 
     Returns:
         The body.
 
     Raises:
-        ValueError: the convex hull or the interior has no volume.
+        ValueError: The convex hull or the interior has no volume.
     """
     hull = convex_hull(vertices)
     shape = ConvexHull(hull)
@@ -98,15 +101,18 @@ def assemble(
 def corner_normals(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], *, crease: float = CREASE
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Unit normal of each corner: the angle-weighted mean over the faces at its vertex within the crease angle.
+    """Compute the unit normal at each corner of each face, so that shading is smooth except at sharp edges.
+
+    The normal is the mean over those faces at the vertex whose normals differ by less than `crease` from the normal of
+    the corner's face. The angles of the faces at the vertex are the weights.
 
     Args:
-        vertices: m.
-        faces: indices. Faces must share the index of a vertex for the surface to be smooth there.
-        crease: rad.
+        vertices: Vertices of the surface (m).
+        faces: Vertex indices of each face. The surface is smooth only where faces share the index of a vertex.
+        crease: Largest angle between the normals of faces that are averaged (rad).
 
     Returns:
-        Normals. A face without area counts as facing (0, 0, 1).
+        Normals of the corners. Faces without area count as facing (0, 0, 1).
     """
     triangles = vertices[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -1,4 +1,4 @@
-"""A rigid object as arrays: its visible surface, its collision geometry and its mass properties."""
+"""`Body`: a rigid object as arrays of its visible surface, its collision geometry and its mass properties."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, ScalarLike
 
-# Padding classes. Two bodies of one class have leaves of equal shape, so they share compiled programs. A padding face
-# is (0, 0, 0). It has no area and covers no pixel. Padding vertices and padding hulls repeat the last one, so that
-# extents need no mask. There are as many vertices as faces. A padding triangle of the interior has all corners at the
-# origin, so it encloses no volume.
+# Size classes, to which the arrays of a body are padded. Two bodies of the same classes have arrays of equal shapes, so
+# they share compiled programs. A padding face is (0, 0, 0), so it has no area and covers no pixel. Padding vertices and
+# padding hulls repeat the last one, so that extents need no mask. There are as many vertices as faces. A padding
+# triangle of the interior has all corners at the origin, so it encloses no volume.
 FACE_CLASSES = (1024, 4096, 16384, 131072)
 PART_CLASSES = (1, 8)
 HULL_CLASSES = (32, 64)
 TEXTURE_CLASSES = (1, 256, 1024)
-PAD = 0.15  # m, side of the sensor's pad, which larger objects do not fit
-SMALLEST = 0.005  # m, longest side of the smallest object: a shorter one probably has another unit
-LEVEL_STEPS = 30  # bisection steps for the level of the contents, beyond the resolution of float32
+PAD = 0.15  # m, side of the sensor's pad and largest side of an object
+SMALLEST = 0.005  # m, longest side of the smallest object. A smaller mesh probably has another unit
+LEVEL_STEPS = 30  # bisection steps for the level of the contents, more than float32 can resolve
 
 Direction = Float[Array | np.ndarray, "3"] | tuple[float, float, float]
 
@@ -28,34 +28,33 @@ CATEGORIES = ("bottle", "camera", "webcam", "mouse", "scissors", "fork", "spoon"
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid object in its own mesh frame (m, kg). All leaves are arrays.
+    """A rigid object in its own mesh frame, as a pytree whose leaves are all arrays.
 
-    The origin lies inside the convex hull. If the object has an up axis, it is +z. The albedo at a point is the
-    texture's value times the interpolated corner colour (as in glTF), in linear light.
-
-    `rigid` computes mass, centre of mass and inertia from the shell and the contents.
+    The object is a shell, whose interior can be filled with contents such as water. `rigid` computes mass, centre of
+    mass and inertia from both. The origin lies inside the convex hull. The object usually stands or lies with +z up.
+    The albedo at a point is the texture's value times the interpolated corner colour (as in glTF), in linear light.
     """
 
-    vertices: Float[Array, "*n v 3"]  # m
-    faces: Int[Array, "*n f 3"]  # counter-clockwise seen from outside
-    normals: Float[Array, "*n f 3 3"]  # unit normal at each corner of each face
-    colors: Float[Array, "*n f 3 3"]  # [0, 1], at each corner of each face
-    uv: Float[Array, "*n f 3 2"]  # [0, 1], texture coordinates of each corner, v = 0 at the texture's top row
-    texture: Float[Array, "*n t t 3"]  # [0, 1]
-    two_sided: Bool[Array, "*n"]  # whether faces are visible from behind too, as on open surfaces
-    hulls: Float[Array, "*n p h 3"]  # m, vertices of the convex collision parts (one part unless decomposed)
-    shell_mass: Float[Array, "*n"]  # kg, of the empty object
-    shell_com: Float[Array, "*n 3"]  # m
-    shell_inertia: Float[Array, "*n 3 3"]  # kg m^2, about the shell's centre of mass, mesh axes
-    interior: Float[Array, "*n i 3 3"]  # m, triangles of the closed surface that bounds the contents, zeros if solid
-    contents_density: Float[Array, "*n"]  # kg/m^3, 0 for solid objects
-    category: Int[Array, "*n"]  # index into CATEGORIES, or -1 for an object of no category
+    vertices: Float[Array, "*n v 3"]  # Vertices of the visible surface (m).
+    faces: Int[Array, "*n f 3"]  # Vertex indices of each face, counter-clockwise seen from outside.
+    normals: Float[Array, "*n f 3 3"]  # Unit normal at each corner of each face.
+    colors: Float[Array, "*n f 3 3"]  # Colour at each corner of each face, in linear light, [0, 1].
+    uv: Float[Array, "*n f 3 2"]  # Texture coordinates at each corner of each face. v is 0 at the texture's top row.
+    texture: Float[Array, "*n t t 3"]  # Texture in linear light, [0, 1].
+    two_sided: Bool[Array, "*n"]  # True if faces are also visible from behind, as on open surfaces.
+    hulls: Float[Array, "*n p h 3"]  # Vertices of the convex parts that collide (m), one part unless decomposed.
+    shell_mass: Float[Array, "*n"]  # Mass of the empty object (kg).
+    shell_com: Float[Array, "*n 3"]  # Centre of mass of the empty object (m).
+    shell_inertia: Float[Array, "*n 3 3"]  # Inertia of the empty object about its centre of mass, mesh axes (kg m^2).
+    interior: Float[Array, "*n i 3 3"]  # Triangles of the closed surface around the contents (m), zeros if solid.
+    contents_density: Float[Array, "*n"]  # Density of the contents (kg/m^3), 0 for solid objects.
+    category: Int[Array, "*n"]  # Index into CATEGORIES, or -1 for an object of no category.
 
     def check(self) -> None:
-        """Raise an error unless this is one body that can be drawn and simulated. Runs on the host, not under `jit`.
+        """Raise an error unless this is one body that can be rendered and simulated. Runs on the host, not under `jit`.
 
         Raises:
-            ValueError: the body has leading axes, a value that is not finite, a vertex index out of range, or an
+            ValueError: The body has leading axes, a value that is not finite, a vertex index out of range, or an
                 unknown category. The message names the field.
         """
         if jnp.ndim(self.vertices) != 2:
@@ -101,12 +100,12 @@ class Body:
 
 
 def size_class(count: int, classes: tuple[int, ...]) -> int:
-    """The smallest of some padding classes that holds `count` items."""
+    """Return the smallest of the size classes that is at least `count`."""
     return next(size for size in classes if count <= size)
 
 
 def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
-    """Append a value until an array has `size` rows."""
+    """Append rows of a value to an array until it has `size` rows."""
     padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
     return np.concatenate([array, padding])
 
@@ -122,7 +121,7 @@ def check_category(category: object) -> None:
 
 
 def is_traced(tree: object) -> bool:
-    """Whether any leaf of a tree is a tracer, which has no concrete values."""
+    """Return whether any leaf of a tree is a tracer of JAX, which has no concrete value."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
@@ -131,19 +130,19 @@ def _form(leaf: object) -> str:
 
 
 def stack(bodies: Sequence[Body]) -> Body:
-    """Stack bodies of one padding class into one `Body` with a leading axis, for `jax.vmap`.
+    """Stack bodies of the same size classes into one `Body` with a leading axis, for `jax.vmap`.
 
     Args:
-        bodies: at least one body, all of the same padding class.
+        bodies: At least one body. The arrays of all bodies must have the same shapes.
 
     Returns:
-        The leaves stacked along a new first axis.
+        A body whose arrays are stacked along a new first axis.
 
     Raises:
-        ValueError: there is no body, or the bodies are of different classes.
+        ValueError: There is no body, or the arrays of two bodies have different shapes.
     """
     if not bodies:
-        raise ValueError("stack needs at least one body, got none")
+        raise ValueError("bodies is empty, but stack needs at least one body")
     shapes = [[jnp.shape(leaf) for leaf in jax.tree.leaves(body)] for body in bodies]
     for index, shape in enumerate(shapes):
         if shape != shapes[0]:
@@ -159,7 +158,7 @@ def _sizes(body: Body) -> str:
 
 
 def mirror(body: Body) -> Body:
-    """Mirror a body, with or without leading axes: y becomes -y in the mesh frame."""
+    """Mirror a body, with or without leading axes, so that y becomes -y in the mesh frame."""
     flip = jnp.array([1.0, -1, 1])
     corners = jnp.array([0, 2, 1])  # so that faces stay counter-clockwise from outside
     return dataclasses.replace(
@@ -179,21 +178,22 @@ def mirror(body: Body) -> Body:
 def rigid(
     body: Body, fill: ScalarLike, shell_scale: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mass, centre of mass and inertia of a body whose contents fill a share of its interior.
+    """Compute mass, centre of mass and inertia of a body whose contents fill a share of its interior.
 
-    Let the shell have mass m_s, centre c_s and inertia I_s, and the contents density rho, volume V, centre c_c and
-    second moments C = int (r - c_c) (r - c_c)^T. With the shell scale s, m = s m_s + rho V and
-    m c = s m_s c_s + rho V c_c. By Steiner's theorem, I = s I_s + rho (tr(C) 1 - C) plus the terms of both masses
-    about c.
+    The shell has the mass m_s, the centre of mass c_s and the inertia I_s. The contents have the density rho, the
+    volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. Let s be the factor on the shell's
+    mass. The mass is m = s m_s + rho V. The centre of mass c follows from m c = s m_s c_s + rho V c_c. The inertia is
+    I = s I_s + rho (tr(C) 1 - C) plus the terms of Steiner's theorem that refer both masses to c.
 
     Args:
-        body: one body.
-        fill: share of the interior's volume, clipped to [0, 1].
-        shell_scale: factor on the shell's mass.
-        up: upward unit vector in the mesh frame. The contents have settled at the lowest end along it.
+        body: One body.
+        fill: Share of the interior's volume that is filled, clipped to [0, 1].
+        shell_scale: Factor on the shell's mass.
+        up: Unit vector in the mesh frame that pointed up when the contents settled.
 
     Returns:
-        mass (kg), centre of mass (m, mesh frame), inertia about the centre of mass (kg m^2, mesh axes).
+        Mass (kg), centre of mass in the mesh frame (m), and inertia about the centre of mass along the mesh axes
+        (kg m^2).
     """
     volume, middle, second = fill_moments(body.interior, fill, up)
     shell, contents = body.shell_mass * shell_scale, body.contents_density * volume
@@ -210,19 +210,21 @@ def rigid(
 def fill_moments(
     interior: Float[Array, "i 3 3"], fill: ScalarLike, up: Direction = (0.0, 0.0, 1.0)
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
-    """Volume, centre and central second moments of a closed mesh filled from below to a share of its volume.
+    """Compute volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
 
-    The triangles are clipped to the half-space below the liquid's surface. With a reference point on that surface,
-    their signed tetrahedra sum to the filled part, because the surface itself contributes nothing. Bisection finds
-    the level of the surface.
+    The triangles are clipped to the half-space below the liquid's surface. The signed tetrahedra between a reference
+    point and the clipped triangles then sum to the liquid. The reference point lies on the liquid's surface, so the
+    surface itself contributes nothing. Bisection finds the level of the surface.
 
     Args:
-        interior: m, triangles of a closed surface, counter-clockwise from outside. Those without area have no effect.
-        fill: share of the volume, clipped to [0, 1].
-        up: upward unit vector. The mesh is filled from the lowest end along it.
+        interior: Triangles of a closed surface (m), counter-clockwise seen from outside. Triangles without area have no
+            effect.
+        fill: Share of the volume that is filled, clipped to [0, 1].
+        up: Upward unit vector, perpendicular to the liquid's surface.
 
     Returns:
-        Volume (m^3), centre (m, the middle of the bounding box if nothing is filled), second moments (m^5).
+        Volume (m^3), centre (m) and second moments about the centre (m^5). If nothing is filled, the centre is the
+        middle of the bounding box.
     """
     up = jnp.asarray(up, interior.dtype)
     height = interior @ up
@@ -230,7 +232,7 @@ def fill_moments(
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
     def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        """Volumes and corners of the tetrahedra below a level, their reference point on it, and the total volume."""
+        """Compute volumes and corners of the tetrahedra below a level, their reference point and the total volume."""
         # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
         # adds the whole triangle and subtracts the piece at the corner above.
         reference = middle + (level - middle @ up) * up
@@ -263,7 +265,7 @@ def fill_moments(
     found, slope = jax.value_and_grad(lambda level: below(level)[-1])((low + high) / 2)
     wide = slope > 0
     level = (low + high) / 2 + jnp.where(wide, (target - found) / jnp.where(wide, slope, 1), 0)
-    # A full body takes a level above the top, so that rounding cannot leave its highest corners out.
+    # The level of a full body is above its top, so that rounding cannot exclude the highest corners.
     level = jnp.where(share < 1, level, top + (top - bottom))
     volumes, corners, reference, volume = below(level)
     total = jnp.sum(corners, axis=1)

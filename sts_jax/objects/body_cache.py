@@ -1,4 +1,4 @@
-"""The cache of loaded bodies: one file per object, whose name is a hash of everything that the body depends on."""
+"""The cache of loaded bodies: one file per object, named by a hash of the mesh file and of all settings."""
 
 import dataclasses
 import hashlib
@@ -15,14 +15,14 @@ from sts_jax.objects.body import FACE_CLASSES, HULL_CLASSES, PART_CLASSES, TEXTU
 from sts_jax.objects.items import Entry, Item, Library
 from sts_jax.objects.materials import references
 
-_FORMAT = 1  # version of cached objects, increased whenever the same file and settings give a different body
+_FORMAT = 1  # version of cached bodies, increased when the same file and settings lead to another body
 
 
 def path_of(library: Library, item: Item) -> Path:
-    """The file of an item in the cache of its library, which must have one.
+    """Return the path of an item's file in the cache of its library. The library must have a cache.
 
     Raises:
-        FileNotFoundError: the mesh file does not exist any more.
+        FileNotFoundError: The mesh file no longer exists.
     """
     assert library.cache is not None
     digest = hashlib.sha256()
@@ -33,7 +33,7 @@ def path_of(library: Library, item: Item) -> Path:
     try:
         named = references(item.path, item.textures)
     except (OSError, ValueError):
-        named = {}  # `load` raises an error for it
+        named = {}  # `load` raises an error for the damaged file
     if not item.path.is_file():
         raise FileNotFoundError(f"{item.path}: no such mesh file")
     for name, path in [(item.path.name, item.path), *sorted(named.items())]:
@@ -42,19 +42,19 @@ def path_of(library: Library, item: Item) -> Path:
 
 
 def write(path: Path, entry: Entry) -> None:
-    """Write an entry as a whole or not at all."""
+    """Write an entry to a file of the cache, completely or not at all."""
     about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
 
     def save(temporary: Path) -> None:
-        with temporary.open("wb") as file:  # given a name, NumPy would add a suffix to it
+        with temporary.open("wb") as file:  # NumPy would add a suffix to a file name
             np.savez(file, about=np.frombuffer(about.encode(), np.uint8), **leaves)
 
     write_whole(path, save)
 
 
 def read(path: Path, item: Item) -> Entry | None:
-    """Read the entry of an item, or return None if its file is missing or damaged."""
+    """Read the entry of an item from a file of the cache, or return None if the file is missing or damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})

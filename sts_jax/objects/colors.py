@@ -1,6 +1,6 @@
-"""Colours of procedural objects: chosen in sRGB, returned in linear light. Each is an array (3,) in [0, 1].
+"""Colours of procedural objects. Values are chosen in sRGB and returned in linear light, as arrays (3,) in [0, 1].
 
-`vivid`, `pale`, `dark` and `steel` draw a random colour of their kind.
+`vivid`, `pale`, `dark` and `steel` draw a random colour from a generator of NumPy.
 """
 
 import numpy as np
@@ -15,33 +15,33 @@ def linear(srgb: np.ndarray) -> np.ndarray:
 
 
 def hsv(hue: Number, saturation: Number, value: Number) -> Color:
-    """The colour of a hue, saturation and value, each in [0, 1]."""
+    """Return the colour of a hue, a saturation and a value, each in [0, 1]."""
     wheel = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     return linear(value * (1 - saturation * (1 - wheel)))
 
 
 def grey(value: Number) -> Color:
-    """The grey of an sRGB value in [0, 1]."""
+    """Return the grey of an sRGB value in [0, 1]."""
     return linear(np.full(3, float(value)))
 
 
 def vivid(rng: np.random.Generator) -> Color:
-    """A saturated, bright colour of any hue."""
+    """Draw a saturated, bright colour of any hue."""
     return hsv(rng.uniform(), rng.uniform(0.65, 0.95), rng.uniform(0.6, 0.95))
 
 
 def pale(rng: np.random.Generator) -> Color:
-    """A light, nearly white colour of any hue."""
+    """Draw a light, nearly white colour of any hue."""
     return hsv(rng.uniform(), rng.uniform(0.0, 0.25), rng.uniform(0.8, 0.97))
 
 
 def dark(rng: np.random.Generator) -> Color:
-    """A dark, nearly black colour of any hue."""
+    """Draw a dark, nearly black colour of any hue."""
     return hsv(rng.uniform(), rng.uniform(0.0, 0.25), rng.uniform(0.12, 0.24))
 
 
 def steel(rng: np.random.Generator) -> Color:
-    """A bluish grey."""
+    """Draw a bluish grey, as of steel."""
     return hsv(0.58, rng.uniform(0.0, 0.1), rng.uniform(0.58, 0.8))
 
 

@@ -1,4 +1,4 @@
-"""Decimation of a mesh to a number of faces. Its colours and texture become one colour per corner."""
+"""Decimation of a surface to fewer faces. Its colours and texture become one colour per corner."""
 
 import warnings
 from pathlib import Path
@@ -10,16 +10,19 @@ from sts_jax.objects.surface import Surface, proper, surface_samples
 
 
 def decimate(path: Path, surface: Surface, target: int) -> Surface:
-    """Reduce a surface to at most `target` faces and vertices, with a warning.
+    """Reduce a surface to at most `target` faces and vertices, and warn about it.
 
     Args:
-        path: the file, which the warning and errors name.
-        surface: the surface.
-        target: number of faces and of vertices.
+        path: Mesh file, for the warning and errors.
+        surface: Surface to reduce.
+        target: Largest number of faces and of vertices.
+
+    Returns:
+        The surface with one colour per corner and without a texture.
 
     Raises:
-        ImportError: fast-simplification is not installed.
-        ValueError: the surface has too many loose parts.
+        ImportError: The package fast-simplification is not installed.
+        ValueError: The surface has too many loose parts.
     """
     try:
         import fast_simplification
@@ -48,9 +51,10 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
 
 
 def _sampled(surface: Surface, corners: np.ndarray, num: int) -> np.ndarray:
-    """The colours (f, 3, 3) of a decimated surface's corners (f, 3, 3), from `num` samples of the whole surface."""
+    """Compute the colours (f, 3, 3) of a decimated surface's corners from `num` samples of the full surface."""
     triangles = surface.vertices[surface.faces]
-    # Each corner, moved a little towards its face's centre, takes the albedo of the nearest sample of similar normal.
+    # Each corner gets the albedo of the nearest sample with a similar normal. The corner is first moved a little
+    # towards the centre of its face.
     face, weight = surface_samples(triangles, num)
     albedo = np.einsum("nk,nkc->nc", weight, surface.colors[face])
     if surface.texture is not None:
@@ -65,7 +69,7 @@ def _sampled(surface: Surface, corners: np.ndarray, num: int) -> np.ndarray:
 
 
 def _welded(surface: Surface, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces after vertices in one cell of a grid became one. `share` is a cell's share of the size."""
+    """Merge the vertices in each cell of a grid, whose cells have the size `share` times the longest side."""
     if not share:
         return surface.vertices, surface.faces.astype(np.int32)
     cell = share * np.ptp(surface.vertices, axis=0).max()

@@ -1,4 +1,4 @@
-"""Convex hulls on the host, in NumPy float64: vertices, distances, support function and rest poses."""
+"""Convex hulls in NumPy float64, on the host: vertices, distances, support function and rest poses."""
 
 import numpy as np
 import trimesh
@@ -7,41 +7,42 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax.objects.body import HULL_CLASSES, Body
 
-HULL_TOLERANCE = 5e-5  # m, a hull is not refined where the surface sticks out by less than this
+HULL_TOLERANCE = 5e-5  # m, a hull is not refined further if no point is farther outside than this
 SAME_FACE = np.deg2rad(0.5)  # rad, triangles of a hull whose normals differ by less than this form one face
-REST_GRAIN = 2e-5  # m, points of a hull this near a face's plane belong to the face
-REST_MARGIN = 5e-4  # m, how far inside the outline of a face the centre of mass must lie for the object to rest on it
+REST_GRAIN = 2e-5  # m, points of a hull nearer to a face's plane than this are part of the face
+REST_MARGIN = 5e-4  # m, the centre of mass of an object at rest lies at least this far inside the outline of the face
 NUM_DIRECTIONS = 128
 
 
 def lattice(num: int) -> Float[np.ndarray, "n 3"]:
-    """`num` unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+    """Return `num` unit vectors that are spread evenly over the sphere in a Fibonacci lattice."""
     step = np.arange(num) + 0.5
     z, angle = 1 - 2 * step / num, np.pi * (1 + np.sqrt(5)) * step
     points = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
     return points.astype(np.float32)
 
 
-DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3) unit vectors, at which `support` is evaluated
+DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3), unit vectors for which `support` is computed
 
 
 def convex_hull(
     points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
 ) -> Float[np.ndarray, "h 3"]:
-    """Vertices of a convex hull, simplified to a tolerance and a maximum number of vertices.
+    """Compute the vertices of a convex hull, simplified to a tolerance and a largest number of vertices.
 
-    Starting from a simplex, the point furthest outside is added until no point is outside by more than the tolerance.
+    The hull starts as a tetrahedron. The point farthest outside is added until no point is outside by more than the
+    tolerance.
 
     Args:
-        points: m.
-        limit: maximum number of vertices, which takes precedence over the tolerance.
-        tolerance: m.
+        points: Points that the hull encloses (m).
+        limit: Largest number of vertices. It takes precedence over the tolerance.
+        tolerance: Largest distance of a point outside the hull (m).
 
     Returns:
-        A subset of the points.
+        Vertices of the hull, which are a subset of the points.
 
     Raises:
-        ValueError: the points lie in a plane.
+        ValueError: The points lie in a plane.
     """
     try:
         candidates = points[ConvexHull(points).vertices]
@@ -65,13 +66,13 @@ def convex_hull(
 
 
 def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "n"]:
-    """Distance (m) of each point from a convex hull, 0 inside."""
+    """Compute the distance (m) of each point from the convex hull of the vertices `hull`, 0 inside."""
     shape = ConvexHull(hull)
     normals, offsets = shape.equations[:, :3], shape.equations[:, 3]
     sides = points @ normals.T + offsets
     plane = np.argmax(sides, axis=1)
     distance = np.maximum(sides[np.arange(len(points)), plane], 0.0)
-    # The distance to the plane that a point is furthest beyond is exact if the foot of the perpendicular lies on the
+    # The distance to the plane that a point is farthest beyond is exact if the foot of the perpendicular lies on the
     # hull. Otherwise the nearest point of the hull lies on an edge.
     feet = points - distance[:, None] * normals[plane]
     rows = np.nonzero((distance > 0) & ((feet @ normals.T + offsets).max(axis=1) > 1e-12))[0]
@@ -84,13 +85,13 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
 
 
 def support(body: Body) -> Float[np.ndarray, "128"]:
-    """Support function of the collision parts' convex hull, about the mesh origin: h(d) = max over vertices v . d.
+    """Compute the support function h(d) = max over v of v . d of a body, with v the vertices of its collision parts.
 
     Args:
-        body: one body.
+        body: One body.
 
     Returns:
-        float32, m, at DIRECTIONS in the mesh frame.
+        Values for the directions d in DIRECTIONS (m), in the mesh frame, float32.
 
     Raises:
         ValueError: `body` has leading axes.
@@ -104,17 +105,19 @@ def support(body: Body) -> Float[np.ndarray, "128"]:
 def rest_poses(
     points: Float[np.ndarray, "n 3"], com: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k"]]:
-    """Attitudes in which a convex hull rests on a plane.
+    """Find the orientations in which a convex hull rests on a level plane.
 
-    The hull rests on a face if the centre of mass lies above the face and at least REST_MARGIN inside its outline.
+    The hull rests on a face if the centre of mass lies above the face and at least 0.5 mm inside the outline of the
+    face.
 
     Args:
-        points: m. Their convex hull is the object at rest.
-        com: centre of mass, m.
+        points: Points whose convex hull is the object (m).
+        com: Centre of mass (m), in the same frame.
 
     Returns:
-        For each such face, the unit vector that points up when the hull rests on it, and a weight: the face's solid
-        angle seen from the centre of mass, as a share of the sum over these faces.
+        The unit vector that points up while the hull rests on each of the k stable faces, and the share of each face.
+        The share is the solid angle of the face, seen from the centre of mass, over the sum of all stable faces. Both
+        arrays are empty if the hull rests on no face.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

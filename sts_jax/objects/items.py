@@ -1,12 +1,12 @@
-"""The items of a collection of mesh files, before and after loading."""
+"""Records of a collection of mesh files: an item before loading, an entry after it, and the library of all items."""
 
 import dataclasses
 from pathlib import Path
 
 from sts_jax.objects.body import Body
 
-LARGEST = 0.12  # m, longest side: larger objects are scaled down to it, so that they can lie on the 0.15 m pad
-NUM_FACES = 4096  # largest padding class for which rendering stays cheap
+LARGEST = 0.12  # m, larger objects are scaled down to this longest side, so that they can lie on the pad of 0.15 m
+NUM_FACES = 4096  # the largest size class whose rendering is cheap
 
 Vector = tuple[float, float, float]
 
@@ -15,37 +15,38 @@ Vector = tuple[float, float, float]
 class Item:
     """One mesh file and the settings for loading it."""
 
-    path: Path
-    name: str  # path within the folder, or ShapeNetSem's model id
-    label: str  # class
-    up: Vector  # direction in the file that becomes +z
-    front: Vector  # direction in the file that becomes -y
-    scale: float | None = None  # m, length of one unit of the file
-    longest_side: float | None = None  # m, instead of a scale
-    textures: Path | None = None  # folder of images that are not beside the file
-    stated: float | None = None  # m, longest side according to ShapeNetSem's table
-    notes: tuple[str, ...] = ()
+    path: Path  # The mesh file.
+    name: str  # Path within the folder, or ShapeNetSem's model id.
+    label: str  # Class of the object.
+    up: Vector  # Direction in the file that becomes +z.
+    front: Vector  # Direction in the file that becomes -y.
+    scale: float | None = None  # Length of one unit of the file (m).
+    longest_side: float | None = None  # Longest side after scaling (m), instead of `scale`.
+    textures: Path | None = None  # Additional folder of images.
+    stated: float | None = None  # Longest side according to ShapeNetSem's table (m).
+    notes: tuple[str, ...] = ()  # Remarks on the item for the listing of the library.
 
 
 @dataclasses.dataclass(frozen=True)
 class Library:
     """The objects of a folder in a fixed order, and the skipped files with the reasons."""
 
-    folder: Path
-    items: tuple[Item, ...]
-    skipped: tuple[tuple[str, str], ...]  # (name, reason)
-    classes: tuple[str, ...]  # of the items, sorted
-    cache: Path | None = None  # folder of the cached bodies
-    faces: int = NUM_FACES  # meshes with more are decimated
-    largest: float = LARGEST  # m, longer objects are scaled down
-    parts: bool = False  # whether objects that their hull fits badly collide as convex parts
+    folder: Path  # Folder of the mesh files.
+    items: tuple[Item, ...]  # Objects, sorted by class and name.
+    skipped: tuple[tuple[str, str], ...]  # (name, reason) of each file or model that is not used.
+    classes: tuple[str, ...]  # Classes of the items, sorted.
+    cache: Path | None = None  # Folder of the cached bodies.
+    faces: int = NUM_FACES  # Largest number of faces and of vertices. Larger meshes are decimated.
+    largest: float = LARGEST  # Longest side (m) to which longer objects are scaled down.
+    parts: bool = False  # True if objects that stand off their convex hull collide as convex parts.
 
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """An item, loaded as a body."""
+    """An item after loading: the body, the fit of its collision parts and notes on repairs."""
 
-    item: Item
-    body: Body
-    gaps: tuple[float, float]  # m, how far the surface sticks out of the collision parts, and the reverse
-    notes: tuple[str, ...]
+    item: Item  # The item that was loaded.
+    body: Body  # The loaded body.
+    # Largest distances (m) of the surface outside the collision parts, and of the collision parts outside the surface.
+    gaps: tuple[float, float]
+    notes: tuple[str, ...]  # Repairs of the mesh and remarks on the item.

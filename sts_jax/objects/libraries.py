@@ -1,8 +1,8 @@
 """Collections of mesh files: ShapeNetSem as downloaded, or any folder of meshes with one sub-folder per class.
 
-`library` lists the items without opening a mesh. `read` loads one item as a `Body`. `survey` reads all items once,
-fills the cache if there is one, and lists each object with its size or its error. One bad object never stops a
-collection.
+`library` lists the objects of a folder without opening a mesh. `read` loads one object as a `Body`. `survey` reads all
+objects once, fills the cache if there is one, and lists each object with its size or its error. An object that cannot
+be loaded does not stop `survey` and `bodies`.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ from sts_jax.objects.items import LARGEST, NUM_FACES, Entry, Item, Library
 from sts_jax.objects.meshes import AXES, load
 from sts_jax.objects.parts import decompose, gaps
 
-THINNEST = 0.0005  # m, a hull thinner than this is a sheet, which has no stable contacts
-HOLLOW = 0.002  # m, a hull that stands off the surface by more than this is worth decomposing
+THINNEST = 0.0005  # m, an object thinner than this is refused, because its contacts are unstable
+HOLLOW = 0.002  # m, a hull that reaches farther outside the surface than this is worth decomposing
 
 _SOLID = ("scissors", "fork", "spoon")  # classes of solid steel objects
 # Formats other than meshes that trimesh reads: archives, points, drawings.
@@ -48,29 +48,34 @@ def library(
 ) -> Library:
     """List the objects of a folder without opening a mesh.
 
-    A folder with ShapeNetSem's metadata.csv is read by that table. `unit` gives the size, `up` and `front` the
-    attitude, and `category` one of CATEGORIES. Meshes are expected at models-OBJ/models/ID.obj, images in
-    models-textures/textures. In any other folder, every mesh file is an object. Its class is the first sub-folder of
-    its path, or the name of the folder for a file directly in it.
+    A folder that contains ShapeNetSem's metadata.csv is read by this table. Its columns define each object: `unit` the
+    size, `up` and `front` the orientation, and `category` the class, one of CATEGORIES. Meshes are expected at
+    models-OBJ/models/ID.obj and images in models-textures/textures.
+
+    In any other folder, every mesh file is an object. Its class is the name of the first sub-folder of its path. The
+    class of a file directly in the folder is the name of the folder.
 
     Args:
-        folder: the folder of objects.
-        cache: folder that keeps the loaded bodies, created if it is missing. None loads the files each time.
-        scale: m, length of one unit of the files. None takes ShapeNetSem's table, or one metre.
-        longest_side: m, longest side to which every object is scaled. None keeps their sizes.
-        up: axis of the files that becomes +z. None takes ShapeNetSem's table, or else "y" for glTF and "z" for others.
-        faces: maximum number of faces and of vertices. Larger meshes are decimated.
-        largest: m. Longer objects are scaled down to it.
-        parts: whether objects whose hull stands off the surface by more than 2 mm are decomposed into convex parts.
-            This takes some ten seconds per object and needs the package coacd.
+        folder: Folder of the objects.
+        cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
+        scale: Length of one unit of the files (m). None uses ShapeNetSem's table, or 1 m without a table.
+        longest_side: Longest side to which every object is scaled (m). None keeps the sizes. Only `scale` or
+            `longest_side` can be given.
+        up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
+            "z" for other formats.
+        faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
+            fast-simplification.
+        largest: Longest side to which longer objects are scaled down (m).
+        parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
+            parts. This takes about ten seconds per object and needs the package coacd.
 
     Returns:
         The library, sorted by class and name.
 
     Raises:
-        FileNotFoundError: the folder does not exist.
-        ValueError: the folder has no usable mesh, the table lacks columns or cannot be read, or an argument is out of
-            range.
+        FileNotFoundError: The folder does not exist.
+        ValueError: The folder contains no usable mesh, the table lacks columns or cannot be read, or an argument is out
+            of range.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -93,7 +98,7 @@ def library(
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
         reasons = "".join(f"\n  {name}: {reason}" for name, reason in skipped[:5])
-        raise ValueError(f"{folder}: holds no mesh that can be used: give a folder with mesh files in it{reasons}")
+        raise ValueError(f"{folder}: contains no mesh that can be used: give a folder with mesh files in it{reasons}")
     if scale is not None or longest_side is not None:
         items = [dataclasses.replace(item, scale=scale, longest_side=longest_side, stated=None) for item in items]
     if up is not None:
@@ -112,7 +117,7 @@ def library(
 
 
 def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
-    """The mesh files of any folder, and (name, reason) of each that trimesh cannot read."""
+    """List the mesh files of a folder as items, and (name, reason) of each mesh file that trimesh cannot read."""
     suffixes = {f".{name}" for name in trimesh.available_formats() - _NO_MESH}
     items, skipped = [], []
     for path in sorted(folder.rglob("*")):
@@ -139,20 +144,20 @@ def _walked(folder: Path) -> tuple[list[Item], list[tuple[str, str]]]:
 def read(collection: Library, index: int) -> Entry:
     """Load one item as a body, through the cache if the library has one.
 
-    The notes list all repairs (see `load`). Scissors, forks and spoons are solid and of steel. All other objects are
-    shells with contents. The body's category is its class if that is one of CATEGORIES, and -1 otherwise.
+    Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. The body's category
+    is its class if the class is one of CATEGORIES, and -1 otherwise. The warnings of `load` about repairs become notes.
 
     Args:
-        collection: a library from `library`.
-        index: index of the item.
+        collection: Library from `library`.
+        index: Index of the item in `collection.items`.
 
     Returns:
-        The body with its gaps and notes.
+        The body, the distances between its surface and its collision parts, and notes.
 
     Raises:
-        ImportError: the package for decimation or decomposition is needed and not installed.
-        FileNotFoundError: the file does not exist any more.
-        ValueError: the file cannot be loaded as a body. The message gives the reason.
+        ImportError: The package for decimation or decomposition is needed and not installed.
+        FileNotFoundError: The file no longer exists.
+        ValueError: The file cannot be loaded as a body. The message contains the reason.
     """
     item = collection.items[index]
     if collection.cache is None:
@@ -166,14 +171,17 @@ def read(collection: Library, index: int) -> Entry:
 
 
 def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[list[Body], list[tuple[str, str]]]:
-    """Load several items as bodies, and skip those that cannot be loaded.
+    """Load several items as bodies, and skip items that cannot be loaded.
 
     Args:
-        collection: a library from `library`.
-        indices: indices of the items. None means all.
+        collection: Library from `library`.
+        indices: Indices of the items in `collection.items`. None selects all items.
 
     Returns:
         The bodies, and (name, reason) of each skipped item.
+
+    Raises:
+        ImportError: The package for decimation or decomposition is needed and not installed.
     """
     made, skipped = [], []
     for index in range(len(collection.items)) if indices is None else indices:
@@ -186,15 +194,18 @@ def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[l
 
 
 def survey(collection: Library, *, progress: Callable[[str], None] | None = None) -> tuple[Library, str]:
-    """Read every item once.
+    """Read every item once, to find the items that cannot be used and to list the others.
 
     Args:
-        collection: a library from `library`.
-        progress: called with the line of each object after it is read.
+        collection: Library from `library`.
+        progress: Function that is called with the line of each object after the object has been read.
 
     Returns:
-        The library with the unusable items moved to `skipped`, and a listing: the number of objects of each class, a
-        line for each object and a line for each skipped item.
+        The library with the unusable items moved to `skipped`, and a listing. The listing has the number of objects of
+        each class, a line for each object and a line for each skipped item.
+
+    Raises:
+        ImportError: The package for decimation or decomposition is needed and not installed.
     """
     items, skipped, lines = [], list(collection.skipped), []
     for index, item in enumerate(collection.items):
@@ -226,12 +237,17 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
 
 
 def describe(entry: Entry) -> str:
-    """The line of one object in a listing."""
+    """Describe one object in a line, as in the listing of `survey`."""
     return f"{entry.item.label}  {entry.item.name}: " + "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
 
 
 def facts(body: Body, apart: tuple[float, float]) -> list[str]:
-    """Size (mm), faces, collision hull and gaps (mm) of a body, in words. `apart` (m) is the result of `gaps`."""
+    """Describe the size (mm), the faces, the collision hull and the gaps (mm) of a body in words.
+
+    Args:
+        body: One body.
+        apart: Gaps between the surface and the collision parts, from `gaps` (m).
+    """
     size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
     drawn = int(np.asarray(body.faces).any(axis=1).sum())
     hulls = np.asarray(body.hulls)
@@ -241,7 +257,7 @@ def facts(body: Body, apart: tuple[float, float]) -> list[str]:
 
 
 def _tried(collection: Library, index: int) -> Entry | str:
-    """An item as a body, or the reason why it cannot be loaded."""
+    """Read an item, or return the reason why it cannot be loaded."""
     item = collection.items[index]
     try:
         return read(collection, index)
@@ -252,12 +268,12 @@ def _tried(collection: Library, index: int) -> Entry | str:
 
 
 def _short(message: object, item: Item) -> str:
-    """A message without its path, because a listing names the object anyway."""
+    """Remove the path of an item from a message, because a listing names the object anyway."""
     return str(message).removeprefix(f"{item.path}: ").replace(f"{item.path.parent}{os.sep}", "").replace("\n", " ")
 
 
 def _made(collection: Library, item: Item) -> Entry:
-    """An item, loaded from its file. Warnings become notes."""
+    """Load an item from its mesh file. Warnings become notes."""
     solid = item.label in _SOLID
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -278,11 +294,13 @@ def _made(collection: Library, item: Item) -> Entry:
     vertices = np.asarray(body.vertices, float)
     longest = float(np.ptp(vertices, axis=0).max())
     if item.stated is not None and not 0.9 < longest / min(item.stated, collection.largest) < 1.1:
-        notes.append(f"the table's aligned.dims give a longest side of {item.stated * 1e3:.0f} mm")
+        notes.append(f"its longest side in metadata.csv (aligned.dims) is {item.stated * 1e3:.0f} mm")
     shape = ConvexHull(np.asarray(body.hulls[0], float))
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:
-        raise ValueError(f"it is a sheet {thickness * 1e3:.2g} mm thick, which is too thin for stable contacts")
+        raise ValueError(
+            f"it is {thickness * 1e3:.2g} mm thick, but stable contacts need {THINNEST * 1e3:g} mm: thicken the mesh"
+        )
     apart = gaps(body)
     if collection.parts and apart[1] > HOLLOW:
         try:

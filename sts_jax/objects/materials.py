@@ -1,4 +1,4 @@
-"""Colours, texture coordinates and textures of mesh files, and the material and image files that they refer to."""
+"""Colours and textures of mesh files, and the material and image files to which mesh files refer."""
 
 import json
 import re
@@ -16,14 +16,14 @@ PLAIN = 0.7  # sRGB grey of a mesh without colours
 
 
 def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """List the files that an OBJ or glTF file refers to. Other formats are not read.
+    """List the files to which an OBJ or glTF file refers. For other formats, the list is empty.
 
     Args:
-        path: the mesh file.
-        images: additional folder of images.
+        path: The mesh file.
+        images: Additional folder in which images are looked up, or None.
 
     Returns:
-        The place of each file by the name that refers to it, or None for a missing file.
+        The path of each file by its name in the mesh or material file. The path of a missing file is None.
     """
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
@@ -41,23 +41,27 @@ def check_materials(path: Path, images: Path | None, strict: bool) -> None:
     """Check the materials and images of an OBJ, because trimesh silently ignores missing and damaged ones.
 
     Args:
-        path: the mesh file. Other formats pass.
-        images: additional folder of images.
-        strict: whether a missing file is an error instead of a warning.
+        path: The mesh file. Files of other formats are not checked.
+        images: Additional folder in which images are looked up, or None.
+        strict: If True, a missing file is an error instead of a warning.
 
     Raises:
-        FileNotFoundError: a file is missing and `strict` is set.
-        ValueError: an image cannot be read.
+        FileNotFoundError: A file is missing and `strict` is True.
+        ValueError: An image cannot be read.
     """
     if path.suffix.lower() != ".obj":
         return
     files = references(path, images)
     missing = [str(path.parent / name) for name, file in files.items() if file is None]
     if missing and strict:
-        raise FileNotFoundError(f"{path} refers to {', '.join(missing)}, not found: add it, or give texture=")
+        raise FileNotFoundError(
+            f"{path} refers to {', '.join(missing)}, which does not exist: add it, or give texture="
+        )
     if missing:
         warnings.warn(
-            f"{path} refers to {', '.join(missing)}, not found: drawn without it unless texture= is given", stacklevel=3
+            f"{path} refers to {', '.join(missing)}, which does not exist, so colours are missing: add it, or give "
+            "texture=",
+            stacklevel=3,
         )
     for file in files.values():
         if file is not None and file.suffix.lower() != ".mtl":
@@ -68,8 +72,8 @@ def read_image(path: Path) -> Image.Image:
     """Read an image file as RGB.
 
     Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file cannot be read as an image.
+        FileNotFoundError: The file does not exist.
+        ValueError: The file cannot be read as an image.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such image file")
@@ -81,14 +85,14 @@ def read_image(path: Path) -> Image.Image:
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):
-    """Lets trimesh find images in an additional folder."""
+    """Resolver of file names with which trimesh also finds images in an additional folder."""
 
     def __init__(self, path: Path, images: Path) -> None:
         super().__init__(str(path))
         self.images = images
 
     def get(self, name: str) -> bytes:
-        """The content of a file that the mesh file refers to."""
+        """Return the content of a file to which the mesh file refers."""
         found = _found(Path(self.parent), name, self.images)
         return super().get(name) if found is None else found.read_bytes()
 
@@ -101,25 +105,25 @@ def _found(folder: Path, name: str, images: Path | None) -> Path | None:
 
 
 def _named(file: Path, word: str) -> list[str]:
-    """The names behind a word at the start of a line in an OBJ or MTL file."""
+    """List the names that follow a keyword at the beginning of a line in an OBJ or MTL file."""
     return re.findall(
         rf"^[ \t]*{word}[ \t]+(\S.*?)\s*$", file.read_text(errors="replace"), re.IGNORECASE | re.MULTILINE
     )
 
 
 def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Colours, texture coordinates and texture of all meshes of a file together.
+    """Extract colours, texture coordinates and one common texture from all meshes of a file.
 
     Args:
-        path: the file. Colours of glTF files are in linear light, all others in sRGB.
-        pieces: its meshes.
+        path: The mesh file. Colours of glTF files are in linear light. Colours of other files are in sRGB.
+        pieces: All meshes of the file.
 
     Returns:
-        Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) of all corners, and the texture (t, t, 3) in
-        linear light, or None.
+        Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) at all corners of all faces, and the texture
+        (t, t, 3) in linear light. The texture is None if no mesh has one.
 
     Raises:
-        ValueError: a texture cannot be read.
+        ValueError: A texture cannot be read.
     """
     is_linear = path.suffix.lower() in (".glb", ".gltf")
     colors, uvs, images = [], [], []
@@ -143,7 +147,7 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
         if not same:
             distinct.append(sheet)
     plain = len(distinct) if any(image is None for image in images) else -1
-    if plain >= 0:  # untextured pieces look up a white cell
+    if plain >= 0:  # the texture of untextured pieces is a white cell
         distinct.append(np.full((8, 8, 3), 255, np.uint8))
     if len(distinct) == 1:
         texture = _square(distinct[0], _texture_class(max(distinct[0].shape[:2])))
@@ -154,8 +158,17 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
 
 
 def _packed(sheets: list[np.ndarray], uvs: list[np.ndarray], cells: list[int]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Pack several textures into one, and map the coordinates of each piece, given its texture's index, to its cell."""
-    # The cells tile a sheet of a texture class's size, so that it is not resampled again.
+    """Pack several textures into cells of one texture.
+
+    Args:
+        sheets: The textures.
+        uvs: Texture coordinates of each piece.
+        cells: Index of the texture of each piece.
+
+    Returns:
+        The packed texture, and the texture coordinates of each piece in it.
+    """
+    # The packed texture has the size of a texture class, so that it is not resampled again.
     grid = int(np.ceil(np.sqrt(len(sheets))))
     size = _texture_class(grid * max(max(sheet.shape[:2]) for sheet in sheets))
     side = size // grid
@@ -176,14 +189,14 @@ def _texture_class(longest: int) -> int:
 
 
 def _square(sheet: np.ndarray, side: int) -> np.ndarray:
-    """An image, stretched to a square."""
+    """Stretch an image to a square."""
     if sheet.shape[:2] == (side, side):
         return sheet
     return np.asarray(Image.fromarray(sheet).resize((side, side), Image.Resampling.LANCZOS))
 
 
 def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, np.ndarray, Image.Image | None]:
-    """Colours (f, 3, 3) in linear light, texture coordinates (f, 3, 2) and the image, if any, of one mesh."""
+    """Extract colours (f, 3, 3) in linear light, texture coordinates (f, 3, 2) and the image, if any, of one mesh."""
     faces = np.asarray(piece.faces)
     uv = np.zeros((len(faces), 3, 2))
     visual = piece.visual
@@ -217,5 +230,5 @@ def _piece_albedo(piece: trimesh.Trimesh, is_linear: bool) -> tuple[np.ndarray, 
 
 
 def _unit(color: np.ndarray) -> np.ndarray:
-    """Colours in [0, 1], from integers of any size or from floats."""
+    """Scale colours of any integer type to [0, 1]. Floats keep their values."""
     return color / np.iinfo(color.dtype).max if np.issubdtype(color.dtype, np.integer) else color.astype(float)

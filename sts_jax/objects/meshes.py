@@ -1,4 +1,4 @@
-"""Mesh files as bodies, in any format that trimesh reads, with textures or colours."""
+"""Loading of mesh files as bodies, in any format that trimesh reads, with textures or colours."""
 
 import os
 import warnings
@@ -19,8 +19,8 @@ from sts_jax.objects.materials import Resolver, albedo, check_materials, read_im
 from sts_jax.objects.parts import decompose
 from sts_jax.objects.surface import Surface, is_closed, merge
 
-# Up and front of a file for which only the up axis is given. Front becomes -y. The front of a glTF is +z (glTF
-# specification).
+# Up and front directions of a file for which only the up axis is given. Up becomes +z, and front becomes -y. The front
+# of a glTF file is +z (glTF specification).
 AXES = {
     "x": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
     "y": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
@@ -29,17 +29,19 @@ AXES = {
 
 
 def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "3 3"]:
-    """Rotation R that takes a file's up axis to +z and the component of its front orthogonal to up to -y.
+    """Compute the rotation that turns a file's up direction to +z and its front direction to -y.
+
+    If the directions are not perpendicular, only the component of `front` perpendicular to `up` is turned to -y.
 
     Args:
-        up: direction of any length.
-        front: direction of any length, not parallel to `up`.
+        up: Direction in the file, of any length.
+        front: Direction in the file, of any length, not parallel to `up`.
 
     Returns:
-        R, a proper rotation: a point p becomes R p.
+        Rotation matrix R. A point p of the file becomes R p.
 
     Raises:
-        ValueError: a direction is not finite or zero, or the two are parallel.
+        ValueError: A direction is not finite or zero, or the two are parallel.
     """
     z, y = np.array(up, float), -np.array(front, float)
     if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
@@ -70,47 +72,56 @@ def load(
     parts: bool = False,
     category: int = -1,
 ) -> Body:
-    """Load a mesh file as a body. The meshes of a scene are merged into one.
+    """Load a mesh file as a body. All meshes of the file are merged into one.
 
-    The albedo is texture times corner colour, in linear light. Textures, 8-bit colours and the `Kd` of an OBJ are read
-    as sRGB, factors and vertex colours of a glTF as linear (glTF specification). The `Kd` of a textured OBJ and alpha
-    are ignored. A texture is stretched to the next square of TEXTURE_CLASSES. Several textures are packed into one,
-    where coordinates outside [0, 1] are clipped instead of repeated. The frame keeps the file's axes (see `up`), with
-    the origin at the centroid of the collision hull, which is the convex hull reduced to at most 64 vertices
-    (`hull_gap` gives the error). Surfaces that are not closed are visible from both sides.
+    The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull.
+    The collision hull is the convex hull, reduced to at most 64 vertices. `hull_gap` returns the error of this
+    reduction. Surfaces that are not closed are visible from both sides.
+
+    The albedo is the texture's value times the corner colour, in linear light. Textures, 8-bit colours and the `Kd` of
+    an OBJ file are read as sRGB. Factors and vertex colours of a glTF file are read as linear light (glTF
+    specification). The `Kd` of a textured OBJ file and alpha are ignored. Textures are resized to a square of
+    TEXTURE_CLASSES. Several textures are packed into one, where coordinates outside [0, 1] are clipped instead of
+    repeated.
 
     Args:
-        path: the file. Its materials and images are looked up beside it.
-        longest_side: m, longest side of the scaled bounding box. None keeps the file's size.
-        scale: m, length of one unit of the file. None means one metre.
-        largest: m, maximum of the longest side. A larger mesh is scaled down to it, with a warning.
-        mass: kg, spread over the surface of a body without contents. None gives a shell of `density` whose contents
-            have 1,000 kg/m^3 (`rigid` takes the fill level).
-        density: kg/m^2 of the surface.
-        hollow: whether the object has contents. False gives a solid object with all its mass on the surface.
-        strict: whether to raise an error for defects that are otherwise repaired with a warning: a mesh that encloses
-            no volume (its convex hull's is used), and missing materials and images of an OBJ (they are left out).
-        up: axis of the file, or direction in it, that becomes +z. The convention of glTF files is "y".
-        front: direction in the file that becomes -y, by default (0, -1, 0). Only with an `up` that is a direction.
-        texture: image that replaces the file's own textures, with the file's texture coordinates.
-        textures: additional folder in which to look up the file's images.
-        faces: maximum number of faces and of vertices. A larger mesh is decimated with a warning, and its texture is
-            replaced by one colour per corner. Needs the package fast-simplification.
-        parts: whether the body collides as convex parts (`decompose`) instead of its hull. Needs the package coacd.
-        category: index into CATEGORIES, or -1.
+        path: The mesh file. Its materials and images are looked up in the same folder.
+        longest_side: Longest side of the bounding box after scaling (m), from 5 mm to 0.15 m. None keeps the file's
+            size. Only `longest_side` or `scale` can be given.
+        scale: Length of one unit of the file (m). None is 1 m.
+        largest: Largest allowed longest side (m), from 5 mm to 0.15 m. A larger mesh is scaled down to it with a
+            warning. None raises an error for a mesh that is larger than the pad.
+        mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass of
+            the shell from `density`.
+        density: Mass of the shell per area (kg/m^2), if `mass` is None.
+        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3, and `rigid` receives the fill level.
+            If False, the body has no contents.
+        strict: If False, two defects are repaired with a warning. If a mesh encloses no volume, the volume of its
+            convex hull is used. Missing materials and images of an OBJ file are left out. If True, these defects are
+            errors.
+        up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
+        front: Direction in the file that becomes -y, only for an `up` that is a direction. None is (0, -1, 0). If `up`
+            is an axis, `front` must be None.
+        texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
+        textures: Additional folder in which the file's images are looked up.
+        faces: Largest number of faces and of vertices, at least 4. A larger mesh is decimated with a warning, and its
+            texture is replaced by one colour per corner. This needs the package fast-simplification.
+        parts: If True, the body collides as convex parts (`decompose`) instead of as its convex hull. This needs the
+            package coacd.
+        category: Index into CATEGORIES, or -1 for an object of no category.
 
     Returns:
         The body.
 
     Raises:
-        FileNotFoundError: the file or the texture does not exist, or with `strict` a file that the mesh refers to.
-        ImportError: the package for decimation or decomposition is not installed.
-        IsADirectoryError: the path is a folder.
-        PermissionError: the file is not readable.
-        ValueError: the file is empty, truncated or not a mesh. The mesh has no faces, NaN, too many faces, no extent
-            in some direction, is larger than the pad or smaller than 5 mm, is not closed although `strict` is set, or
-            cannot be decimated to `faces` or decomposed. `mass`, `density`, `category`, `faces`, a size or a direction
-            is out of range.
+        FileNotFoundError: The file or the texture does not exist. With `strict`, also for a missing material or image.
+        ImportError: The package for decimation or decomposition is not installed.
+        IsADirectoryError: The path is a folder.
+        PermissionError: The file is not readable.
+        ValueError: The file is empty, truncated or not a mesh, or an image cannot be read. The mesh has no faces,
+            values that are not finite, too many faces, no extent in some direction, no texture coordinates for
+            `texture`, or a longest side above 0.15 m or below 5 mm. With `strict`, the mesh is not closed or encloses
+            no volume. The mesh cannot be decimated to `faces` or decomposed. An argument is out of range.
     """
     path = Path(path)
     _check_arguments(path, longest_side, scale, largest, mass, density, faces, category)
@@ -142,7 +153,7 @@ def load(
 def _check_arguments(
     path: Path, longest_side: Any, scale: Any, largest: Any, mass: Any, density: Any, faces: Any, category: Any
 ) -> None:
-    """Raise an error that names the first argument of `load` that is out of range."""
+    """Raise a ValueError that names the first argument of `load` that is out of range."""
     for name, value, unit in (
         ("longest_side", longest_side, "metres"),
         ("scale", scale, "metres"),
@@ -156,10 +167,10 @@ def _check_arguments(
             raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
-            raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most that")
+            raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most {PAD}")
         if value is not None and value < SMALLEST:
             raise ValueError(
-                f"{path}: {name} is {value} m, but the smallest object is {SMALLEST} m long: give at least that"
+                f"{path}: {name} is {value} m, but the smallest object is {SMALLEST} m long: give at least {SMALLEST}"
             )
     try:
         check_category(category)
@@ -174,10 +185,13 @@ def _check_arguments(
 def _attitude(
     path: Path, up: Literal["x", "y", "z"] | tuple[float, float, float], front: tuple[float, float, float] | None
 ) -> np.ndarray:
-    """The rotation of the arguments `up` and `front` of `load`."""
+    """Return the rotation matrix for the arguments `up` and `front` of `load`."""
     if isinstance(up, str):
         if up not in AXES or front is not None:
-            raise ValueError(f"{path}: up must be 'x', 'y' or 'z', or three numbers if front is given, got {up!r}")
+            raise ValueError(
+                f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z', or three numbers if front "
+                "is given"
+            )
         return rotation(*AXES[up])
     try:
         return rotation(up, AXES["z"][1] if front is None else front)
@@ -186,7 +200,7 @@ def _attitude(
 
 
 def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh.Trimesh]:
-    """The meshes of a file. The image `texture` replaces their textures."""
+    """Read the meshes of a file. The image `texture` replaces their textures."""
     sheet = None if texture is None else read_image(texture)
     try:
         # trimesh opens the images itself, so only a resolver can make it look in a separate folder of images.
@@ -194,7 +208,7 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
-        # For text that is not UTF-8, trimesh imports a package that is not among its requirements.
+        # For text that is not UTF-8, trimesh imports a package that is not one of its requirements.
         damaged = "it is truncated or damaged: replace it" if error.name == "charset_normalizer" else "install it"
         raise ValueError(f"{path}: cannot be read as a mesh ({error}): {damaged}") from error
     except Exception as error:  # trimesh's many readers raise errors of many types
@@ -205,16 +219,14 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
         raise ValueError(f"{path}: has no faces: give a mesh with triangles")
     for piece in pieces if sheet is not None else []:
         if getattr(piece.visual, "uv", None) is None:
-            raise ValueError(
-                f"{path}: has no texture coordinates, so {texture} cannot be applied to it: leave texture out"
-            )
+            raise ValueError(f"{path}: has no texture coordinates, so {texture} cannot be applied to it: omit texture=")
         material = trimesh.visual.material.PBRMaterial(baseColorTexture=sheet)
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
     return pieces
 
 
 def _check_file(path: Path) -> None:
-    """Raise an error unless a file exists, is readable and not empty. An STL file must also be complete."""
+    """Raise an error unless a file exists, can be read and is not empty. An STL file must also be complete."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give a mesh file in it, or pass it to objects.library")
     if not path.is_file():
@@ -246,7 +258,7 @@ def _check_file(path: Path) -> None:
 def _factor(
     path: Path, corners: np.ndarray, longest_side: float | None, scale: float | None, largest: float | None
 ) -> float:
-    """The factor that turns the file's units into metres."""
+    """Return the factor from the file's units to metres, after a check of the size."""
     extent = float(np.ptp(corners, axis=(0, 1)).max())
     if not extent > 0:
         raise ValueError(f"{path}: all vertices lie at one point: repair the mesh")
@@ -257,7 +269,7 @@ def _factor(
     if extent < SMALLEST:
         raise ValueError(
             f"{path}: its longest side is {extent * 1e3:.2g} mm, but the smallest object is {SMALLEST * 1e3:g} mm "
-            "long: check its unit and give longest_side, or scale, the metres of one unit of the file"
+            "long: check its unit and give longest_side, or scale, the length of one unit of the file in metres"
         )
     if largest is not None and extent > largest:
         warnings.warn(f"{path}: its longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
@@ -273,7 +285,7 @@ def _factor(
 def _body(
     path: Path, surface: Surface, mass: float | None, density: float, hollow: bool, strict: bool, category: int
 ) -> Body:
-    """The body of a surface. The volume of its hull stands in for that of a surface that encloses none."""
+    """Make a body of a surface. If the surface encloses no volume, its convex hull bounds the contents."""
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
@@ -300,10 +312,10 @@ def _body(
             )
         if holds:
             warnings.warn(
-                f"{path}: the mesh {fault}, so its volume is taken from its convex hull ({hull.volume * 1e6:.3g} ml)",
+                f"{path}: the mesh {fault}, so the volume of its convex hull is used ({hull.volume * 1e6:.3g} ml)",
                 stacklevel=3,
             )
-        if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its padding class
+        if len(hull.simplices) > max(len(faces), len(vertices)):  # keeps the body in its size class
             points = convex_hull(vertices, limit=256, tolerance=0.0)
             interior = (points, _outward(points, ConvexHull(points)))
         else:
@@ -327,7 +339,7 @@ def _body(
 
 
 def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
-    """The corners (f, 3, 3) of the faces of a mesh, in the file's units."""
+    """Return the corners (f, 3, 3) of the faces of a mesh, in the file's units."""
     faces = np.asarray(piece.faces)
     wrong = faces[(faces < 0) | (faces >= len(piece.vertices))]
     if wrong.size:
@@ -339,7 +351,7 @@ def _corners(path: Path, piece: trimesh.Trimesh) -> np.ndarray:
 
 
 def _outward(vertices: np.ndarray, hull: ConvexHull) -> np.ndarray:
-    """The faces of a hull, counter-clockwise from outside."""
+    """Return the faces of a hull, counter-clockwise seen from outside."""
     triangles = vertices[hull.simplices]
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     inward = np.einsum("fi,fi->f", normal, hull.equations[:, :3]) < 0

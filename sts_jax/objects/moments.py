@@ -1,29 +1,31 @@
-"""Moments of solids and surfaces on the host, in NumPy float64.
+"""Moments of solids and surfaces in NumPy float64, on the host.
 
-Triangles are counter-clockwise seen from outside. A row of moments is `[1, x, y, z, xx, yy, zz, xy, xz, yz]`
-integrated over a solid or a surface.
+Triangles are counter-clockwise seen from outside. A row of moments contains the integrals of
+`[1, x, y, z, xx, yy, zz, xy, xz, yz]` over a solid or a surface.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # axes of the second moments in a row
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # pairs of axes of the second moments, in the order of a row
 
 
 def solid_moments(
     triangles: Float[np.ndarray, "f 3 3"], *, reference: Float[np.ndarray, "3"] | None = None
 ) -> Float[np.ndarray, "f 10"]:
-    """Moments of the signed tetrahedra between a reference point and each triangle, which sum to the solid's.
+    """Compute the moments of the signed tetrahedra between a reference point and each triangle.
 
-    For a tetrahedron with corners `0, a, b, c` relative to the reference, v = a . (b x c) / 6, int r = v s / 4 and
-    int r r^T = v (s s^T + a a^T + b b^T + c c^T) / 20 with s = a + b + c.
+    The moments of a solid are the sum over all triangles of its closed surface. Let a tetrahedron have the corners 0,
+    a, b, c relative to the reference, and s = a + b + c. Its volume is v = a . (b x c) / 6, its first moments are
+    int r = v s / 4, and its second moments are int r r^T = v (s s^T + a a^T + b b^T + c c^T) / 20.
 
     Args:
-        triangles: corners, m.
-        reference: any point. For a clipped solid, a point on the cutting plane, so that the cut contributes nothing.
+        triangles: Corners of the triangles (m).
+        reference: Reference point (m), by default the origin. A solid that is clipped by a plane needs a point on the
+            plane, so that the missing cut face contributes nothing.
 
     Returns:
-        One row per triangle: m^3, m^4, m^5.
+        One row per triangle (m^3, m^4 and m^5), about the origin.
     """
     origin = np.zeros(3) if reference is None else reference
     r = triangles - origin
@@ -34,7 +36,17 @@ def solid_moments(
 
 
 def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
-    """Moments of triangles as thin sheets: area A, int r = A s / 3, int r r^T = A (s s^T + sum r_i r_i^T) / 12."""
+    """Compute the moments of triangles as thin sheets.
+
+    Let a triangle have the corners r_i, the sum of corners s and the area A. Its first moments are int r = A s / 3, and
+    its second moments are int r r^T = A (s s^T + sum_i r_i r_i^T) / 12.
+
+    Args:
+        triangles: Corners of the triangles (m).
+
+    Returns:
+        One row per triangle (m^2, m^3 and m^4).
+    """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(cross, axis=1) / 2
     total = triangles.sum(axis=1)
@@ -43,6 +55,7 @@ def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, 
 
 
 def _shifted(measure: np.ndarray, mean: np.ndarray, second: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Make rows of moments about 0 from the size, the mean and the mean square of r - origin."""
     second = (
         second + np.einsum("fi,j->fij", mean, origin) + np.einsum("i,fj->fij", origin, mean) + np.outer(origin, origin)
     )

@@ -1,4 +1,4 @@
-"""Convex collision parts: decomposition of a body, and the gaps between parts and visible surface."""
+"""Convex collision parts: decomposition of a body, and the distances between the parts and the visible surface."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -21,22 +21,23 @@ def convex_parts(
     limit: int = PART_CLASSES[-1],
     vertices_per_part: int = HULL_CLASSES[0],
 ) -> list[Float[np.ndarray, "_ 3"]]:
-    """Decompose a surface into convex parts, the largest first (CoACD: Wei et al., 2022, SIGGRAPH).
+    """Decompose a surface into convex parts (CoACD: Wei et al., 2022, SIGGRAPH).
 
-    The same mesh gives the same parts. CoACD first closes open surfaces, which thickens them a little.
+    Equal meshes have equal parts, because the seed is fixed. CoACD first closes open surfaces, which thickens them a
+    little.
 
     Args:
-        vertices: m.
-        faces: counter-clockwise from outside.
-        limit: maximum number of parts.
-        vertices_per_part: maximum number of vertices of each part.
+        vertices: Vertices of the surface (m).
+        faces: Vertex indices of each face, counter-clockwise seen from outside.
+        limit: Largest number of parts.
+        vertices_per_part: Largest number of vertices of each part.
 
     Returns:
-        The vertices (m) of each part. A convex surface gives a single part.
+        Vertices of each part (m), the part with the largest volume first. A convex surface has a single part.
 
     Raises:
-        ImportError: coacd is not installed.
-        ValueError: the surface cannot be decomposed.
+        ImportError: The package coacd is not installed.
+        ValueError: The surface cannot be decomposed.
     """
     try:
         import coacd
@@ -63,18 +64,18 @@ def convex_parts(
 
 
 def decompose(body: Body) -> Body:
-    """Let a body, such as scissors, a bowl or a mug, collide as several convex parts instead of its convex hull.
+    """Replace the convex hull of a body by several convex parts for collisions, such as for scissors or a bowl.
 
     Args:
-        body: one body.
+        body: One body.
 
     Returns:
-        The body with the parts as `hulls`, at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each.
-        If a single part suffices, the body is returned unchanged.
+        The body with the parts as `hulls`: at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each. If
+        a single part is enough, the body is returned unchanged.
 
     Raises:
-        ImportError: coacd is not installed.
-        ValueError: the surface cannot be decomposed.
+        ImportError: The package coacd is not installed.
+        ValueError: The surface cannot be decomposed.
     """
     parts = convex_parts(*_surface(body))
     if len(parts) == 1:
@@ -86,7 +87,15 @@ def decompose(body: Body) -> Body:
 
 
 def gaps(body: Body) -> tuple[float, float]:
-    """`surface_gaps` (m) of one body: how far its surface sticks out of the collision parts, and the reverse."""
+    """Compute the largest distances between the visible surface of a body and its collision parts.
+
+    Args:
+        body: One body.
+
+    Returns:
+        Largest distance (m) of the surface outside the collision parts, and largest distance (m) of the collision parts
+        outside the surface.
+    """
     parts = np.asarray(body.hulls, float)
     new = np.array([True, *(parts[1:] != parts[:-1]).any(axis=(1, 2))])  # padding repeats the last part
     return surface_gaps(*_surface(body), [np.unique(part, axis=0) for part in parts[new]])
@@ -95,19 +104,21 @@ def gaps(body: Body) -> tuple[float, float]:
 def surface_gaps(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], hulls: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> tuple[float, float]:
-    """Largest distances (m) between the visible surface and the collision parts.
+    """Compute the largest distances between a visible surface and its collision parts.
 
-    Each is the maximum over the corners and 10,000 points of one surface of the exact distance to the other. A maximum
-    between two points can be missed by about half their spacing. The first distance is exact for a single hull.
+    Each result is the largest distance of the corners and 10,000 points of one surface from the other surface. The
+    distance of each point is exact. The true maximum can lie between the points, which causes an error of about half
+    their spacing. The first result is exact for a single hull.
 
     Args:
-        vertices: m.
-        faces: of the visible surface, counter-clockwise from outside.
-        hulls: the vertices of each convex part.
+        vertices: Vertices of the visible surface (m).
+        faces: Vertex indices of each face, counter-clockwise seen from outside.
+        hulls: Vertices of each convex part (m).
 
     Returns:
-        How far the surface sticks out of all parts, which is how deep the drawn surface can sink in. How far the parts
-        reach outside the surface, where the object collides although nothing is visible, as in a bowl's hollow.
+        Largest distance (m) of the surface outside all parts. The visible surface can sink into the pad by this
+        distance. Largest distance (m) of the parts outside the surface. Up to this distance, the object collides where
+        nothing is visible, as in the hollow of a bowl.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
@@ -122,27 +133,30 @@ def surface_gaps(
 
 
 def hull_gap(body: Body) -> float:
-    """Largest distance (m) by which the visible surface of one body sticks out of the collision parts."""
+    """Compute the largest distance (m) of the visible surface of one body outside its collision parts."""
     surface = np.unique(np.asarray(body.vertices, float), axis=0)
     parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
     return float(np.min(parts, axis=0).max())
 
 
 def _surface(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and the faces of a body without padding faces."""
     faces = np.asarray(body.faces)
     return np.asarray(body.vertices, float), faces[faces.any(axis=1)]
 
 
 def _points(triangles: np.ndarray, num: int) -> np.ndarray:
+    """Sample `num` points (num, 3) evenly from triangles."""
     face, weight = surface_samples(triangles, num)
     return np.einsum("nk,nkc->nc", weight, triangles[face])
 
 
 def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
-    """Largest distance from the triangles over the points outside them, or over all points if they are not closed.
+    """Compute the largest distance (m) from triangles, over the points outside them or over all if not `closed`.
 
-    The distance to the nearest corner or sample is an upper bound for a point. Therefore only points whose bound
-    exceeds the largest distance so far are measured, each against the triangles within its bound.
+    The distance from a point to the nearest corner or sample of the triangles is an upper bound. Therefore the exact
+    distance is computed only for points whose bound exceeds the largest distance so far, and only to triangles within
+    the bound.
     """
     bound = KDTree(np.concatenate([_points(triangles, 10_000), triangles.reshape(-1, 3)])).query(points)[0]
     center = triangles.mean(axis=1)
@@ -158,7 +172,8 @@ def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
         lengths = np.linalg.norm(away, axis=1)
         distance = np.full(len(some), np.inf)
         np.minimum.at(distance, row, lengths)
-        # The nearest faces of a closed surface decide which side a point is on. If they disagree, the winding decides.
+        # The nearest faces of a closed surface show on which side a point is. If they disagree, the winding number
+        # decides.
         nearest = lengths <= distance[row] + 1e-9
         front = np.zeros((2, len(some)), bool)
         np.logical_or.at(front, ((np.einsum("pi,pi->p", away, normals[column]) > 0).astype(int), row), nearest)
@@ -173,7 +188,7 @@ def _reach(points: np.ndarray, triangles: np.ndarray, closed: bool) -> float:
 
 
 def _turns(point: np.ndarray, triangles: np.ndarray) -> float:
-    """Winding number of the triangles around a point (van Oosterom and Strackee, 1983): 1 inside, 0 outside."""
+    """Compute the winding number of triangles around a point: 1 inside, 0 outside (van Oosterom and Strackee, 1983)."""
     a, b, c = np.moveaxis(triangles - point, 1, 0)
     one, two, three = (np.linalg.norm(side, axis=1) for side in (a, b, c))
     across = np.einsum("fi,fi->f", a, np.cross(b, c))

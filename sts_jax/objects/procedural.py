@@ -1,7 +1,7 @@
-"""Procedural objects: the registry of families, and `make`, which generates an object of a family from a key.
+"""Procedural objects: the registry of families, and `make`, which generates an object of a family from a random key.
 
-Each family is a module of `objects.families`. It builds its parts with `objects.shapes` and `objects.colors`, on the
-host and in millimetres.
+A family is a class of objects, such as bottles, and is a module of `objects.families`. It builds the parts of an object
+with `objects.shapes` and `objects.colors`, on the host and in millimetres.
 """
 
 import dataclasses
@@ -24,14 +24,16 @@ class Family:
     """A class of procedural objects.
 
     Args:
-        name: name of the class. A body has the category of this name, or -1 if CATEGORIES has no such name.
-        seed: whole number >= 0 that joins the key. Families with different seeds draw different numbers from one key.
-        parts: function that draws an object's dimensions and colours from a generator and returns its parts in
-            millimetres, with +z up as the object usually stands or lies. Equal generators must give equal parts. The
-            object collides as the convex hull of all parts.
+        name: Name of the class. The category of a body is the index of this name in CATEGORIES, or -1 if CATEGORIES
+            lacks the name.
+        seed: Whole number >= 0 that is combined with the key, so that families with different seeds draw different
+            numbers from the same key.
+        parts: Function that receives a generator of NumPy, draws the dimensions and colours of an object from it, and
+            returns the parts of the object in millimetres. +z is up as the object usually stands or lies. Equal
+            generators must lead to equal parts. The object collides as the convex hull of all parts.
 
     Raises:
-        ValueError: `seed` is no whole number >= 0.
+        ValueError: `seed` is not a whole number >= 0.
     """
 
     name: str
@@ -43,7 +45,7 @@ class Family:
             raise ValueError(f"family {self.name}: seed must be a whole number >= 0, got {self.seed!r}")
 
 
-# A seed never changes: equal keys give equal objects in every version.
+# Seeds never change, so that equal keys lead to equal objects in every version.
 FAMILIES = {
     family.name: family
     for family in (
@@ -60,14 +62,14 @@ FAMILIES = {
 
 
 def find_family(category: str) -> Family:
-    """The family of a category.
+    """Find the family of a category.
 
     Args:
-        category: one of CATEGORIES, or "module:NAME" for a `Family` that is the variable NAME of a module, which is
-            imported. The module of a notebook or script is `__main__`.
+        category: One of CATEGORIES, or "module:NAME" for a `Family` of your own. The module is imported, and NAME is
+            its variable. The module of a notebook or script is `__main__`.
 
     Raises:
-        ValueError: there is no such category, module or variable, or the variable is no `Family`.
+        ValueError: There is no such category, module or variable, or the variable is not a `Family`.
     """
     if category in FAMILIES:
         return FAMILIES[category]
@@ -86,26 +88,27 @@ def find_family(category: str) -> Family:
         ) from error
     if not isinstance(found, Family):
         raise ValueError(
-            f"category is {category!r}, but {name} of {module} must be an objects.Family, got {type(found).__name__}"
+            f"category is {category!r}, but {name} of {module} must be an objects.Family, got {type(found).__name__}: "
+            f"assign a Family to {name}"
         )
     return found
 
 
 def make(key: PRNGKeyArray, category: str | Family) -> Body:
-    """Generate an object of a category. Equal keys give equal objects.
+    """Generate a random object of a category. Equal keys lead to equal objects.
 
     Args:
-        key: from `jax.random.key`, consumed by the call.
-        category: one of CATEGORIES, "module:NAME" (see `find_family`), or a family.
+        key: Key from `jax.random.key`, consumed by the call.
+        category: One of CATEGORIES, "module:NAME" for a `Family` of your own (`find_family`), or a `Family`.
 
     Returns:
-        A body with +z up as it usually stands or lies. A body of CATEGORIES has the smallest face class and a longest
-        side of 50 to 130 mm.
+        A body with +z up as the object usually stands or lies. A body of one of CATEGORIES has a longest side of 50 to
+        130 mm and the smallest size class of faces, FACE_CLASSES[0].
 
     Raises:
         TypeError: `key` is not a JAX key.
-        ValueError: `category` is unknown, or its family made an object that is no body: without parts, not finite,
-            of too many faces, smaller than 5 mm or larger than the pad, or with more than one interior.
+        ValueError: `category` is unknown, or the parts of its family are invalid. There are no parts, values that are
+            not finite, too many faces or more than one interior, or the longest side is below 5 mm or above 0.15 m.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category
@@ -132,12 +135,12 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
 
 def _check(family: Family, parts: list[Part]) -> None:
-    """Raise an error unless the parts make an object of a permitted size."""
+    """Raise a ValueError unless the parts form an object of an allowed size."""
     if not parts:
-        raise ValueError(f"family {family.name}: parts must return at least one Part, got none")
+        raise ValueError(f"family {family.name}: the function parts must return at least one Part, got none")
     inner = sum(part.interior for part in parts)
     if inner > 1:
-        raise ValueError(f"family {family.name}: one part may have interior=True, got {inner}")
+        raise ValueError(f"family {family.name}: at most one part can have interior=True, got {inner}")
     points, faces = np.concatenate([part.vertices for part in parts]), sum(len(part.faces) for part in parts)
     if max(len(points), faces) > FACE_CLASSES[-1]:
         raise ValueError(
@@ -150,5 +153,5 @@ def _check(family: Family, parts: list[Part]) -> None:
     if not 1e3 * SMALLEST <= longest <= 1e3 * PAD:
         raise ValueError(
             f"family {family.name}: the longest side must be {1e3 * SMALLEST:g} to {1e3 * PAD:g} mm, got {longest:.3g} "
-            "mm: parts are in millimetres, and shapes.scaled gives them a length"
+            "mm: parts are in millimetres, and shapes.scaled scales them to a length"
         )

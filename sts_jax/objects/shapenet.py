@@ -1,4 +1,4 @@
-"""ShapeNetSem as downloaded: its table gives class, size and attitude of each mesh."""
+"""ShapeNetSem as downloaded: its table metadata.csv defines the class, size and orientation of each mesh."""
 
 import csv
 import io
@@ -9,8 +9,8 @@ import numpy as np
 from sts_jax.objects.items import Item, Vector
 from sts_jax.objects.meshes import rotation
 
-# Class of each of ShapeNetSem's categories (the `category` column of its metadata.csv, named in its taxonomy.txt).
-# "Mouse" is left out because, unlike "ComputerMouse", it may be the animal.
+# Class of each category of ShapeNetSem that is used (column `category` of metadata.csv, names in taxonomy.txt). "Mouse"
+# is left out because it can be the animal, unlike "ComputerMouse".
 CLASSES = {
     "Bottle": "bottle",
     "BeerBottle": "bottle",
@@ -27,14 +27,14 @@ CLASSES = {
     "Spoon": "spoon",
     "Watch": "watch",
 }
-# The required columns among those in ShapeNetSem's README: id, categories, directions, metres per unit.
+# Required columns, as in ShapeNetSem's README: id, categories, directions up and front, and metres per unit.
 _COLUMNS = ("fullId", "category", "up", "front", "unit")
 # Defaults of ShapeNet's own viewer for missing directions (ShapeNet/shapenet-viewer, Constants.scala).
 _UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 
 
 def find_root(folder: Path) -> Path | None:
-    """Find the folder with the table: `folder`, or a sub-folder as the archive unpacks it. None without a table."""
+    """Find the folder of the table: `folder` or one of its sub-folders. Return None if there is no table."""
     for table in (folder / "metadata.csv", *sorted(folder.glob("*/metadata.csv"))):
         if table.is_file():
             with table.open(encoding="utf-8", errors="replace", newline="") as lines:
@@ -45,16 +45,16 @@ def find_root(folder: Path) -> Path | None:
 
 
 def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
-    """List the models of the classes CLASSES.
+    """List the models in the categories of CLASSES.
 
     Args:
-        root: the folder with the table.
+        root: Folder of the table.
 
     Returns:
         The items, and (name, reason) of each skipped model.
 
     Raises:
-        ValueError: the table lacks columns or cannot be read.
+        ValueError: The table lacks columns or cannot be read.
     """
     rows = _rows(root / "metadata.csv")
     found: list[Item] = []
@@ -77,7 +77,7 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
                 raise ValueError("it has several rows in metadata.csv, of which the first is used: remove the others")
             seen.add(name)
             if "_BAD" in categories:
-                raise ValueError("marked _BAD in the table")
+                raise ValueError("it is marked _BAD in metadata.csv")
             if len(labels) > 1:
                 raise ValueError(f"it has several classes ({', '.join(sorted(labels))})")
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
@@ -92,7 +92,7 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
 
 
 def _rows(table: Path) -> list[dict[str, str]]:
-    """The rows of the table, by column."""
+    """Read the rows of the table as dictionaries by column."""
     text = table.read_text(encoding="utf-8", errors="replace")
     for escape in (None, "\\"):  # commas inside a value are quoted, escaped or both
         reader = csv.DictReader(io.StringIO(text), escapechar=escape, restkey="rest", restval="")
@@ -111,17 +111,18 @@ def _rows(table: Path) -> list[dict[str, str]]:
 
 
 def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:
-    """The item of a row. Raises a ValueError with the reason if the row cannot be used."""
+    """Make the item of a row, or raise a ValueError with the reason why the row cannot be used."""
     unit = row["unit"].strip()
     if not unit:
-        raise ValueError("its unit is missing, so its size is unknown")
+        raise ValueError("its unit is missing in metadata.csv, so its size is unknown")
     try:
         scale = float(unit)
     except ValueError:
         scale = float("nan")
     if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"its unit is {unit!r}, not a positive number of metres")
-    notes = [f"no {key} in the table: ShapeNet's default" for key in ("up", "front") if not row[key].strip()]
+        raise ValueError(f"its unit is {unit!r} in metadata.csv, but it must be a positive number of metres")
+    missing = [key for key in ("up", "front") if not row[key].strip()]
+    notes = [f"metadata.csv has no {key}: ShapeNet's default is used" for key in missing]
     up, front = _vector(row["up"], "up") or _UP, _vector(row["front"], "front") or _FRONT
     rotation(up, front)  # raises an error if they do not define a rotation
     # ShapeNetSem's README gives these in metres, but the released table holds centimetres.
@@ -131,12 +132,12 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
 
 
 def _vector(text: str, key: str) -> Vector | None:
-    """Three numbers from the text of a cell, or None if it is empty."""
+    """Read three numbers from the text of a cell, or return None if the cell is empty."""
     text = text.strip().strip('"')
     if not text:
         return None
     try:
         x, y, z = (float(part) for part in text.replace("\\", "").split(","))
     except ValueError as error:
-        raise ValueError(f"its {key} is {text!r}, not three numbers") from error
+        raise ValueError(f"its {key} is {text!r} in metadata.csv, but it must be three numbers") from error
     return x, y, z

@@ -1,7 +1,7 @@
-"""Building blocks of procedural objects, in millimetres: outlines, surfaces lofted through rings, painted marks.
+"""Building blocks of procedural objects: outlines, surfaces through rings, and painted marks. Lengths are in mm.
 
-An outline is an array (n, 2) of points in a plane, counter-clockwise. Rings are an array (k, n, 3): k outlines in
-space, through which `loft` draws a surface. A `Part` is such a surface with its colours. An object is a list of parts.
+An outline is an array (n, 2) of points in a plane, counter-clockwise. Rings are an array (k, n, 3) of k outlines in
+space, which `loft` connects to a surface. A `Part` is such a surface with its colours. An object is a list of parts.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import numpy as np
 from sts_jax.objects.assembly import WALL
 from sts_jax.objects.colors import Color, Number
 
-PAINT = 0.04  # mm, height of a painted mark, so that it is drawn in front of the surface below it
+PAINT = 0.04  # mm, height of a painted mark above the surface below it, so that the mark is visible
 
 Painted = Color | Sequence[Color]
 
@@ -20,31 +20,44 @@ Painted = Color | Sequence[Color]
 class Part(NamedTuple):
     """One closed or open surface with the colour of each face."""
 
-    vertices: np.ndarray  # (v, 3) mm
-    faces: np.ndarray  # (f, 3) indices of vertices, counter-clockwise seen from outside
-    colors: np.ndarray  # (f, 3) linear light
-    density: float  # kg/m^2
-    interior: bool  # whether the part is closed and bounds the contents, which one part of an object may do
+    vertices: np.ndarray  # Vertices, (v, 3) (mm).
+    faces: np.ndarray  # Vertex indices of each face, (f, 3), counter-clockwise seen from outside.
+    colors: np.ndarray  # Colour of each face, (f, 3), in linear light, [0, 1].
+    density: float  # Mass per area (kg/m^2).
+    interior: bool  # True if the part is closed and bounds the contents. At most one part of an object can do so.
 
 
 # Outlines.
 
 
 def circle(radius: Number, num: int) -> np.ndarray:
-    """A circle of `num` points about the origin."""
+    """Return a circle with a radius (mm) about the origin as an outline of `num` points, (num, 2)."""
     angle = 2 * np.pi * (np.arange(num) + 0.5) / num
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def ellipse(a: Number, b: Number, num: int, power: Number = 2.0) -> np.ndarray:
-    """A superellipse |x / a|^power + |y / b|^power = 1 of `num` points, which is an ellipse for a power of 2."""
+    """Return a superellipse |x / a|^power + |y / b|^power = 1 as an outline of `num` points, (num, 2).
+
+    Args:
+        a: Half of the width along x (mm).
+        b: Half of the width along y (mm).
+        num: Number of points.
+        power: Exponent. The outline is an ellipse for 2, and closer to a rectangle for larger values.
+    """
     angle = 2 * np.pi * (np.arange(num) + 0.5) / num
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([a * np.sign(c) * np.abs(c) ** (2 / power), b * np.sign(s) * np.abs(s) ** (2 / power)], axis=1)
 
 
 def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray:
-    """A rectangle about the origin, of four points, or of eight with corners cut off by `chamfer`."""
+    """Return a rectangle about the origin as an outline, (4, 2), or (8, 2) with its corners cut off.
+
+    Args:
+        width: Size along x (mm).
+        depth: Size along y (mm).
+        chamfer: Length that is cut off each side at each corner (mm).
+    """
     w, d, c = width / 2, depth / 2, chamfer
     if c == 0:
         return np.array([[w, -d], [w, d], [-w, d], [-w, -d]])
@@ -57,12 +70,23 @@ def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray
 
 
 def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.ndarray:
-    """Rings with an outline in x, y at each (scale, z)."""
+    """Return a horizontal ring for each (scale, z): the outline (n, 2), scaled, at the height z (mm)."""
     return np.stack([np.column_stack([outline * scale, np.full(len(outline), z)]) for scale, z in levels])
 
 
 def sweep(path: np.ndarray, section: np.ndarray, binormal: Sequence[Number], *, closed: bool = False) -> np.ndarray:
-    """Rings of a section (n, 2) or (k, n, 2) along a path (k, 3): first axis outwards, second along the binormal."""
+    """Return rings that follow a path, such as the rings of a tube or a handle.
+
+    Args:
+        path: Points along the path, (k, 3) (mm).
+        section: Cross-section of the tube (mm), (n, 2), or one per point, (k, n, 2). Its first axis points along the
+            cross product of path and binormal. Its second axis points along the binormal.
+        binormal: Unit vector (3,), not parallel to the path.
+        closed: True if the path is closed, so that its last point is next to its first point.
+
+    Returns:
+        Rings (k, n, 3) (mm).
+    """
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0)
     if not closed:
         ahead[0], ahead[-1] = path[1] - path[0], path[-1] - path[-2]
@@ -87,16 +111,16 @@ def loft(
     density: Number = WALL,
     interior: bool = False,
 ) -> Part:
-    """A surface through rings (k, n, 3), turned so that its faces are counter-clockwise from outside.
+    """Connect rings to a surface, whose faces are counter-clockwise seen from outside.
 
     Args:
-        rings: mm, the rings.
-        color: one colour, one per band between two rings (k - 1, or k if `closed`), or n per band.
-        ends: colours of the faces that close the first and the last ring. An end of None stays open. By default both
+        rings: Rings, (k, n, 3) (mm). A band of the surface connects each ring to the next one.
+        color: One colour (3,), one colour per band, or n colours per band. There are k - 1 bands, or k if `closed`.
+        ends: Colours of the faces that close the first and the last ring. An end with None stays open. By default, both
             ends are closed and have the colours of their bands.
-        closed: whether a band joins the last ring to the first, as in a ring or hoop, which has no ends.
-        density: kg/m^2.
-        interior: whether the surface bounds the contents of the object.
+        closed: True if a band also connects the last ring to the first. The surface then has no ends, as in a hoop.
+        density: Mass per area (kg/m^2).
+        interior: True if the surface bounds the contents of the object.
     """
     k, n = rings.shape[:2]
     bands = k if closed else k - 1
@@ -120,7 +144,7 @@ def loft(
         vertices.append(rings[-end].mean(axis=0)[None])
         colors.append(np.broadcast_to(np.zeros(3) if shown is None else shown, (n, 3)))
         keep.append(np.full(n, shown is not None))
-    # An open end counts as closed until the sign of the volume has shown which side is outside.
+    # Open ends are treated as closed until the sign of the volume has shown which side is outside.
     points, whole = np.concatenate(vertices), np.concatenate(faces)
     if _volume(points, whole) < 0:
         whole = whole[:, ::-1]
@@ -131,18 +155,25 @@ def loft(
 
 
 def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Six times the volume of a closed surface, negative if its faces are turned inside out."""
+    """Return six times the volume of a closed surface, negative if its faces are clockwise seen from outside."""
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
     return float(np.einsum("fi,fi->", a, np.cross(b, c)))
 
 
 def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int = 16, **kind: object) -> Part:
-    """A surface of revolution about z through (radius, z), with the keywords of `loft`."""
+    """Return a surface of revolution about the z axis.
+
+    Args:
+        profile: Points (radius, z) of the surface (mm).
+        color: Colours as in `loft`.
+        num: Number of points around the axis.
+        kind: Keyword arguments of `loft`: `ends`, `closed`, `density` and `interior`.
+    """
     return loft(rings(circle(1.0, num), profile), color, **kind)  # type: ignore[arg-type]
 
 
 def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
-    """A box with sides along the axes."""
+    """Return a box with a size (x, y, z) (mm) along the axes, about a centre (x, y, z) (mm)."""
     x, y, z = size
     return move(loft(rings(rectangle(x, y), [(1.0, -z / 2), (1.0, z / 2)]), color), centre)
 
@@ -150,14 +181,14 @@ def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
 def decal(
     outline: np.ndarray, color: Color, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", spin: Number = 0.0
 ) -> Part:
-    """A painted mark without mass in the plane z = PAINT, facing +z, then moved like a part.
+    """Return a painted mark without mass. It lies at z = PAINT and faces +z, and is then moved by `move`.
 
     Args:
-        outline: mm, star-shaped about its mean.
-        color: linear light.
-        shift: mm, see `move`.
-        axis: see `move`.
-        spin: rad, see `move`.
+        outline: Outline of the mark, (n, 2) (mm). Each point must be visible from the mean of all points.
+        color: Colour (3,) in linear light.
+        shift: Shift along x, y and z (mm).
+        axis: Direction to which the mark's z axis is turned: "x", "y", "z", "-x", "-y" or "-z".
+        spin: Rotation about z before the turn (rad).
     """
     n = len(outline)
     points = np.column_stack([np.vstack([outline, outline.mean(axis=0)]), np.full(n + 1, PAINT)])
@@ -179,32 +210,32 @@ _TURNS = {
 
 
 def rotation_about_z(angle: Number) -> np.ndarray:
-    """The rotation matrix (3, 3) of an angle (rad) about z."""
+    """Return the rotation matrix (3, 3) of an angle (rad) about the z axis."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", spin: Number = 0.0) -> Part:
-    """Turn a part by `spin` (rad) about z, then turn its z axis to `axis`, then shift it.
+    """Rotate a part about z, then turn its z axis to another direction, then shift it.
 
     Args:
-        part: the part.
-        shift: mm.
-        axis: "x", "y", "z", "-x", "-y" or "-z".
-        spin: rad.
+        part: Part to move.
+        shift: Shift along x, y and z (mm).
+        axis: Direction to which the part's z axis is turned: "x", "y", "z", "-x", "-y" or "-z".
+        spin: Rotation about z before the turn (rad).
     """
     return part._replace(vertices=part.vertices @ (_TURNS[axis] @ rotation_about_z(spin)).T + np.asarray(shift, float))
 
 
 def mirrored(part: Part, axis: int = 0) -> Part:
-    """The mirror image of a part, whose coordinate `axis` changes its sign."""
+    """Return the mirror image of a part, in which the coordinate `axis` (0, 1 or 2) changes its sign."""
     flip = np.ones(3)
     flip[axis] = -1
     return part._replace(vertices=part.vertices * flip, faces=part.faces[:, ::-1])
 
 
 def scaled(parts: list[Part], longest: Number) -> list[Part]:
-    """All parts of an object, scaled so that the longest side of their common bounding box is `longest` (mm)."""
+    """Scale all parts of an object so that the longest side of their common bounding box is `longest` (mm)."""
     points = np.concatenate([part.vertices for part in parts])
     scale = longest / np.ptp(points, axis=0).max()
     return [part._replace(vertices=part.vertices * scale) for part in parts]

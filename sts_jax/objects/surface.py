@@ -1,4 +1,4 @@
-"""Triangulated surfaces: the merged surface of a mesh file, its boundary, and samples of it."""
+"""Triangulated surfaces of mesh files: merging of vertices, a test for holes, and samples of points."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -8,27 +8,27 @@ from jaxtyping import Float, Int
 
 
 class Surface(NamedTuple):
-    """Vertices, faces and the albedo of each corner: texture times colour, in linear light."""
+    """A triangulated surface. Its albedo is the texture's value times the colour of the corner, in linear light."""
 
-    vertices: np.ndarray  # (v, 3), m, without duplicates, even at seams of the colours
-    faces: np.ndarray  # (f, 3)
-    colors: np.ndarray  # (f, 3, 3), of each corner
-    uv: np.ndarray  # (f, 3, 2), texture coordinates of each corner
-    texture: np.ndarray | None  # (t, t, 3)
+    vertices: np.ndarray  # (v, 3), vertices (m), without duplicates, even where the colour changes
+    faces: np.ndarray  # (f, 3), vertex indices
+    colors: np.ndarray  # (f, 3, 3), colour at each corner, in linear light, [0, 1]
+    uv: np.ndarray  # (f, 3, 2), texture coordinates at each corner
+    texture: np.ndarray | None  # (t, t, 3), texture in linear light, [0, 1], or None
 
 
 def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None) -> Surface:
-    """Merge the vertices of faces that share them.
+    """Make a surface of separate faces. Corners at the same place become one vertex.
 
     Args:
-        path: the file, which errors name.
-        corners: m, (f, 3, 3), the corners of each face.
-        colors: (f, 3, 3), see `Surface`.
-        uv: (f, 3, 2), see `Surface`.
-        texture: see `Surface`.
+        path: Mesh file, for errors.
+        corners: Corners of each face, (f, 3, 3) (m).
+        colors: Colour at each corner, (f, 3, 3), in linear light.
+        uv: Texture coordinates at each corner, (f, 3, 2).
+        texture: Texture (t, t, 3) in linear light, or None.
 
     Raises:
-        ValueError: no face has any area.
+        ValueError: All faces are without area.
     """
     grain = np.ptp(corners, axis=(0, 1)).max() * 1e-7
     _, first, index = np.unique(
@@ -38,10 +38,14 @@ def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, t
 
 
 def proper(path: Path, surface: Surface) -> Surface:
-    """Remove faces without area and unused vertices.
+    """Remove faces that use a vertex twice, and vertices that no face uses.
+
+    Args:
+        path: Mesh file, for errors.
+        surface: Surface to clean.
 
     Raises:
-        ValueError: no face has any area.
+        ValueError: No face remains.
     """
     faces = surface.faces
     kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
@@ -57,10 +61,10 @@ def proper(path: Path, surface: Surface) -> Surface:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Whether faces have no boundary: each edge is traversed equally often in both directions.
+    """Return whether faces form a closed surface, in which each edge is traversed equally often in both directions.
 
-    A single part is then watertight and consistently wound. Where touching parts have been welded, more than two faces
-    may meet at an edge without leaving a hole.
+    A single part is then watertight, and all its faces have the same orientation. Where vertices of touching parts have
+    been merged, more than two faces can meet at an edge without a hole.
     """
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
@@ -71,7 +75,15 @@ def is_closed(faces: np.ndarray) -> bool:
 def surface_samples(
     triangles: Float[np.ndarray, "f 3 3"], num: int
 ) -> tuple[Int[np.ndarray, "num"], Float[np.ndarray, "num 3"]]:
-    """Points spread evenly by area over triangles, with a fixed seed: the face and barycentric weights of each."""
+    """Sample points from triangles, evenly by area and with a fixed seed.
+
+    Args:
+        triangles: Corners of the triangles (m).
+        num: Number of points.
+
+    Returns:
+        The triangle and the three barycentric weights of each point.
+    """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     share = np.cumsum(np.linalg.norm(cross, axis=1))
     face = np.searchsorted(share, (np.arange(num) + 0.5) / num * share[-1])

@@ -1,4 +1,4 @@
-"""Physics: objects fall, slide and topple on the pad in MuJoCo (`simulate`) or rest on it (`place`)."""
+"""Motion of objects on the pad, simulated in MuJoCo (`simulate`), and poses of objects at rest (`place`)."""
 
 from sts_jax.physics.bodies import BodyError, refusal
 from sts_jax.physics.draws import Starts, starts

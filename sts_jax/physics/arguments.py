@@ -1,4 +1,4 @@
-"""Checks of the arguments of `simulate` and `starts`, whatever their types."""
+"""Checks of the arguments of `simulate` and `starts`, and of the values that the methods of a scenario return."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,30 +13,30 @@ from sts_jax.sensor import Sensor
 
 
 def listed(body: Any) -> list[Any]:
-    """One body or several as a list, unchecked."""
+    """Return one body or a sequence of bodies as a list. The items are not checked."""
     return list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
 
 
 def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts: Any) -> None:
-    """Raise an error for any argument that cannot be used.
+    """Raise an error if an argument of `simulate` or `starts` cannot be used.
 
     Args:
-        bodies: the bodies.
-        sensor: the sensor.
-        scenario: the scenario.
-        counts: numbers of trajectories by the name of their argument.
+        bodies: Bodies to simulate.
+        sensor: Sensor whose pad the bodies fall on.
+        scenario: Scenario to simulate.
+        counts: Numbers that must be whole and >= 1, such as `num`, by the names of the caller's arguments.
 
     Raises:
-        BodyError: (a ValueError) a body has bad values.
-        ValueError: another argument, which the message names, is out of range.
-        TypeError: an argument is of another type.
+        BodyError: A body has bad values. BodyError is a ValueError.
+        ValueError: A count or a field of the scenario is out of range, or there is no body.
+        TypeError: The sensor, the scenario or a body has the wrong type.
     """
     for name, count in counts.items():
         whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
         if not whole or count < 1:
-            raise ValueError(f"{name} is {count!r}, but it must be a whole number of trajectories >= 1")
+            raise ValueError(f"{name} is {count!r}, but it must be a whole number >= 1")
     if not bodies:
-        raise ValueError("no body was given: pass one Body or a sequence of them")
+        raise ValueError("no body was given: pass one Body or a sequence of at least one")
     if not isinstance(sensor, Sensor):
         raise TypeError(f"sensor is {sensor!r}, but it must be a Sensor, for instance sts.Sensor()")
     if not isinstance(scenario, Scenario) or not _is_frozen(scenario):
@@ -54,7 +54,7 @@ def _is_frozen(scenario: Any) -> bool:
 
 
 def check_condition(scenario: Scenario, start: Start) -> None:
-    """Raise an error unless the condition of some starts has the numbers that the scenario declares."""
+    """Raise a ValueError unless conditions have as many numbers as the quantities of their scenario."""
     width, declared = start.condition.shape[-1], len(scenario.condition_scale)
     if width != declared:
         raise ValueError(
@@ -64,20 +64,25 @@ def check_condition(scenario: Scenario, start: Start) -> None:
 
 
 def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
-    """Raise an error unless the outcomes of some trajectories (n,) are the scenario's."""
+    """Raise a ValueError unless each outcome of n trajectories, (n,), is one of `scenario.outcomes`."""
     known = [int(one) for one in scenario.outcomes]
     other = sorted(set(outcome.tolist()) - set(known))
     if other:
         raise ValueError(
-            f"scenario.outcome returns {other[0]}, but the numbers of scenario.outcomes are {known}: add it to outcomes"
+            f"scenario.outcome returns {other[0]}, but the numbers of scenario.outcomes are {known}: add an outcome "
+            f"with the number {other[0]}"
         )
 
 
 def check_hidden(hidden: Hidden, count: int) -> Hidden:
-    """Given hidden values of `count` draws as arrays of JAX.
+    """Check given hidden values, and return them as JAX arrays.
+
+    Args:
+        hidden: One value of each field per trajectory.
+        count: Number of trajectories.
 
     Raises:
-        ValueError: a value, which the message names, has another shape or is out of range.
+        ValueError: A field has the wrong shape, or one of its values is out of range. The message names the field.
     """
     arrays = {name: np.asarray(values, np.float32) for name, values in hidden._asdict().items()}
     for name, values in arrays.items():
@@ -87,10 +92,10 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
                 f"hidden.{name} has shape {values.shape}, but it must be {expected}, because bodies * num is {count}"
             )
         if not np.isfinite(values).all():
-            raise ValueError(f"hidden.{name} has a value that is not finite, but all must be finite")
+            raise ValueError(f"hidden.{name} has values that are not finite, but all must be finite")
     fill = arrays["fill"]
     if fill.min() < 0 or fill.max() > 1:
-        raise ValueError(f"hidden.fill reaches from {fill.min()} to {fill.max()}, but a share must be from 0 to 1")
+        raise ValueError(f"hidden.fill has values from {fill.min()} to {fill.max()}, but each must be from 0 to 1")
     for name in ("shell_scale", "friction"):
         if arrays[name].min() <= 0:
             raise ValueError(f"hidden.{name} has the value {arrays[name].min()}, but it must be > 0")

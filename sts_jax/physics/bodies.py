@@ -1,4 +1,4 @@
-"""The bodies of a simulation: whether they can start in a scenario, and where."""
+"""Checks of the bodies of a simulation, and the geometry that collisions and random starts need."""
 
 import math
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from sts_jax.physics.mass_properties import rigid_of_draws
 from sts_jax.physics.rest import UPRIGHT, StableFaces
 from sts_jax.physics.scenario import Scenario, Shape
 
-CONTENTS = 16  # draws of a body's contents by which a start may be chosen
+CONTENTS = 16  # random contents of each body, whose centres of mass a scenario with `by_contents` receives
 
 
 class BodyError(ValueError):
-    """One of several bodies cannot be simulated.
+    """A body cannot be simulated.
 
     Attributes:
-        body: Its index.
+        body: Index of the body in the sequence of bodies.
     """
 
     def __init__(self, body: int, reason: str):
@@ -31,17 +31,18 @@ class BodyError(ValueError):
 
 
 def check_bodies(bodies: Sequence[Any]) -> None:
-    """Raise an error unless all are bodies with finite values and a known number of hull points.
+    """Raise an error unless every item is a `Body` that can be simulated.
 
     Raises:
-        TypeError: one is of another type.
-        BodyError: one has bad values.
+        TypeError: An item is not a `Body`.
+        BodyError: The hulls of a body are not of a size class or not finite, or its shell mass is not > 0 and finite.
+            Also raised for an error of `Body.check`.
     """
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):
             raise TypeError(
-                f"body {i} is {body!r}, but it must be a Body: objects.make draws one, objects.load reads a mesh file. "
-                "For several, pass a sequence of them"
+                f"body {i} is {body!r}, but it must be a Body: objects.make generates one, objects.load reads a mesh "
+                "file. For several bodies, pass a sequence"
             )
         known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
         if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
@@ -61,11 +62,14 @@ def check_bodies(bodies: Sequence[Any]) -> None:
 
 
 def refusal(body: Body, scenario: Scenario) -> str | None:
-    """The reason why an object cannot start in a scenario, or None if it can.
+    """Return the reason why a body cannot start in a scenario, or None if it can.
 
     Args:
-        body: one object, whose hull spans a volume.
-        scenario: scenario of the start.
+        body: One body. The points of its hulls must span a volume.
+        scenario: Scenario in which the body is to start.
+
+    Returns:
+        A sentence about the body, such as "it rests on no face, because ...", or None.
     """
     return _refusal(_faces(body), scenario)
 
@@ -79,16 +83,16 @@ def _refusal(faces: StableFaces, scenario: Scenario) -> str | None:
 
 
 def _faces(body: Body) -> StableFaces:
-    """The faces on which an empty body can rest."""
+    """Find the faces on which a body without contents can rest."""
     points = np.asarray(body.hulls, np.float64).reshape(-1, 3)
     return StableFaces(*objects.rest_poses(points, np.asarray(body.shell_com, np.float64)))
 
 
 def hulls(bodies: Sequence[Body]) -> list[Hull]:
-    """The collision hulls of the bodies.
+    """Compute the collision hull of each body.
 
     Raises:
-        BodyError: a hull spans no volume.
+        BodyError: The points of a hull span no volume.
     """
     found = []
     for index, body in enumerate(bodies):
@@ -100,10 +104,10 @@ def hulls(bodies: Sequence[Body]) -> list[Hull]:
 
 
 def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
-    """The properties that determine the starts of each body, padded to a common size.
+    """Compute the geometry from which the scenario draws starts, padded to a common size for all bodies.
 
     Raises:
-        BodyError: a body cannot start in the scenario.
+        BodyError: A body cannot start in the scenario.
     """
     faces = [_faces(body) for body in bodies]
     for index, own in enumerate(faces):
@@ -124,7 +128,7 @@ def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
 
 
 def _padded(arrays: Sequence[np.ndarray], mode: Literal["edge", "constant"]) -> np.ndarray:
-    """Arrays of different lengths as one array, padded with their last row or with 0."""
+    """Stack arrays of different lengths, padded with their last row ("edge") or with 0 ("constant")."""
     size = max(map(len, arrays))
     rest = ((0, 0),) * (arrays[0].ndim - 1)
     return np.stack([np.pad(x, ((0, size - len(x)), *rest), mode) for x in arrays]).astype(np.float32)

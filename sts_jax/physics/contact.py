@@ -1,17 +1,19 @@
-"""Contacts of convex hulls with a box's top and sides: exact candidates, and the contact points chosen from them.
+"""Contacts of convex hulls with the top and the sides of a box: exact candidates, and the points chosen from them.
 
-MJX's own test of a mesh against a box is unsuitable. Besides faces, it tests every pair of edges, so a small object on
-a large pad is pushed by contacts between its edges and the distant rims of the pad. It never comes to rest, or is even
-thrown off. Every mesh also compiles anew. The pad and the stop wall of the slope are boxes whose sides are parallel to
-the axes, so their contacts with a convex hull are of three kinds:
+MJX's own collision test of a mesh with a box is unsuitable here. It also tests every pair of edges. The edges of a
+small object on a large pad then have contacts with the distant rims of the pad. These contacts push the object, which
+never comes to rest or is even thrown off. MJX would also compile its test again for every mesh.
 
-- a vertex of the hull inside the box. The nearest of the top and the four sides pushes it out.
-- an edge of the hull across a rim of the top. It is pushed along the common normal of the two lines.
-- a corner of the top inside the hull. The hull is pushed along the normal of the nearest of its lower faces.
+The pad and the stop wall of the slope are boxes whose sides are parallel to the axes. Their contacts with a convex hull
+are therefore of three kinds:
 
-Each contact has the true distance along its own normal. A fourth kind is omitted: an edge across an upright edge of the
-box, below the top. Only objects that have fallen off meet these edges, and pass through them. The tests compare the
-contacts with those of a mesh in C MuJoCo.
+- A vertex of the hull lies inside the box. It is pushed out through the nearest of the top and the four sides.
+- An edge of the hull crosses a rim of the top. The edge is pushed along the common normal of edge and rim.
+- A corner of the top lies inside the hull. The hull is pushed along the normal of the nearest of its lower faces.
+
+The distance of each contact is exact along its normal. A fourth kind is left out: an edge of the hull that crosses an
+upright edge of the box below the top. Only objects that have fallen off the pad meet these edges, and they pass through
+them. The tests compare the contacts with those of a mesh in C MuJoCo.
 """
 
 from typing import NamedTuple
@@ -24,20 +26,20 @@ from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax import geometry
 
-PAD_CONTACTS, WALL_CONTACTS = 8, 4  # MJX reserves four for each pair of boxes
-STEEP = 5.0  # weight of depth relative to reach in the choice of contact points
-APART = 0.001  # m, least distance between the two deepest points
-SKIN = 0.001  # m, points up to this far above the deepest one may still support the object
+PAD_CONTACTS, WALL_CONTACTS = 8, 4  # multiples of four, because MJX reserves four contacts for each pair of boxes
+STEEP = 5.0  # weight of a point's depth relative to its reach in a direction, for the choice of contact points
+APART = 0.001  # m, least distance between the two deepest points, measured in the `plane` of `collide`
+SKIN = 0.001  # m, points up to this height above the deepest one can be contacts
 
 
 class Hull(NamedTuple):
-    """The convex parts of an object in the mesh frame, padded to their class by repetition.
+    """The p convex parts of an object in the mesh frame. Repeated rows pad each array to the size of its class.
 
-    Coordinates come before points, because XLA vectorises along the last axis.
+    The axis of coordinates is before the axis of points, because XLA vectorises along the last axis.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m
-    edges: Float[Array | np.ndarray, "*n 2 3 p e"]  # m, both ends, including harmless diagonals of flat faces
+    edges: Float[Array | np.ndarray, "*n 2 3 p e"]  # m, both ends. Diagonals of flat faces are included and harmless
     planes: Float[Array | np.ndarray, "*n 4 p f"]  # outward unit normal and offset (m), with normal . x < offset inside
 
 
@@ -50,19 +52,19 @@ class Contacts(NamedTuple):
 
 
 def hull(parts: np.ndarray) -> Hull:
-    """Vertices, edges and faces of convex parts. Their numbers depend only on the number of points.
+    """Compute the vertices, edges and face planes of convex parts. Their shapes depend only on the shape of `parts`.
 
     Args:
-        parts: (p, n, 3) m, points of each part. Repeated points have no effect.
+        parts: Points of each part, (p, n, 3) (m). Repeated points have no effect.
 
     Raises:
-        ValueError: the points of a part span no volume.
+        ValueError: The points of a part span no volume.
     """
     return jax.tree.map(lambda *x: np.stack(x, axis=-2), *(_part(part) for part in parts))
 
 
 def _part(vertices: np.ndarray) -> Hull:
-    """Vertices, edges and faces of one part, without the axis of parts."""
+    """Compute the vertices, edges and face planes of one part. The arrays lack the axis of parts."""
     points = np.asarray(vertices, np.float64)
     try:
         found = ConvexHull(points)
@@ -89,23 +91,23 @@ class _Candidates(NamedTuple):
 
 
 class _Crossing(NamedTuple):
-    """The edges of a hull at the side plane of the box that holds one rim of its top."""
+    """Intersections of the edges of a hull with one side plane of the box. The plane contains one rim of the top."""
 
-    crosses: Bool[Array, "e"]  # whether an edge has one end on either side of the plane
-    point: Float[Array, "3 e"]  # m, where it meets the plane
-    inner: Float[Array, "3 e"]  # m, its inner end, or where it leaves the box by the side next to the rim
-    beyond: Bool[Array, "e"]  # whether its inner end lies beyond that side
-    to_corner: Float[Array, "e"]  # m, from the point along the rim to the corner on the side of the inner end
+    crosses: Bool[Array, "e"]  # True if the two ends of an edge lie on different sides of the plane
+    point: Float[Array, "3 e"]  # m, intersection of the edge and the plane
+    inner: Float[Array, "3 e"]  # m, end on the inner side of the plane, cut off at the box's neighbouring side
+    beyond: Bool[Array, "e"]  # True if the inner end was beyond the neighbouring side and has been cut off
+    to_corner: Float[Array, "e"]  # m, signed, along the rim from `point` to the corner on the side of the inner end
 
 
 def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 3 h"]) -> Float[Array, "*n 3 h"]:
-    """`rotation @ points` without a matrix product, because XLA is slow at small ones on a CPU."""
+    """Compute `rotation @ points` without a matrix product, because small products are slow in XLA on a CPU."""
     x, y, z = points[..., :1, :], points[..., 1:2, :], points[..., 2:, :]
     return rotation[:, :1] * x + rotation[:, 1:2] * y + rotation[:, 2:] * z
 
 
 def _vertices(points: Float[Array, "3 h"], half: Float[Array, "2"]) -> _Candidates:
-    """Vertices of the hull inside the box. The nearest of the top and the four sides pushes."""
+    """Find the vertices of the hull inside the box. The normal is that of the nearest of the top and the four sides."""
     x, y, z = points
     side_x, side_y = half[0] - jnp.abs(x), half[1] - jnp.abs(y)
     top = -z <= jnp.minimum(side_x, side_y)
@@ -116,7 +118,7 @@ def _vertices(points: Float[Array, "3 h"], half: Float[Array, "2"]) -> _Candidat
 
 
 def _crossing(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: float) -> _Crossing:
-    """Where the edges meet the side plane of the box on one side (`sign`) of an axis."""
+    """Intersect the edges with the side plane of the box on one side (`sign`, 1 or -1) of an axis."""
     out = sign * ends[:, axis] - half[axis]
     crosses = out[0] * out[1] < 0
     share = jnp.where(crosses, out[0] / jnp.where(crosses, out[0] - out[1], 1.0), 0.0)
@@ -130,9 +132,10 @@ def _crossing(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, s
 
 
 def _through_top(edges: _Crossing, half: Float[Array, "2"], axis: int, sign: float) -> Bool[Array, "e"]:
-    """Whether an edge came through the top of the box and not through a side.
+    """Return for each edge whether it entered the box through the top and not through a side.
 
-    It did if its inner end is above the box, inside it and nearer to the top than to a side, or beyond its far side.
+    It entered through the top in three cases. The inner end of the edge lies above the box, or inside the box and
+    nearer to the top than to a side, or beyond the far side of the box.
     """
     inner = edges.inner
     cut = jnp.abs(sign * half[axis] - inner[axis])
@@ -142,7 +145,13 @@ def _through_top(edges: _Crossing, half: Float[Array, "2"], axis: int, sign: flo
 
 
 def _rim_normal(along: Float[Array, "3 e"], axis: int, sign: float) -> Float[Array, "3 e"]:
-    """Unit vectors perpendicular to edges of some directions and to the rim, which runs along the other axis."""
+    """Compute for each edge the unit vector perpendicular to the edge and to the rim.
+
+    Args:
+        along: Direction of each edge.
+        axis: Horizontal axis perpendicular to the rim, 0 or 1.
+        sign: Side of the box along this axis, 1 or -1.
+    """
     across, up = along[2], -along[axis]
     length = jnp.sqrt(across**2 + up**2)
     scale = jnp.where(up < 0, -1.0, 1.0) / jnp.where(length > 0, length, 1.0)
@@ -155,7 +164,7 @@ def _rim_normal(along: Float[Array, "3 e"], axis: int, sign: float) -> Float[Arr
 
 
 def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: float) -> _Candidates:
-    """Edges of the hull across the rim of the top on one side (`sign`) of an axis."""
+    """Find the edges of the hull that cross the rim of the top on one side (`sign`, 1 or -1) of an axis."""
     edges = _crossing(ends, half, axis, sign)
     normal = _rim_normal(ends[1] - ends[0], axis, sign)
     on_rim = jnp.abs(edges.point[1 - axis]) < half[1 - axis]
@@ -164,7 +173,7 @@ def _rim(ends: Float[Array, "2 3 e"], half: Float[Array, "2"], axis: int, sign: 
 
 
 def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidates:
-    """Corners of the top inside a convex part. The nearest of its lower faces is pushed."""
+    """Find the corners of the top inside a convex part. The normal is that of the nearest of the part's lower faces."""
     found = []
     for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         corner = jnp.stack([x * half[0], y * half[1], jnp.zeros(())])
@@ -178,7 +187,16 @@ def _corners(planes: Float[Array, "4 f"], half: Float[Array, "2"]) -> _Candidate
 
 
 def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> Int[Array, "k"]:
-    """Indices of the contact points: the two deepest, over which it would tip, and those that reach farthest."""
+    """Choose `num` contact points: the two deepest, over which the object tips, and the farthest in fixed directions.
+
+    Args:
+        depth: Depth of each candidate (m).
+        across: Coordinates of each candidate in the plane in which the chosen points lie far apart (m).
+        num: Number of points.
+
+    Returns:
+        Indices of the chosen candidates. An index can occur more than once.
+    """
     deepest = jnp.max(depth)
     candidate = depth > jnp.maximum(0, deepest - SKIN)
 
@@ -198,6 +216,7 @@ def _spread(depth: Float[Array, "c"], across: Float[Array, "2 c"], num: int) -> 
 
 
 def _frame(normal: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """Compute the contact frame, whose rows are the normal and two tangents."""
     other = jnp.where(jnp.abs(normal[1]) < 0.5, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
     tangent = geometry.normalize(other - normal * (normal @ other))
     return jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
@@ -212,15 +231,15 @@ def collide(
 ) -> Contacts:
     """Find the contacts of an object with a box whose top is centred at the origin.
 
-    They include the deepest point and the deepest one at least APART from it. The others reach farthest in fixed
-    directions. The depths of all are within SKIN of the largest.
+    The contacts include the deepest point and the deepest point at least APART from it. The other contacts are the
+    farthest points in fixed directions. All depths are within SKIN of the largest depth.
 
     Args:
-        body: convex parts of the object.
-        pose: (7,) mesh frame in the frame of the box's top.
-        half: (2,) m, half the size of the box in x and y. Its top is at z = 0, and its depth is infinite.
-        num: number of contacts.
-        plane: axes of the plane in which the contacts reach far.
+        body: Convex parts of the object.
+        pose: Mesh frame in the frame of the box's top, (7,): position (m), quaternion.
+        half: Half the size of the box along x and y, (2,) (m). Its top is at z = 0, and its depth is infinite.
+        num: Number of contacts.
+        plane: Indices of the two axes of the plane in which the contacts lie far apart.
 
     Returns:
         `num` contacts in the frame of the box's top. Unused contacts have a distance of 1 m.

@@ -1,4 +1,4 @@
-"""Random starts and hidden values: of the trajectories of `simulate`, and of further starts without trajectories."""
+"""Random starts and hidden properties, for the trajectories of `simulate` and, without trajectories, for `starts`."""
 
 import functools
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from sts_jax.physics.bodies import shapes
 from sts_jax.physics.scenario import Hidden, Scenario, Shape, Start
 from sts_jax.sensor import Sensor
 
-_FURTHER = 2**32 - 1  # folded into the key. `simulate` folds in the indices of bodies, which are lower
+_FURTHER = 2**32 - 1  # `starts` folds it into the key. `simulate` folds in the indices of bodies, which are smaller
 
 
 class Starts(NamedTuple):
-    """n starts of one or more bodies, body-major."""
+    """n starts of one or more bodies, ordered body by body."""
 
-    pose: Float[Array, "n 7"]  # mesh frame in the sensor frame, w >= 0
-    hidden: Hidden  # (n,) each, `up` (n, 3)
-    body: Int[Array, "n"]  # index into the sequence of bodies
+    pose: Float[Array, "n 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
+    hidden: Hidden  # Hidden properties of each start: arrays of shape (n,), and `up` of shape (n, 3).
+    body: Int[Array, "n"]  # Index of the body in the sequence of bodies.
 
 
 @functools.partial(jax.jit, static_argnames=("scenario", "pad"))
@@ -37,16 +37,19 @@ def draw(
     scenario: Scenario,
     pad: tuple[float, float],
 ) -> tuple[Start, Hidden]:
-    """Draw starts and hidden values. Each depends on its own body, number and attempt only.
+    """Draw n starts and their hidden properties. Each draw depends only on the key, its body, number and attempt.
 
     Args:
-        key: for the whole set.
-        body: index of the body of each draw.
-        nth: number of each draw among those of its body.
-        attempt: how often each was drawn before.
-        shapes: of all bodies.
-        scenario: scenario of the starts.
-        pad: m, size of the pad along x and y.
+        key: Key of the whole set.
+        body: Index of the body of each draw.
+        nth: Number of each draw among the draws of its body, from 0.
+        attempt: Number of earlier draws that this draw replaces.
+        shapes: Geometry of all bodies, with a leading axis of bodies.
+        scenario: Scenario that draws the starts.
+        pad: Size of the pad along x and y (m).
+
+    Returns:
+        The starts and the hidden properties, with a leading axis of n.
     """
 
     def one(body: ArrayLike, nth: ArrayLike, attempt: ArrayLike) -> tuple[Start, Hidden]:
@@ -60,25 +63,26 @@ def draw(
 def starts(
     key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
 ) -> Starts:
-    """Draw `num` further starts of each body and their hidden values, without simulating them.
+    """Draw `num` random starts of each body and their hidden properties, without a simulation.
 
-    They have the distribution of the starts of `simulate` and are independent of its draws with the same key. Start j
-    of body i depends on `key`, i, j and the body, not on the number of other starts.
+    The starts have the same distribution as the starts of `simulate`. They are independent of them, even if both
+    functions receive the same key. Start j of body i depends on `key`, i, j and the body, not on the number of other
+    starts.
 
     Args:
-        key: for the whole set. The key of `simulate` may be used again.
-        bodies: one body, or a sequence of different ones.
-        sensor: `sensor.gel.size` is the pad's size.
+        key: Key of the whole set, from `jax.random.key`.
+        bodies: One body, or a sequence of bodies.
+        sensor: Sensor whose `gel.size` is the size of the pad.
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
-        num: starts of each body.
+        num: Number of starts of each body.
 
     Returns:
-        bodies * num starts, body-major.
+        `num` starts of body 0, then `num` starts of body 1, and so on.
 
     Raises:
-        BodyError: (a ValueError) a body cannot start in the scenario, or has bad values.
-        ValueError: another argument, which the message names, is out of range.
-        TypeError: an argument is of another type.
+        BodyError: A body cannot start in the scenario, or has bad values. BodyError is a ValueError.
+        ValueError: Another argument is out of range. The message names the argument.
+        TypeError: An argument has the wrong type.
     """
     several = listed(bodies)
     check_key(key)

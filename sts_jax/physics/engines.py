@@ -1,4 +1,4 @@
-"""Chunks of trajectories in the two engines, MJX and C MuJoCo."""
+"""Simulation of chunks of trajectories in the two engines: MJX (`in_mjx`) and C MuJoCo (`in_c`)."""
 
 import copy
 import functools
@@ -21,59 +21,59 @@ from sts_jax.physics.scenario import Hidden, Scenario, Start
 from sts_jax.physics.scene import Contact
 from sts_jax.physics.solver import mjx
 
-COMPILED = 64  # bodies whose compiled model is kept for C MuJoCo
+COMPILED = 64  # largest number of bodies whose compiled models are kept for C MuJoCo
 
 Engine = Literal["mjx", "mujoco"]
 
 
 class Setup(NamedTuple):
-    """The properties of a set of n trajectories that no draw changes."""
+    """Properties of n trajectories that do not depend on the random draws."""
 
     bodies: list[Body]
     which: Int[np.ndarray, "n"]  # index of the body of each trajectory
-    hulls: list[Hull]  # of the bodies
+    hulls: list[Hull]  # collision hull of each body
     scenario: Scenario
     pad: tuple[float, float]  # m, size along x and y
-    time: Float[Array, "f s"]  # s, time at which each step begins
+    time: Float[Array, "f s"]  # s, time at which each of the s steps of each of the f frames begins
 
 
 class Rolled(NamedTuple):
-    """The results of one or more trajectories."""
+    """Results of one or more trajectories: the final values, and a record of every frame."""
 
     ends: State | native.Ends
     record: Record
 
 
-Run = Callable[[np.ndarray], Rolled]  # takes indices of at most `chunk` trajectories
+Run = Callable[[np.ndarray], Rolled]  # simulates the trajectories with given indices, at most `chunk`
 
 
 class Worlds(NamedTuple):
-    """The arrays that one call of MJX steps, with a leading axis of trajectories."""
+    """Arguments of one call of `roll_worlds`. All arrays have a leading axis of n trajectories."""
 
-    fields: dict[str, Array]  # fields of the model, see `scene.drawn`
+    fields: dict[str, Array]  # fields of MJX's model that differ between trajectories, see `scene.drawn`
     hull: Hull
     start: Start
-    velocity: Float[Array, "n 6"]  # on release, m/s, rad/s, sensor frame
-    gravity: Float[Array, "n f s 3"]
+    velocity: Float[Array, "n 6"]  # velocity on release: m/s, rad/s, sensor frame
+    gravity: Float[Array, "n f s 3"]  # m/s^2, sensor frame
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
 def gravity_at(
     condition: Float[Array | np.ndarray, "n c"], time: Float[Array, "f s"], scenario: Scenario
 ) -> Float[Array, "n f s 3"]:
-    """Gravity in the sensor frame (m/s^2) for each step that begins at a time (s)."""
+    """Compute the gravity (m/s^2, sensor frame) of each condition in the steps that begin at given times (s)."""
     return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
 def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario) -> Float[Array, "n 6"]:
-    """Velocity on release (m/s, rad/s, sensor frame)."""
+    """Compute the velocity on release (m/s, rad/s, sensor frame) of each condition."""
     return jax.vmap(scenario.velocity)(jnp.asarray(condition))
 
 
 @jax.jit
 def roll_worlds(worlds: Worlds, model: mjx.Model, data: mjx.Data) -> Rolled:
-    """Roll trajectories of bodies with hulls of one size in MJX."""
+    """Simulate trajectories in MJX. The hulls of all bodies have the same shape."""
 
     def one(world: Worlds) -> Rolled:
         own = model.tree_replace(world.fields)
@@ -91,15 +91,21 @@ def drawn_fields(
     constants: Contact,
     wall: float,
 ) -> dict[str, np.ndarray]:
-    """The fields of MJX's model for each draw, which MuJoCo derives from mass properties and friction.
+    """Compute the fields of MJX's model that MuJoCo derives from mass properties and friction, for each draw.
 
     Args:
-        bodies: the bodies.
-        which: index of the body of each draw.
-        hidden: the hidden values of each draw.
-        pad: m, size of the pad along x and y.
-        constants: contact and solver constants.
-        wall: m, height of the stop wall, 0 for none.
+        bodies: All bodies.
+        which: Index of the body of each draw.
+        hidden: Hidden properties of each draw.
+        pad: Size of the pad along x and y (m).
+        constants: Contact and solver constants.
+        wall: Height of the stop wall (m), 0 for none.
+
+    Returns:
+        The fields by name, with a leading axis of draws.
+
+    Raises:
+        BodyError: The mass properties or the friction of a draw are out of range.
     """
     original, like, _ = scene.template(pad, constants, wall)
     model = copy.copy(original)
@@ -113,7 +119,7 @@ def drawn_fields(
 
 
 def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rigid, row: int) -> None:
-    """`scene.set_rigid` with the values of one draw. Errors name the body."""
+    """Write the values of one draw into a model by `scene.set_rigid`, and name the body in errors."""
     try:
         scene.set_rigid(model, data, *(x[row] for x in rigid))
     except ValueError as error:
@@ -121,7 +127,7 @@ def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rig
 
 
 def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
-    """Prepare the rolling of trajectories in MJX. All bodies of one call have hulls of one size."""
+    """Return the function that simulates trajectories in MJX. The hulls in one call must have the same shape."""
     scenario = setup.scenario
     _, model, data = scene.template(setup.pad, scenario.contact, scenario.wall)
     fields = drawn_fields(setup.bodies, setup.which, hidden, setup.pad, scenario.contact, scenario.wall)
@@ -142,7 +148,7 @@ def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
 
 
 def in_c(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
-    """Prepare the rolling of trajectories in C MuJoCo. All trajectories of one call have the same body."""
+    """Return the function that simulates trajectories in C MuJoCo. All trajectories of one call have the same body."""
     bodies, scenario = setup.bodies, setup.scenario
     rigid = rigids(bodies, setup.which, hidden)
     starts = jax.tree.map(np.asarray, starts)

@@ -1,4 +1,4 @@
-"""The wrench of the pad on an object that a hand holds against it."""
+"""The wrench of the pad on an object that a hand presses into the gel."""
 
 import jax
 import jax.numpy as jnp
@@ -9,26 +9,31 @@ from sts_jax import geometry, tactile
 from sts_jax.objects.body import Body
 from sts_jax.rendering.equilibrium import underside
 
-DEEPEST = 0.98  # share of the gel's largest depth to which a hand presses an object at most
-HALVINGS = 50  # of the interval in which the depth lies
+DEEPEST = 0.98  # largest depth to which a hand presses an object, as a share of the gel's largest depth
+HALVINGS = 50  # bisection steps for the depth
 
 
 def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], force: float) -> Float[np.ndarray, "6"]:
-    """The wrench of the pad on an object that is held in its attitude and pressed into the gel.
+    """Compute the wrench of the pad on an object that a hand presses into the gel without tilting it.
 
-    The hand balances all moments, so the object sinks without tilting until the gel's springs carry the force. Their
-    pressure `p = k max(0, d - h)` on the gel's grid determines the centre of pressure, and `sense` finds the same
-    balance. A sharp corner would sink deeper than the gel allows. The hand then carries more, so that the depth stays
-    below the limit. The wrench depends on the body, the pose and the force only, not on the motion after the release.
+    The hand balances all moments, so the object sinks without tilting until the gel's springs carry the force. The
+    pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is the stiffness of the gel, d is the depth of
+    the object's lowest point, and h is the height of the object's underside above this point. The pressures determine
+    the centre of pressure. `sense` finds the same balance.
+
+    A sharp corner would sink deeper than the gel allows. The hand then carries more of the weight, so that the depth
+    stays below the limit. The wrench depends only on the gel, the body, the pose and the force, not on the motion after
+    the release.
 
     Args:
-        gel: its springs and its grid.
-        body: the object.
-        pose: mesh frame in the sensor frame. Its height has no effect.
-        force: N, normal force that the pad is to exert.
+        gel: Gel of the sensor.
+        body: The object.
+        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion. The height has no effect.
+        force: Normal force that the pad is to exert (N).
 
     Returns:
-        Force (N) and moment about the sensor's origin (N m), without friction. 0 for an object beside the pad.
+        Force (N) and moment about the sensor's origin (N m), (6,), without friction. All are 0 for an object beside
+        the pad.
     """
     x, y = (np.asarray(part, np.float64) for part in tactile.cell_centres(gel))
     heights = np.asarray(_heights(gel, body.vertices, body.faces, body.two_sided, jnp.asarray(pose)), np.float64)
@@ -48,5 +53,5 @@ def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], forc
 def _heights(
     gel: tactile.Gel, vertices: Array, faces: Array, two_sided: Array, pose: Float[Array, "7"]
 ) -> Float[Array, "r c"]:
-    """Heights of the object's underside over the gel's grid (m), `inf` where there is none within the gel's reach."""
+    """Compute the height of the object's underside over each cell (m), `inf` where no face is in the gel's reach."""
     return underside(gel, faces, two_sided, geometry.transform(pose, vertices), jnp.bool_(True))[0]

@@ -1,4 +1,4 @@
-"""The slope: an object is laid on the tilted pad."""
+"""The slope: an object is laid on the tilted pad, or released just above it."""
 
 import dataclasses
 import math
@@ -26,8 +26,8 @@ from sts_jax.physics.scenario import (
 )
 from sts_jax.physics.scene import Contact
 
-DIRECTIONS = 120  # directions in which an object's support is measured
-LET_GO = 0.008  # s from release to frame 0, when a tipping object leans by 0.1 degree and touch has felt it
+DIRECTIONS = 120  # horizontal directions in which the extent of an object's support is measured
+LET_GO = 0.008  # s from release to frame 0. Frame 0 then has a wrench, and a tipping object leans by only 0.1 degree
 CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop wall
 
 
@@ -35,35 +35,40 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 class Inclined(Scenario):
     """An object is laid on the tilted pad or released just above it. Downhill is +y, with a stop wall at the edge.
 
-    On the slope, weight reveals little, but the centre of pressure reveals where the contents lie. They are therefore
-    frozen in any direction. Whatever its contents, an object that lies flat holds and one that stands high tips, so
-    objects are laid in poses in which the contents decide.
+    On the slope, the weight of an object reveals little, but the centre of pressure reveals where its contents lie. The
+    contents are therefore frozen after they have settled in a random direction (`tilt`). Objects that lie flat hold and
+    objects that stand high tip, with any contents. Objects are therefore laid in poses in which the contents decide.
+    See `tries`.
 
-    Ranges are uniform. Source: paper, "Data Collection".
+    Values are drawn uniformly from their ranges. Source: paper, "Data Collection".
     """
 
     symmetries = (0, 6)  # x -> -x
     outcomes = (Outcome.ROLLS, Outcome.SLIDES, Outcome.STICKS, Outcome.FELL_OFF)
 
-    slope: float = math.radians(30)  # rad
-    wall: float = 0.02  # m, height of the stop wall at the lower edge, 0 for none
-    resting: float = 0.9  # share of the starts at rest on a stable face. The others are in any orientation ...
-    gap: tuple[float, float] = (0.001, 0.01)  # m, ... and this far above the pad
-    # candidate faces and turns of a start at rest, which has the one where the contents decide most whether it tips
+    slope: float = math.radians(30)  # Angle of the pad to the horizontal (rad).
+    wall: float = 0.02  # Height of the stop wall at the lower edge (m), 0 for no wall.
+    resting: float = 0.9  # Share of starts at rest on a stable face. The others are above the pad in any orientation.
+    # Range of the distance from the pad to the object's lowest point, for starts that are not at rest (m).
+    gap: tuple[float, float] = (0.001, 0.01)
+    # Number of candidate poses of a start at rest: stable faces, each with a random turn. The start has the pose in
+    # which the contents matter most for whether the object tips.
     tries: int = 16
-    across: float = 0.04  # m, largest |x| of the object's origin at the start
-    along: tuple[float, float] = (-0.05, 0.03)  # m, y of the origin at the start
-    rate: float = 31.25  # frames/s
-    frames: int = 60
-    fill: tuple[float, float] = (0.2, 0.6)  # share of the interior's volume
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
-    friction: tuple[float, float] = (0.56, 0.76)
-    tilt: float = math.pi  # rad, as in `Freefall`
-    contact: Contact = dataclasses.field(default_factory=Contact)
+    across: float = 0.04  # Largest |x| of the object's origin at the start (m).
+    # Range of y of the object's origin at the start (m). Objects that would touch the stop wall start farther uphill.
+    along: tuple[float, float] = (-0.05, 0.03)
+    rate: float = 31.25  # Frame rate (frames/s).
+    frames: int = 60  # Number of frames.
+    fill: tuple[float, float] = (0.2, 0.6)  # Range of the share of the interior's volume that is filled.
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
+    friction: tuple[float, float] = (0.56, 0.76)  # Range of the coefficient of friction against the pad.
+    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    tilt: float = math.pi
+    contact: Contact = dataclasses.field(default_factory=Contact)  # Contact and solver constants.
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
-        """See `Scenario.check`."""
+        """Raise a ValueError unless the scenario can be simulated."""
         super().check()
         if not 0 <= self.slope < math.pi / 2:
             raise ValueError(
@@ -81,10 +86,11 @@ class Inclined(Scenario):
             raise ValueError(f"scenario.resting is {self.resting}, but a share must be from 0 to 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start outside the wall, as `Scenario.start` describes.
+        """Draw one start uphill of the stop wall. `Scenario.start` describes the arguments.
 
-        A start at rest has the best of `tries` faces and turns: the one in which some contents hold by the widest
-        margin and others tip by it.
+        A start at rest has the best of `tries` candidate poses. For each pose, two means are computed over random
+        contents: the margin by which the object holds, and the margin by which it tips. The best pose has the largest
+        minimum of the two means.
         """
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting
@@ -109,12 +115,16 @@ class Inclined(Scenario):
         return Start(shape.above(place, geometry.quat_canonical(quat), height), held, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """See `Scenario.gravity`."""
+        """Return the gravity in the frame of the tilted pad (m/s^2), which is constant."""
         del time, condition
         return G * jnp.array([0.0, math.sin(self.slope), -math.cos(self.slope)])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """`FELL_OFF`, `ROLLS` (turned by 45 degrees or more, about any axis), `SLIDES` (moved by 10 mm) or `STICKS`."""
+        """Return the outcome, given the true or predicted poses (7,) of the first and the last frame.
+
+        The first of these that is true counts: `FELL_OFF`, `ROLLS` (turned by more than 45 degrees about any axis),
+        `SLIDES` (moved by 10 mm or more along the pad), `STICKS`.
+        """
         same = jnp.abs(geometry.normalize(first[3:]) @ geometry.normalize(last[3:]))
         moved = geometry.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STICKS)
@@ -123,9 +133,10 @@ class Inclined(Scenario):
 
 
 def _margins(quat: Float[Array, "4"], shape: Shape, slope: float) -> Float[Array, "m"]:
-    """How far (m) inside its support an object's weight meets a slope towards +y, for each centre of mass.
+    """Compute the margin (m) by which an object with each centre of mass holds on a slope towards +y.
 
-    Where this is negative, the object tips.
+    The vertical line through the centre of mass meets the pad at a point. The margin is the distance of this point from
+    the outline of the points that support the object. It is negative outside the outline, where the object tips.
     """
     rotation = geometry.quat_to_matrix(quat)
     points, coms = shape.points @ rotation.T, shape.coms @ rotation.T

@@ -1,4 +1,4 @@
-"""Checks of the fields of scenarios."""
+"""Checks of the values of a scenario's fields. Each raises a ValueError that names the field."""
 
 import math
 import numbers
@@ -9,28 +9,30 @@ from sts_jax.physics.scene import Contact
 
 
 def check_kind(name: str, value: object, default: object) -> None:
-    """Raise an error unless a value is of its default's kind: whole number, number, pair of numbers or `Contact`.
+    """Raise a ValueError unless the value of a field is of the same kind as the field's default.
 
-    Values of other kinds, which only some scenarios have, are not checked.
+    Kinds are whole numbers, numbers, pairs of numbers and `Contact`. Fields whose default is of another kind are not
+    checked.
     """
     pair = isinstance(default, tuple) and len(default) == 2 and all(map(_is_number, default))
     if isinstance(default, Contact):
         fits, wanted = isinstance(value, Contact), "a physics.Contact"
     elif pair:
         fits = isinstance(value, tuple) and len(value) == 2 and all(map(_is_number, value))
-        wanted = "a tuple of two numbers of Python or NumPy, (low, high)"
+        wanted = "a tuple of two numbers (low, high) of a Python or NumPy type"
     elif not _is_number(default):
         return
     elif isinstance(default, int):
-        fits, wanted = _is_number(value) and isinstance(value, numbers.Integral), "a whole number of Python or NumPy"
+        fits = _is_number(value) and isinstance(value, numbers.Integral)
+        wanted = "a whole number of a Python or NumPy type"
     else:
-        fits, wanted = _is_number(value), "a number of Python or NumPy"
+        fits, wanted = _is_number(value), "a number of a Python or NumPy type"
     if not fits:
         raise ValueError(f"scenario.{name} is {value!r}, but it must be {wanted}")
 
 
 def check_range(name: str, values: tuple[float, float], *, positive: bool = True) -> None:
-    """Raise an error unless a pair (low, high) is finite, in order, and above 0 (or not below)."""
+    """Raise a ValueError unless (low, high) is finite with low <= high and low > 0 (>= 0 if `positive` is False)."""
     low, high = values
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and (low > 0 if positive else low >= 0)):
         raise ValueError(
@@ -40,7 +42,7 @@ def check_range(name: str, values: tuple[float, float], *, positive: bool = True
 
 
 def check_length(name: str, value: float) -> None:
-    """Raise an error unless a length (m) is finite and not negative."""
+    """Raise a ValueError unless a length (m) is finite and >= 0."""
     if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"scenario.{name} is {value} m, but it must be finite and >= 0")
 

@@ -1,4 +1,4 @@
-"""Mass properties of bodies with the contents and the shell of each draw."""
+"""Mass properties of bodies, given the hidden properties of each draw."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,37 +11,37 @@ from sts_jax import objects
 from sts_jax.objects.body import Body
 from sts_jax.physics.scenario import Hidden
 
-AT_ONCE = 8  # draws whose mass properties are computed at once
+AT_ONCE = 8  # draws whose mass properties one call computes
 
-rigid_of_draws = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))  # of one body
+rigid_of_draws = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))  # one body, several draws
 
 
 class Rigid(NamedTuple):
-    """Mass properties and friction of draws, float64."""
+    """Mass properties and friction of n draws of hidden properties, in float64."""
 
-    mass: Float[np.ndarray, "n"]  # kg
-    com: Float[np.ndarray, "n 3"]  # m, mesh frame
-    inertia: Float[np.ndarray, "n 3 3"]  # kg m^2 about `com`
-    friction: Float[np.ndarray, "n"]
+    mass: Float[np.ndarray, "n"]  # Mass (kg).
+    com: Float[np.ndarray, "n 3"]  # Centre of mass in the mesh frame (m).
+    inertia: Float[np.ndarray, "n 3 3"]  # Inertia about the centre of mass, along the mesh axes (kg m^2).
+    friction: Float[np.ndarray, "n"]  # Coefficient of sliding friction against the pad.
 
 
 def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
-    """Compute the mass properties (`objects.rigid`) and the friction of draws.
+    """Compute mass, centre of mass, inertia and friction of bodies for n draws of their hidden properties.
 
     Args:
-        bodies: the bodies.
-        which: index of the body of each draw, in ascending order.
-        hidden: the hidden values of each draw.
+        bodies: All bodies.
+        which: Index of the body of each draw, (n,), in ascending order.
+        hidden: Hidden properties of each draw, with a leading axis of n.
 
     Returns:
-        n values each, in the order of the draws.
+        Arrays with a leading axis of n, in the order of the draws. `objects.rigid` has the equations.
     """
     values = jax.tree.map(np.asarray, hidden)
     found = []
     for index in np.unique(which).tolist():
         mine = np.flatnonzero(which == index)
         for rows in np.split(mine, range(AT_ONCE, len(mine), AT_ONCE)):
-            # Always the same number at once, because another number rounds differently and compiles anew.
+            # Every call has the same number of draws, because another number would round differently and compile anew.
             own = Hidden(*(x[np.resize(rows, AT_ONCE)] for x in values))
             rigid = rigid_of_draws(bodies[index], own.fill, own.shell_scale, own.up)
             found.append([np.asarray(x)[: len(rows)] for x in (*rigid, own.friction)])

@@ -1,8 +1,10 @@
-"""Several trajectories of one body in C MuJoCo, the engine for CPUs. The results mean the same as those of `roll`.
+"""Simulation of several trajectories of one body in C MuJoCo, the engine for CPUs.
 
-Every vertex of the hull is a contact point of its own, as in `contact`. MuJoCo keeps only four contacts of a mesh that
-stands on a face, which would turn a round base into a square. The mesh itself collides with the rims of pad and wall,
-which touch the hull between its vertices.
+The results have the same meaning as those of MJX (`physics.roll`). A world is MuJoCo's state of one trajectory.
+
+Every vertex of the hull is a contact point, as in `physics.contact`. MuJoCo alone keeps only four contacts of a mesh
+that stands on a face, which would turn a round base into a square. The mesh collides as well, because the rims of pad
+and wall touch the hull between its vertices.
 """
 
 from collections.abc import Sequence
@@ -20,16 +22,17 @@ from sts_jax.physics.roll import GONE_DEPTH, PARTED_TIME, SLOW_SPEED, SLOW_TURN,
 from sts_jax.physics.scenario import Start
 
 POINT = 1e-6  # m, radius of the contact sphere at each vertex
-MESH_GAP = 0.0001  # m, depth from which the mesh pushes, more than that of vertices at rest
-BLOCK = 8  # frames rolled before worlds that have ended are dropped
-# An object slower than both speeds for this time, under constant gravity, is taken to stay at rest.
+MESH_GAP = 0.0001  # m, the mesh pushes where it is deeper than this, which is more than the depth of vertices at rest
+BLOCK = 8  # frames in a row, after which worlds that have ended are no longer simulated
+# An object slower than STILL_SPEED and STILL_TURN for STILL_TIME under constant gravity is assumed to stay at rest.
 STILL_SPEED = 0.001  # m/s
 STILL_TURN = 0.02  # rad/s
 STILL_TIME = 0.5  # s
 
-FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # the part of the state that is set at every step
-_PAD, _WALL = slice(0, 9), slice(11, 17)  # force, torque, position; force, torque
-_DEEPEST = slice(9, 11)  # whether there is a contact, and the distance of the deepest one
+FORCE = mujoco.mjtState.mjSTATE_XFRC_APPLIED  # the part of the state that the caller sets in every step
+# Columns of the sensor data.
+_PAD, _WALL = slice(0, 9), slice(11, 17)  # pad: force, torque, position. Wall: force, torque
+_DEEPEST = slice(9, 11)  # > 0 if there is a contact, and the distance of the deepest one
 _SENSORS = """
 <sensor>
   <contact geom1="pad" subtree2="object" reduce="netforce" data="force torque pos"/>
@@ -42,7 +45,7 @@ _WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="
 
 
 class Ends(NamedTuple):
-    """Final values of trajectories. The fields mean the same as in `roll.State`."""
+    """Final values of n trajectories. The fields have the same meaning as in `roll.State`."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -52,7 +55,7 @@ class Ends(NamedTuple):
 
 
 class _Counts(NamedTuple):
-    """Counts carried from block to block, in addition to MuJoCo's own state."""
+    """Counts that one block of frames passes to the next, in addition to MuJoCo's own state."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -63,23 +66,26 @@ class _Counts(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """All steps of some worlds."""
+    """States and sensor data of n worlds after each of t steps."""
 
     qpos: Float[np.ndarray, "n t 7"]
     qvel: Float[np.ndarray, "n t 6"]
     sensors: Float[np.ndarray, "n t k"]
-    gone: Int[np.ndarray, "n"]  # the step after which the object is gone, t for none
+    gone: Int[np.ndarray, "n"]  # index of the step after which the object has left the pad, t for none
 
     @property
     def moving(self) -> Bool[np.ndarray, "n t"]:
-        """Whether a step counts: all do until the object is gone."""
+        """True for every step up to the one after which the object has left the pad."""
         return np.arange(self.qpos.shape[1]) <= self.gone[:, None]
 
 
 def compile_body(
     parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
 ) -> mujoco.MjModel:
-    """The scene with the contacts and the sensors that `roll` needs. Arguments as for `scene.compile_scene`."""
+    """Compile the scene with the contact points and sensors that `roll` needs.
+
+    `scene.compile_scene` describes the arguments: parts of the hull, size of the pad, constants, height of the wall.
+    """
     sensors = _SENSORS.format(wall=_WALL_SENSOR if wall else "")
     spec = mujoco.MjSpec.from_string(scene.scene_xml(parts, pad, contact, wall).replace("</mujoco>", sensors))
     owner = spec.body("object")
@@ -92,18 +98,18 @@ def compile_body(
 
 
 def _run(before: Int[np.ndarray, "n"], holds: Bool[np.ndarray, "n t"]) -> Int[np.ndarray, "n t"]:
-    """For how many steps in a row a condition has held, after each step, if it held for `before` at the start."""
+    """Count, up to each step, the steps in a row in which a condition `holds`. `before` is the count before step 0."""
     step = np.arange(holds.shape[1])
     return step - np.maximum.accumulate(np.where(holds, -1 - before[:, None], step), axis=1)
 
 
 def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lowest: float) -> Int[np.ndarray, "n"]:
-    """The first step after which the whole object is GONE_DEPTH below the gel's face, t for none.
+    """Find the first step after which the whole object is GONE_DEPTH below the gel's face, t for none.
 
     Args:
-        qpos: pose after each step.
-        points: m, vertices of the hull in the mesh frame.
-        lowest: m, height of the mesh frame's origin above which an object cannot be gone.
+        qpos: Pose after each step.
+        points: Vertices of the hull in the mesh frame (m).
+        lowest: Height of the mesh frame's origin above which the object cannot be so deep and is not tested (m).
     """
     low = qpos[..., 2] < lowest
     gone = np.zeros(low.shape, bool)
@@ -114,7 +120,7 @@ def _gone(qpos: Float[np.ndarray, "n t 7"], points: Float[np.ndarray, "h 3"], lo
 
 
 def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
-    """Update the counts by some steps."""
+    """Return the counts after some steps, given the counts before them."""
     speed, turn = (np.linalg.norm(steps.qvel[..., part], axis=-1) for part in (slice(3), slice(3, 6)))
     sensors, moving = steps.sensors, steps.moving
     touched = (np.any(sensors[..., _PAD], axis=-1) | np.any(sensors[..., _WALL], axis=-1)) & moving
@@ -133,7 +139,7 @@ def _count(steps: _Steps, counts: _Counts, timestep: float) -> _Counts:
 
 
 def _record(steps: _Steps, frames: int) -> Record:
-    """Record the last step of each frame's interval, and the mean wrench of the unbroken contact at its end."""
+    """Record the state at the end of each frame's interval, and the mean wrench of the unbroken contact until then."""
     worlds, count = steps.gone.shape[0], steps.qpos.shape[1] // frames
     ends = np.arange(frames) * count + count - 1
     last = np.minimum(ends, steps.gone[:, None])[..., None]
@@ -161,12 +167,12 @@ def _record(steps: _Steps, frames: int) -> Record:
 
 
 class _Simulation(NamedTuple):
-    """Several worlds of one body. The records are written in place."""
+    """The worlds of n trajectories of one body. Their records are written in place."""
 
     batch: mujoco.batch.Batch
     points: Float[np.ndarray, "h 3"]  # m, vertices of the hull in the mesh frame
-    lowest: float  # m, height of the mesh frame's origin above which the object cannot be gone
-    change: Float[np.ndarray, "n f s 3"]  # N, weight in each step less that in the last step
+    lowest: float  # m, see `_gone`
+    change: Float[np.ndarray, "n f s 3"]  # N, weight in each step minus the weight in the last step
     timestep: float  # s
     records: Record
 
@@ -180,19 +186,20 @@ def roll(
     *,
     freeze: bool = True,
 ) -> tuple[Ends, Record]:
-    """Roll trajectories of one body from their starts to the last frame. Each depends only on its own arguments.
+    """Simulate n trajectories of one body from their starts to the last frame, each independent of the others.
 
     Each model has the gravity of the last step of its trajectory. In steps with another gravity, the difference acts as
     a force on the object's centre of mass.
 
     Args:
-        models: for each trajectory, a copy of one `compile_body`. Its gravity is overwritten.
-        points: m, vertices of the hull in the mesh frame.
-        start: n starts.
-        gravity: m/s^2, sensor frame, for every step of every frame's interval.
-        velocity: on release, m/s of the mesh frame's origin, rad/s; sensor frame. None for objects at rest.
-        freeze: whether a trajectory ends once the object has been still for STILL_TIME. The object then keeps its pose
-            and wrench, and its velocity becomes 0.
+        models: One copy of the result of `compile_body` per trajectory. The gravity of the copy is overwritten.
+        points: Vertices of the hull in the mesh frame (m).
+        start: Starts of the n trajectories.
+        gravity: Gravity for each of the s steps of each of the f frames' intervals (m/s^2, sensor frame).
+        velocity: Velocity on release: linear, of the mesh frame's origin (m/s), and angular (rad/s), in the sensor
+            frame. None for objects at rest.
+        freeze: If True, a trajectory ends once the object has been slower than STILL_SPEED and STILL_TURN for
+            STILL_TIME. The object then keeps its pose and wrench, and its velocity becomes 0.
 
     Returns:
         Final values of each trajectory, and one record per trajectory and frame.
@@ -205,7 +212,7 @@ def roll(
     for steps_held in np.unique(held[held < steps]):
         counts = _advance(worlds, counts, np.flatnonzero(held == steps_held), 0, 1, steps - int(steps_held))
     changing = np.any(worlds.change, axis=(2, 3))
-    # The first frame from which gravity is constant.
+    # The first frame from which on gravity is constant.
     calm = np.where(changing.any(axis=1), frames - changing[:, ::-1].argmax(axis=1), 0)
     active = np.arange(count)
     for begin in range(1, frames, BLOCK):
@@ -231,7 +238,7 @@ def _simulation(
     gravity: Float[np.ndarray, "n f s 3"],
     velocity: Float[np.ndarray, "n 6"],
 ) -> _Simulation:
-    """Worlds at their starts, with records of objects that stay there. The arguments are those of `roll`."""
+    """Create the worlds at their starts, with records of objects that stay there. `roll` describes the arguments."""
     count, frames, _, _ = gravity.shape
     mass = np.array([model.body("object").mass[0] for model in models])
     for model, pull in zip(models, gravity[:, -1, -1], strict=True):
@@ -268,15 +275,18 @@ def _simulation(
 def _advance(
     worlds: _Simulation, counts: _Counts, which: Int[np.ndarray, "k"], begin: int, end: int, per_frame: int
 ) -> _Counts:
-    """Roll some worlds through the last steps of each interval from frame `begin` to `end`, and keep their records.
+    """Simulate some worlds over several frames' intervals, and write their records.
 
     Args:
-        worlds: all worlds.
-        counts: of all worlds.
-        which: indices of the worlds to roll.
-        begin: the first frame.
-        end: the frame after the last one.
-        per_frame: number of steps in each interval.
+        worlds: All worlds.
+        counts: Counts of all worlds.
+        which: Indices of the worlds to simulate.
+        begin: First frame.
+        end: Frame after the last one.
+        per_frame: Number of steps to simulate at the end of each interval.
+
+    Returns:
+        Counts of all worlds, updated for the simulated ones.
     """
     steps = worlds.change.shape[2]
     push = np.zeros((len(which), (end - begin) * per_frame, 2, 6))
@@ -297,14 +307,14 @@ def _advance(
 
 
 def _keep(records: Record, end: int, ended: Int[np.ndarray, "k"], still: Int[np.ndarray, "m"]) -> None:
-    """Keep the last pose of the worlds that have ended, and the wrench and contacts of those whose object is still."""
+    """Copy frame end - 1 to all later frames: poses of ended worlds, and wrenches and contacts of still objects."""
     records.pose[ended, end:] = records.pose[ended, end - 1 : end]
     for field in (records.wrench, records.contact, records.wall):
         field[still, end:] = field[still, end - 1 : end]
 
 
 def _finite(worlds: _Simulation) -> Bool[np.ndarray, "n"]:
-    """Whether MuJoCo warned of nothing, and all recorded poses and velocities are finite."""
+    """Return for each world whether MuJoCo gave no warning and all recorded poses and velocities are finite."""
     failed = worlds.batch.warning[..., 1].any(axis=1) | (worlds.batch.status != 0)
     pose, velocity = worlds.records.pose, worlds.records.velocity
     return ~failed & np.isfinite(pose).all(axis=(1, 2)) & np.isfinite(velocity).all(axis=(1, 2))

@@ -1,4 +1,4 @@
-"""The jerked pad: an object stands on the pad, which is jerked sideways."""
+"""The jerked pad: an object stands on the pad, which is accelerated sideways for a short time."""
 
 import dataclasses
 import math
@@ -29,53 +29,55 @@ from sts_jax.physics.scene import Contact
 
 
 class Jerk(NamedTuple):
-    """The condition of `Perturbed`: the acceleration of the pad for a moment, from frame 0 on."""
+    """The condition of `Perturbed`: a constant acceleration of the pad for a short time, from frame 0 on."""
 
-    acceleration: Float[Array | np.ndarray, "*n 2"]  # m/s^2, of the pad along x and y
-    duration: Float[Array | np.ndarray, "*n"]  # s
+    acceleration: Float[Array | np.ndarray, "*n 2"]  # acceleration of the pad along x and y (m/s^2)
+    duration: Float[Array | np.ndarray, "*n"]  # duration of the acceleration (s)
 
 
 def jerk(condition: Float[Array | np.ndarray, "*n 3"]) -> Jerk:
-    """The parts of a condition of `Perturbed`."""
+    """Split a condition of `Perturbed` into acceleration and duration."""
     return Jerk(condition[..., :2], condition[..., 2])
 
 
 @dataclasses.dataclass(frozen=True)
 class Perturbed(Scenario):
-    """An object stands upright on the pad, which is jerked sideways for a moment and then coasts.
+    """An object stands upright on the pad, which accelerates sideways for a short time and then keeps its velocity.
 
-    The simulation runs in the pad's frame. While the pad accelerates, gravity contains the opposite of its
-    acceleration. The condition is the jerk: acceleration of the pad along x and y (m/s^2) and duration (s), from frame
-    0 on. The fill matters most for a narrow base, so the defaults are for bottles.
+    The short acceleration is called a jerk. The condition describes it: acceleration of the pad along x and y (m/s^2)
+    and duration (s), from frame 0 on. The simulation runs in the pad's frame. While the pad accelerates, gravity
+    contains the opposite of its acceleration. The fill matters most for objects with a narrow base, so the defaults are
+    chosen for bottles.
 
-    Ranges are uniform. Source: paper, "Data Collection".
+    Values are drawn uniformly from their ranges. Source: paper, "Data Collection".
     """
 
     symmetries = tuple(range(8))
     quantities = (Quantity("acceleration", "m/s²", 10.0, vector=True), Quantity("duration", "s", 0.1))
     outcomes = (Outcome.TOPPLES, Outcome.SLIDES, Outcome.STANDS, Outcome.FELL_OFF)
 
-    acceleration: tuple[float, float] = (4.0, 12.0)  # m/s^2, in any direction
-    duration: tuple[float, float] = (0.06, 0.12)  # s
-    spread: float = 0.02  # m, radius of the disc from which the object's origin is drawn
-    rate: float = 31.25  # frames/s
-    frames: int = 60
-    fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
-    friction: tuple[float, float] = (0.5, 0.6)
-    tilt: float = 0.0  # rad, as in `Freefall`
-    contact: Contact = dataclasses.field(default_factory=Contact)
+    acceleration: tuple[float, float] = (4.0, 12.0)  # Range of the acceleration (m/s^2). Its direction is random.
+    duration: tuple[float, float] = (0.06, 0.12)  # Range of the duration of the acceleration (s).
+    spread: float = 0.02  # Radius of the disc about the pad's centre from which the object's origin is drawn (m).
+    rate: float = 31.25  # Frame rate (frames/s).
+    frames: int = 60  # Number of frames.
+    fill: tuple[float, float] = (0.0, 1.0)  # Range of the share of the interior's volume that is filled.
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
+    friction: tuple[float, float] = (0.5, 0.6)  # Range of the coefficient of friction against the pad.
+    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    tilt: float = 0.0
+    contact: Contact = dataclasses.field(default_factory=Contact)  # Contact and solver constants.
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
-        """See `Scenario.check`."""
+        """Raise a ValueError unless the scenario can be simulated."""
         super().check()
         check_length("spread", self.spread)
         check_range("acceleration", self.acceleration, positive=False)
         check_range("duration", self.duration, positive=False)
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start with +z up and one jerk, as `Scenario.start` describes."""
+        """Draw one start with +z up, and one jerk as its condition. `Scenario.start` describes the arguments."""
         del pad
         turn, radius, angle, push, heading, time = jax.random.split(key, 6)
         pose = shape.above(random_place(radius, angle, self.spread), random_yaw(turn), -STANDING)
@@ -86,19 +88,26 @@ class Perturbed(Scenario):
         return Start(pose, jnp.asarray(0), condition)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
-        """See `Scenario.gravity`. The step in which the jerk ends has the share of the jerk that lies in it."""
+        """Return gravity minus the acceleration of the pad (m/s^2, sensor frame). `Scenario.gravity` has the arguments.
+
+        In the time step in which the jerk ends, the acceleration is scaled by the share of the step before the end.
+        """
         acceleration, duration = jerk(condition)
         step = self.contact.timestep
         share = jnp.clip((duration - time) / step, 0, 1) * (time > -step / 2)
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """See `Scenario.drift`."""
+        """Return the velocity over the pad of an object without friction (m/s): -acceleration * duration."""
         acceleration, duration = jerk(condition)
         return jnp.asarray(-acceleration * duration)
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """`FELL_OFF`, `TOPPLES` (leans by more than 45 degrees), `SLIDES` (moved by 10 mm or more) or `STANDS`."""
+        """Return the outcome, given the true or predicted poses (7,) of the first and the last frame.
+
+        The first of these that is true counts: `FELL_OFF`, `TOPPLES` (+z leans by more than 45 degrees), `SLIDES`
+        (moved by 10 mm or more along the pad), `STANDS`.
+        """
         leans = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2] < math.cos(TURNED)
         moved = geometry.norm(last[:2] - first[:2]) >= MOVED
         stays = jnp.where(moved, Outcome.SLIDES, Outcome.STANDS)

@@ -1,4 +1,4 @@
-"""The release by hand: an object is held in an unstable pose in contact with the pad, and let go."""
+"""The release by hand: a hand holds an object on the pad in an unstable pose, and lets go."""
 
 import dataclasses
 import math
@@ -26,49 +26,55 @@ from sts_jax.physics.scenario import (
 )
 from sts_jax.physics.scene import Contact
 
-SMALLEST = math.radians(6)  # rad, smallest lean from the face, so that a held object never seems to lie on it
-FLAT = math.radians(15)  # rad, an object that balances at a smaller lean lies on one of several facets
-CLEARANCE = 0.002  # m, smallest distance of the points that touch from the edge of the pad
+SMALLEST = math.radians(6)  # rad, smallest lean of a held object, so that it never seems to lie on its face
+FLAT = math.radians(15)  # rad, if an object balances at a smaller lean, its face is one facet of a rounded side
+CLEARANCE = 0.002  # m, smallest distance between the points that touch the pad and the edge of the pad
 
 
 @dataclasses.dataclass(frozen=True)
 class Released(Scenario):
     """A hand leans an object over an edge of one of its faces, holds it there on the pad and lets go at frame 0.
 
-    Over the edge, the object balances at one angle. It is held a little short of this angle, from where it returns to
-    the face, or beyond it, from where it topples. Contents that lie anywhere in the object move the angle, so the
-    contents decide near it.
+    At one angle of lean, the object balances on the edge. It is held at a random angle near the balance. Short of the
+    balance, the object returns to its face. Beyond it, the object topples. The contents can lie anywhere in the object
+    and shift the angle of balance, so near the balance the contents decide the outcome.
 
-    In frame 0 the object is at rest. The pad carries a random share of its weight, and the hand carries the rest and
-    all moments. The wrench is that of the gel under the held pose (`held.held_wrench`). It depends on nothing that
-    happens after the release.
+    In frame 0 the object is at rest. The pad carries a random share of the weight. The hand carries the rest of the
+    weight and all moments. The wrench in frame 0 is the balance of the gel under the held pose (`held.held_wrench`). It
+    does not depend on the motion after the release.
 
-    Ranges are uniform. Source: paper, "Real-World Dataset", where a small camera is released by hand.
+    Values are drawn uniformly from their ranges. Source: paper, "Real-World Dataset", where a small camera is released
+    by hand.
     """
 
     symmetries = tuple(range(8))
     outcomes = (Outcome.TOPPLES, Outcome.RETURNS, Outcome.FELL_OFF)
 
-    # rad, lean beyond the angle at which an object with average contents balances, negative short of it
+    # Range of the held angle minus the angle at which an object with average contents balances (rad). Negative values
+    # are short of the balance, from where the object returns to its face.
     beyond: tuple[float, float] = (math.radians(-9), math.radians(9))
-    skew: float = math.radians(4)  # rad, largest angle in the pad's plane between the axis of the lean and the edge
-    carried: tuple[float, float] = (0.3, 0.9)  # share of the weight that the pad carries until the release
-    spread: float = 0.015  # m, radius of the disc about the pad's centre, where the object lies on average
-    # Candidate faces and edges. The suitable one with the lowest centre of mass in balance is taken, so that few
-    # objects tumble off the pad.
+    skew: float = math.radians(4)  # Largest angle in the pad's plane between the axis of the lean and the edge (rad).
+    carried: tuple[float, float] = (0.3, 0.9)  # Range of the share of the weight on the pad until the release.
+    # Radius of the disc about the pad's centre from which the object's place is drawn (m). The place is the midpoint of
+    # the centre of mass before and after a fall over the edge.
+    spread: float = 0.015
+    # Number of candidate edges of random stable faces. The start has the suitable edge over which the centre of mass is
+    # lowest in balance, so that few objects tumble off the pad.
     tries: int = 16
-    rate: float = 31.25  # frames/s
-    frames: int = 60
-    fill: tuple[float, float] = (0.2, 0.6)  # share of the interior's volume
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
-    friction: tuple[float, float] = (0.5, 0.6)
-    tilt: float = math.pi  # rad, as in `Freefall`
-    # A gel brakes rolling objects. More rolling friction would let an object stand on its edge.
+    rate: float = 31.25  # Frame rate (frames/s).
+    frames: int = 60  # Number of frames.
+    fill: tuple[float, float] = (0.2, 0.6)  # Range of the share of the interior's volume that is filled.
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
+    friction: tuple[float, float] = (0.5, 0.6)  # Range of the coefficient of friction against the pad.
+    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    tilt: float = math.pi
+    # Contact and solver constants. A gel brakes rolling objects. More rolling friction would let an object stand on its
+    # edge.
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(rolling=0.0005))
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
-        """See `Scenario.check`."""
+        """Raise a ValueError unless the scenario can be simulated."""
         super().check()
         check_length("spread", self.spread)
         if not 0 <= self.skew <= TURNED:
@@ -88,17 +94,17 @@ class Released(Scenario):
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one held pose over the pad and the share of the weight on the pad, as `Scenario.start` describes.
+        """Draw one held pose and the share of the weight on the pad. `Scenario.start` describes the arguments.
 
-        Toppling and returning differ by the angle that the object turns, see `outcome`. Starts therefore lean from the
-        narrower one of the two faces at an edge, on which the object balances at 15 to 45 degrees. An object without
-        such a face, such as a cylinder on its side, leans from another one.
+        `outcome` distinguishes toppling from returning by the angle that the object turns. An object therefore leans
+        from the narrower of the two faces at an edge, where it balances at 15 to 45 degrees. Some objects have no such
+        face, for example a cylinder on its side. They lean from another face.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
         edges = jax.lax.map(lambda own: _random_edge(own, shape), keys)  # one by one, to save memory
         suitable = (edges.balance > FLAT) & (edges.balance < TURNED)
-        chosen = jnp.argmin(jnp.where(suitable, edges.height, edges.height + 1.0))  # no object is 1 m high
+        chosen = jnp.argmin(jnp.where(suitable, edges.height, edges.height + 1.0))  # 1 m ranks other edges last
         edge = jax.tree.map(lambda x: x[chosen], edges)
 
         past = jax.random.uniform(beyond, minval=self.beyond[0], maxval=self.beyond[1])
@@ -113,22 +119,24 @@ class Released(Scenario):
         low = jnp.min(jnp.where(touching, across, jnp.inf), axis=0)
         high = jnp.max(jnp.where(touching, across, -jnp.inf), axis=0)
         room = jnp.asarray(pad) / 2 - CLEARANCE
-        # Halfway between the places of the centre of mass on the two faces, so that it is over the pad on either.
+        # The midpoint of the centre of mass on the one face and on the other, so that the object stays over the pad.
         middle = random_place(radius, angle, self.spread) - edge.middle
         place = jnp.clip(middle - (low + high) / 2, -room - low, room - high)
         carried = jax.random.uniform(share, minval=self.carried[0], maxval=self.carried[1])
         return Start(shape.above(place, quat, -STANDING), jnp.asarray(self.steps), jnp.zeros(0), carried)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """See `Scenario.gravity`."""
+        """Return the gravity on the level pad (m/s^2, sensor frame), which is constant."""
         del time, condition
         return jnp.array([0.0, 0.0, -G])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """`FELL_OFF`, `TOPPLES` (its upward direction turned by more than 45 degrees) or `RETURNS`.
+        """Return the outcome, given the true or predicted poses (7,) of the first and the last frame.
 
-        The lean from the narrower face at an edge is less than 45 degrees and that from the wider one more, so an
-        object that turned less has returned to the face from which it leaned. Turns about the vertical do not count.
+        The first of these that is true counts: `FELL_OFF`, `TOPPLES` (the object's upward direction turned by more than
+        45 degrees), `RETURNS`. At a right-angled edge, the held object leans by less than 45 degrees from the narrower
+        face and by more from the wider face. An object that turned by less than 45 degrees has therefore returned to
+        the narrower face. Turns about the vertical do not count.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)
@@ -138,15 +146,15 @@ class Released(Scenario):
 class _Edge(NamedTuple):
     """An edge of a face on which an object lies."""
 
-    quat: Float[Array, "4"]  # of the object on the face
+    quat: Float[Array, "4"]  # orientation of the object on the face
     outward: Float[Array, ""]  # rad, direction in the pad's plane perpendicular to the edge, away from the face
     balance: Float[Array, ""]  # rad, lean over the edge at which an object with average contents balances
-    height: Float[Array, ""]  # m, of the centre of mass at this angle
-    middle: Float[Array, "2"]  # m, from the edge, halfway between the centres of mass before and after a quarter turn
+    height: Float[Array, ""]  # m, height of the centre of mass at this lean
+    middle: Float[Array, "2"]  # m, from the edge to the midpoint of the centre of mass before and after a quarter turn
 
 
 def _random_edge(key: PRNGKeyArray, shape: Shape) -> _Edge:
-    """Draw a stable face by its share and an edge of it that lies in a random direction."""
+    """Draw a stable face with its share as the probability, and the edge of the face in a random direction."""
     which, turn, direction = jax.random.split(key, 3)
     face = jax.random.categorical(which, jnp.log(shape.shares))
     quat = geometry.quat_multiply(random_yaw(turn), upright(shape.rests[face]))
@@ -155,7 +163,7 @@ def _random_edge(key: PRNGKeyArray, shape: Shape) -> _Edge:
     low = jnp.min(points[:, 2])
     support = points[:, 2] < low + LEVEL
 
-    # One step around the outline of the face, from the corner that reaches farthest in the direction to the next one.
+    # The edge runs from the corner that reaches farthest in the direction to the next corner around the face's outline.
     angle = jax.random.uniform(direction, maxval=2 * jnp.pi)
     outward = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     corner = points[jnp.argmax(jnp.where(support, points[:, :2] @ outward, -jnp.inf)), :2]

@@ -15,7 +15,7 @@ from sts_jax.objects.body import is_traced
 from sts_jax.physics.scenario import STANDING, G
 from sts_jax.sensor import Sensor
 
-UPRIGHT = math.radians(1)  # rad, largest lean of a body that stands upright
+UPRIGHT = math.radians(1)  # rad, largest lean of a body that counts as upright
 
 
 _rigid = jax.jit(objects.rigid)
@@ -25,15 +25,16 @@ _transform = jax.jit(geometry.transform)
 class StableFaces(NamedTuple):
     """The faces of a body's convex hull on which it can rest, the most likely first."""
 
-    up: Float[np.ndarray, "k 3"]  # unit vectors in the mesh frame that point up while the body rests on the face
-    share: Float[np.ndarray, "k"]  # share of the solid angle, see `objects.rest_poses`
+    up: Float[np.ndarray, "k 3"]  # Unit vector in the mesh frame that points up while the body rests on each face.
+    # Solid angle of each face, seen from the centre of mass, as a share of the sum over all stable faces.
+    share: Float[np.ndarray, "k"]
 
 
 class Placement(NamedTuple):
     """The pose of a body at rest and the wrench that carries it, as arguments of `sense`."""
 
-    pose: Float[Array, "7"]  # m and quaternion with w >= 0, mesh frame in the sensor frame
-    wrench: Float[Array, "6"]  # N and N m about the sensor's origin, exerted by the pad on the body
+    pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
+    wrench: Float[Array, "6"]  # Force (N) and moment about the sensor's origin (N m) of the pad on the body.
 
 
 def stable_faces(
@@ -43,25 +44,29 @@ def stable_faces(
     shell_scale: float = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> StableFaces:
-    """The faces on which a body can rest, with its centre of mass above them. Runs on the host, not under `jit`.
+    """Find the faces of a body's convex hull on which the body can rest on a level plane.
+
+    The body rests on a face if its centre of mass lies above the face and at least 0.5 mm inside the outline of the
+    face. The function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
 
     Args:
-        body: one body.
-        fill: share of the interior's volume that is filled, 0 to 1.
-        shell_scale: factor on the shell's mass.
-        up: unit vector in the mesh frame, upward when the contents settled.
+        body: One body.
+        fill: Share of the interior's volume that is filled, 0 to 1.
+        shell_scale: Factor on the shell's mass.
+        up: Unit vector in the mesh frame that pointed up when the contents settled.
 
     Returns:
-        The stable faces, none if the body cannot rest on any.
+        The stable faces, the most likely first. Both arrays are empty if the body cannot rest on any face.
 
     Raises:
-        TypeError: `body` is not a Body, or is traced.
-        ValueError: a value of the body is not finite, or its hull spans no volume.
+        TypeError: `body` is not a Body, or an argument is traced.
+        ValueError: The body has an invalid value (`Body.check`), or its hulls span no volume.
     """
     _check_body(body)
     if is_traced((body, fill, shell_scale, up)):
         raise TypeError(
-            "body is traced, but its faces are computed on the host: call this function outside jit, vmap and grad"
+            "body, fill, shell_scale or up is traced, but stable faces are computed on the host: call stable_faces "
+            "outside jit, vmap and grad"
         )
     body.check()
     com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
@@ -81,24 +86,24 @@ def weight(
     shell_scale: ScalarLike = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Float[Array, "6"]:
-    """The wrench that carries a body's weight on the flat pad, in any pose.
+    """Compute the wrench of the level pad that carries a body's weight in a given pose.
 
-    With the mass m and the centre of mass c in the sensor frame, the force is (0, 0, m g), and its moment about the
-    sensor's origin is c x (0, 0, m g) = (c_y m g, -c_x m g, 0). Without the moment, the body would tilt in the gel.
+    With the mass m, gravity g and the centre of mass c in the sensor frame, the force is (0, 0, m g). Its moment about
+    the sensor's origin is c x (0, 0, m g) = (c_y m g, -c_x m g, 0). Without the moment, the body would tilt in the gel.
 
     Args:
-        body: one body.
-        pose: mesh frame in the sensor frame.
-        fill: share of the interior's volume that is filled, 0 to 1.
-        shell_scale: factor on the shell's mass.
-        up: unit vector in the mesh frame, upward when the contents settled.
+        body: One body.
+        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion.
+        fill: Share of the interior's volume that is filled, 0 to 1.
+        shell_scale: Factor on the shell's mass.
+        up: Unit vector in the mesh frame that pointed up when the contents settled.
 
     Returns:
-        Force (N) and moment (N m).
+        Force (N) and moment about the sensor's origin (N m), (6,).
 
     Raises:
         TypeError: `body` is not a Body.
-        ValueError: the shape of `pose` is not (7,).
+        ValueError: The shape of `pose` is not (7,).
     """
     _check_body(body)
     mass, com, _ = _rigid(body, fill, shell_scale, jnp.asarray(up, jnp.float32))
@@ -118,29 +123,32 @@ def place(
     shell_scale: float = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Placement:
-    """Place a body at rest on the flat pad, on one of its stable faces and under its own weight.
+    """Place a body at rest on the level pad, on one of its stable faces and under its own weight.
 
-    The body penetrates the pad by 0.01 mm, as at rest in a simulation, so a simulation that starts there stays there.
-    The indentation of the gel is much deeper. `sense` computes it from the wrench. Runs on the host, not under `jit`.
+    The body penetrates the pad by 0.01 mm, the depth of objects at rest in the simulation. A simulation that starts
+    with this pose therefore stays there. The gel is indented much deeper, which `sense` computes from the wrench. The
+    function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
 
     Args:
-        body: one body.
-        sensor: `sensor.gel.size` is the pad's size.
-        face: index into its `stable_faces`, 0 for the most likely one, or "upright" for the face with +z up.
-        yaw: rad, about the vertical. At 0, the +z of a lying body points to the top of the image, and so does the -y
-            of a standing one, upright or upside down.
-        position: m, x and y of the middle of the body's extent.
-        fill: share of the interior's volume that is filled, 0 to 1.
-        shell_scale: factor on the shell's mass.
-        up: unit vector in the mesh frame, upward when the contents settled. They stay there when the body is placed.
+        body: One body.
+        sensor: Sensor whose `gel.size` is the size of the pad.
+        face: Index of a face in `stable_faces` with the same `fill`, `shell_scale` and `up`, where 0 is the most likely
+            face. "upright" is the face on which the body's +z points up.
+        yaw: Rotation about the vertical (rad). At 0, the +z of a lying body points to the top of the image. The -y of a
+            standing body, upright or upside down, points to the top of the image.
+        position: x and y of the centre of the body's extent (m).
+        fill: Share of the interior's volume that is filled, 0 to 1.
+        shell_scale: Factor on the shell's mass, > 0.
+        up: Unit vector in the mesh frame that pointed up when the contents settled. Placing the body does not move the
+            contents.
 
     Returns:
-        Pose and wrench.
+        Pose of the body, and wrench of the pad on the body.
 
     Raises:
-        TypeError: an argument is traced, or `body` or `sensor` is of another type.
-        ValueError: there is no such face, or no stable face at all, the centre of mass does not lie above the pad, or
-            an argument is out of range or not finite.
+        TypeError: An argument is traced, or `body` or `sensor` has the wrong type.
+        ValueError: The body has no such face or no stable face, its centre of mass does not lie above the pad, or an
+            argument is out of range or not finite.
     """
     _check_body(body)
     if not isinstance(sensor, Sensor):
@@ -166,7 +174,7 @@ def place(
     if not (np.abs(com) < half).all():
         raise ValueError(
             f"position is {position} m, so the centre of mass lies at ({com[0]:.3f}, {com[1]:.3f}) m, beyond the pad, "
-            f"and the body would fall off: its |x| must be < {half[0]:g} m and its |y| < {half[1]:g} m"
+            f"and the body would fall off: |x| of the centre of mass must be < {half[0]:g} m and |y| < {half[1]:g} m"
         )
     return Placement(pose, wrench)
 
@@ -174,7 +182,7 @@ def place(
 def _check_body(body: object) -> None:
     if not isinstance(body, Body):
         raise TypeError(
-            f"body is {body!r:.60}, but it must be one Body: objects.make draws one, objects.load reads a mesh file"
+            f"body is {body!r:.60}, but it must be one Body: objects.make generates one, objects.load reads a mesh file"
         )
 
 

@@ -1,4 +1,4 @@
-"""One trajectory as a pure function: the step, the measurements in each step, and one record per frame."""
+"""Simulation of one trajectory in MJX as a pure function: the step, its measurements, and one record per frame."""
 
 from typing import NamedTuple
 
@@ -12,9 +12,10 @@ from sts_jax.physics import scene
 from sts_jax.physics.contact import PAD_CONTACTS, WALL_CONTACTS, Contacts, Hull, collide, turned
 from sts_jax.physics.solver import mjx
 
-SLOW_SPEED = 0.005  # m/s, an object slower than this ...
-SLOW_TURN = 0.1  # rad/s, ... and slower than this ...
-SLOW_TIME = 0.2  # s, ... for this long has settled
+# An object has settled if it has been slower than SLOW_SPEED and SLOW_TURN for SLOW_TIME.
+SLOW_SPEED = 0.005  # m/s
+SLOW_TURN = 0.1  # rad/s
+SLOW_TIME = 0.2  # s
 PARTED_TIME = 0.005  # s, shortest time without contact between two touches
 GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has left the pad
 
@@ -22,33 +23,33 @@ GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has lef
 class State(NamedTuple):
     """The state that one step passes to the next."""
 
-    qpos: Float[Array, "7"]  # m, quaternion: the pose
+    qpos: Float[Array, "7"]  # pose: position (m), quaternion
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
-    warmstart: Float[Array, "6"]  # acceleration from which the solver starts
-    held: Int[Array, ""]  # steps until release. The state is frozen until then
+    warmstart: Float[Array, "6"]  # acceleration (MuJoCo's qacc) from which the solver starts
+    held: Int[Array, ""]  # steps until the release. The state is frozen until then
     gone: Bool[Array, ""]  # the object has left the pad. The state is frozen from then on
     slow: Int[Array, ""]  # consecutive slow steps
     apart: Int[Array, ""]  # consecutive steps without contact
-    touches: Int[Array, ""]  # contacts that began after PARTED_TIME without contact
+    touches: Int[Array, ""]  # number of contacts that began after at least PARTED_TIME without contact
     sunk: Float[Array, ""]  # m, largest depth of a hull vertex or a contact so far
     finite: Bool[Array, ""]  # all states so far were finite
     impulse: Float[Array, "6"]  # wrench summed over the steps of the unbroken contact within this frame's interval
-    loaded: Int[Array, ""]  # number of those steps
-    wall: Bool[Array, ""]  # the stop wall pushes
+    loaded: Int[Array, ""]  # number of steps in `impulse`
+    wall: Bool[Array, ""]  # the stop wall pushes the object
 
 
 class Record(NamedTuple):
     """The recorded values of one frame."""
 
-    pose: Float[Array | np.ndarray, "*n 7"]  # m and quaternion, w >= 0
-    velocity: Float[Array | np.ndarray, "*n 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
-    wrench: Float[Array | np.ndarray, "*n 6"]  # N, N m about the sensor's origin
-    contact: Bool[Array | np.ndarray, "*n"]  # the pad pushes in the last step
-    wall: Bool[Array | np.ndarray, "*n"]  # the stop wall pushes in the last step
+    pose: Float[Array | np.ndarray, "*n 7"]  # position (m), quaternion with w >= 0
+    velocity: Float[Array | np.ndarray, "*n 6"]  # m/s of the mesh frame's origin and rad/s, sensor frame
+    wrench: Float[Array | np.ndarray, "*n 6"]  # mean N, N m about the sensor's origin, of the pad on the object
+    contact: Bool[Array | np.ndarray, "*n"]  # the pad pushes the object in the last step
+    wall: Bool[Array | np.ndarray, "*n"]  # the stop wall pushes the object in the last step
 
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:
-    """The state of an object with a pose and a velocity (m/s, rad/s, sensor frame), released after `held` steps."""
+    """Create the state of an object that is released after `held` steps with a velocity (m/s, rad/s, sensor frame)."""
     turn = velocity[3:] @ geometry.quat_to_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
     return State(
@@ -76,13 +77,14 @@ class _Top(NamedTuple):
 
 
 def _tops(model: mjx.Model) -> list[_Top]:
-    """The tops of the pad, and of the wall if there is one."""
+    """Return the top of the pad, and the top of the wall if there is one."""
     centre, half = model.geom_pos, model.geom_size
     fixed = np.flatnonzero(model.geom_bodyid == 0)
     return [_Top(centre[i] + jnp.zeros(3).at[2].set(half[i, 2]), half[i, :2]) for i in fixed]
 
 
 def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts:
+    """Find the contacts with the pad, followed by those with the wall if there is one."""
     found = []
     kinds = ((PAD_CONTACTS, (0, 1)), (WALL_CONTACTS, (0, 2)))  # the pad lies in x y, the wall's face in x z
     for top, (num, plane) in zip(_tops(model), kinds, strict=False):
@@ -92,7 +94,7 @@ def _contacts(model: mjx.Model, hull: Hull, pose: Float[Array, "7"]) -> Contacts
 
 
 def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
-    """Depth (m) of the deepest point in the pad or the wall."""
+    """Return the depth (m) of the deepest point in the pad or the wall, 0 if all points are outside."""
     depths = []
     for top in _tops(model):
         x, y, z = points - top.centre[:, None]
@@ -101,9 +103,10 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
-    """Take one time step under its gravity (m/s^2, sensor frame).
+    """Advance a state by one time step under a given gravity (m/s^2, sensor frame).
 
-    The wrench is that of the pad's contacts, without the wall's. Its moment is about the sensor's origin.
+    The measured wrench is the sum over the contacts with the pad, without the wall. Its moment is about the sensor's
+    origin.
     """
     old = state
     model = model.tree_replace({"opt.gravity": gravity})
@@ -142,7 +145,7 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
 
 
 def _unless_frozen(old: State, now: State) -> State:
-    """The state after a step, or the state before it while the object is held or once it is gone.
+    """Return the state after a step, or the state before the step if the object is held or gone.
 
     A held object keeps the velocity that it will have on its release.
     """
@@ -176,13 +179,14 @@ def roll(
     state: State,
     gravity: Float[Array, "frames steps 3"],
 ) -> tuple[State, Record]:
-    """Roll one trajectory: for each frame, take the steps of the interval that ends with it.
+    """Simulate one trajectory. Each frame is recorded at the end of its interval of time steps.
 
     Args:
-        model, data: the scene in MJX.
-        hull: hull of the object.
-        state: state at the beginning of the first frame's interval.
-        gravity: (frames, steps, 3) m/s^2 in the sensor frame, for every step of every interval.
+        model: Model of the scene in MJX.
+        data: Data of the scene in MJX.
+        hull: Collision hull of the object.
+        state: State at the beginning of the first frame's interval.
+        gravity: Gravity for every step of every interval, (frames, steps, 3) (m/s^2, sensor frame).
 
     Returns:
         The last state, and one record per frame.

@@ -1,4 +1,4 @@
-"""The contract of a scenario: how objects start, under which gravity they move, and how their ends are named."""
+"""The interface of scenarios: starts of objects, the gravity that acts on them, and the outcomes of trajectories."""
 
 import abc
 import dataclasses
@@ -16,15 +16,15 @@ from sts_jax.physics.limits import check_kind, check_range
 from sts_jax.physics.scene import Contact
 
 G = 9.81  # m/s^2
-FELL_OFF_HEIGHT = -0.005  # m, height below which an object's origin, inside its hull, has left the pad
+FELL_OFF_HEIGHT = -0.005  # m, an object whose origin (a point inside its hull) is below this height has left the pad
 MOVED = 0.01  # m, an object that moved less has stayed in place
-TURNED = math.pi / 4  # rad, an object that leans more topples, and one that turned more rolls
-LEVEL = 0.001  # m, points up to this far above the lowest one support an object, since it may rock by a facet
-STANDING = 1.04e-5  # m, depth in the pad of a standing object and of a start at rest
+TURNED = math.pi / 4  # rad, an object that leans more has toppled, and an object that turned more has rolled
+LEVEL = 0.001  # m, points up to this height above the lowest one support an object, since it may rock onto them
+STANDING = 1.04e-5  # m, depth in the pad of an object that stands or lies at rest
 
 
 class Outcome(enum.IntEnum):
-    """How a trajectory ended. Each scenario has some of these. They print as words: "fell off"."""
+    """The outcome of a trajectory. Each scenario uses some of these. `str` returns words such as "fell off"."""
 
     RESTS = 0
     FELL_OFF = 1
@@ -40,39 +40,39 @@ class Outcome(enum.IntEnum):
 
 
 def in_words(outcome: enum.IntEnum) -> str:
-    """The name of an outcome in words: "fell off"."""
+    """Return the name of an outcome in words, such as "fell off"."""
     return outcome.name.lower().replace("_", " ")
 
 
 class Hidden(NamedTuple):
-    """Properties that a camera cannot see, one value per trajectory."""
+    """Properties of an object that a camera cannot see, one value per trajectory."""
 
-    fill: Float[Array, "*n"]  # share of the interior's volume that is filled
-    shell_scale: Float[Array, "*n"]  # shell's mass over its nominal mass
-    friction: Float[Array, "*n"]  # coefficient of sliding friction against the pad
-    up: Float[Array, "*n 3"]  # unit vector in the mesh frame, upward when the contents settled
+    fill: Float[Array, "*n"]  # Share of the interior's volume that is filled.
+    shell_scale: Float[Array, "*n"]  # Mass of the shell over its nominal mass.
+    friction: Float[Array, "*n"]  # Coefficient of sliding friction against the pad.
+    up: Float[Array, "*n 3"]  # Unit vector in the mesh frame that pointed up when the contents settled.
 
 
 class Shape(NamedTuple):
-    """The properties of a body that determine where it may start."""
+    """Geometry of a body, from which a scenario draws starts. Vectors are in the mesh frame."""
 
-    points: Float[Array | np.ndarray, "*n h 3"]  # m, vertices of its convex hull, mesh frame, padded by repetition
-    rests: Float[Array | np.ndarray, "*n k 3"]  # unit vectors in the mesh frame that point up at rest, padded
-    shares: Float[Array | np.ndarray, "*n k"]  # share of each rest, see `objects.rest_poses`, 0 for padding
-    coms: Float[Array | np.ndarray, "*n m 3"]  # m, mesh frame, centres of mass with some contents or empty
+    points: Float[Array | np.ndarray, "*n h 3"]  # Vertices of the convex parts (m), padded by repetition.
+    rests: Float[Array | np.ndarray, "*n k 3"]  # Unit vector that points up on each stable face, padded by repetition.
+    shares: Float[Array | np.ndarray, "*n k"]  # Share of each stable face (`objects.rest_poses`), 0 for padding.
+    coms: Float[Array | np.ndarray, "*n m 3"]  # Centres of mass with m random contents, or of the empty body alone (m).
 
     def above(
         self, place: Float[Array, "2"], quat: Float[Array, "4"], height: Float[Array, ""] | float
     ) -> Float[Array, "7"]:
-        """The pose with a given orientation, its origin above a given place, and its lowest point at a given height.
+        """Compute the pose of the body from its place, its orientation and the height of its lowest point.
 
         Args:
-            place: m, x and y of the origin of the mesh frame.
-            quat: unit quaternion.
-            height: m, z of the lowest point. The gel's face is at 0.
+            place: x and y of the origin of the mesh frame (m).
+            quat: Orientation as a unit quaternion.
+            height: z of the lowest point (m). The gel's face is at 0.
 
         Returns:
-            Mesh frame in the sensor frame.
+            Mesh frame in the sensor frame, (7,): position (m), quaternion.
         """
         lowest = jnp.min(self.points @ geometry.quat_to_matrix(quat)[2])
         return jnp.concatenate([place, jnp.stack([height - lowest]), quat])
@@ -81,95 +81,113 @@ class Shape(NamedTuple):
 class Start(NamedTuple):
     """The pose of a held object, the time of its release, and the input that the scenario applies."""
 
-    pose: Float[Array, "7"]  # m and quaternion, mesh frame in the sensor frame
-    held: Int[Array, ""]  # steps until its release in the interval that ends with frame 0
-    condition: Float[Array, "c"]  # SI units
-    # Share of its weight that the pad carries in frame 0 if the object is held until then. The hand carries the rest.
+    pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m), quaternion.
+    # Number of time steps for which the object is held, from the beginning of the interval that ends with frame 0. With
+    # `Scenario.steps`, the object is released at frame 0.
+    held: Int[Array, ""]
+    condition: Float[Array, "c"]  # Numbers of `Scenario.quantities`, in SI units.
+    # Share of the weight that the pad carries in frame 0 if the object is held until then. The hand carries the rest.
     carried: Float[Array, ""] | float = 0.0
 
 
 class Quantity(NamedTuple):
     """A quantity of a scenario's condition: a number, or a vector (x, y) in the plane of the pad."""
 
-    name: str
-    unit: str  # as it is printed
-    scale: float  # typical size, in SI units. Networks receive the quantity divided by it
-    vector: bool = False  # two numbers, which turn with the pad under its symmetries
+    name: str  # Name in texts and figures.
+    unit: str  # Unit in texts and figures.
+    scale: float  # Typical size, in SI units. Networks receive the quantity divided by this size.
+    vector: bool = False  # True for a vector, whose two numbers turn with the pad under its symmetries.
 
 
 class Scenario(abc.ABC):
-    """How objects start, under which gravity they move, and how their ends are named.
+    """Base class of scenarios, which define the starts, the gravity and the outcomes of trajectories.
 
     A scenario is a frozen dataclass that derives from this class. It defines `outcomes`, `start`, `gravity` and
-    `outcome`. All other members have the defaults below, which a class attribute or a field of the dataclass replaces.
-    The methods are pure functions of JAX for one trajectory.
+    `outcome`. All other members have defaults, which a class attribute, a field or a method of the dataclass replaces.
+    `start`, `gravity`, `outcome`, `velocity`, `drift` and `hidden` are pure JAX functions for one trajectory.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # for type checkers: it is a dataclass
 
-    # The outcomes, the most informative first: members of `Outcome` or of another IntEnum with other numbers.
-    # `Outcome.FELL_OFF` must be one of them.
+    # Possible outcomes, the most informative first. They are members of `Outcome`, or of another IntEnum with numbers
+    # that `Outcome` does not use. `Outcome.FELL_OFF` must be one of them.
     outcomes: ClassVar[tuple[enum.IntEnum, ...]]
-    # The quantities of the condition, vectors first. A predictor gets the condition and the first frame only.
+    # Quantities of the condition, vectors first. The condition is an input of predictors, besides the first frame.
     quantities: ClassVar[tuple[Quantity, ...]] = ()
-    symmetries: ClassVar[tuple[int, ...]] = (0,)  # symmetries of the square pad that leave it unchanged, `dataset.turn`
-    must_stand: ClassVar[bool] = False  # whether it refuses objects that do not stand with +z up
-    by_contents: ClassVar[bool] = False  # whether `start` needs centres of mass for several contents in `Shape.coms`
+    # Symmetries of the square pad under which the scenario does not change, as numbers of `dataset.turn`.
+    symmetries: ClassVar[tuple[int, ...]] = (0,)
+    must_stand: ClassVar[bool] = False  # True if the scenario refuses objects that cannot stand with +z up.
+    by_contents: ClassVar[bool] = False  # True if `Shape.coms` must have centres of mass for random contents.
 
-    rate: float = 31.25  # frames/s
-    frames: int = 60
-    fill: tuple[float, float] = (0.0, 1.0)  # share of the interior's volume
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # shell's mass over nominal
-    friction: tuple[float, float] = (0.4, 0.8)
-    tilt: float = 0.0  # rad, largest lean of the contents' up from the object's +z, in any direction
-    wall: float = 0.0  # m, height of the stop wall at the edge of large y, 0 for none
-    contact: Contact = Contact()
+    rate: float = 31.25  # Frame rate (frames/s).
+    frames: int = 60  # Number of frames.
+    fill: tuple[float, float] = (0.0, 1.0)  # Range of the share of the interior's volume that is filled.
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
+    friction: tuple[float, float] = (0.4, 0.8)  # Range of the coefficient of friction against the pad.
+    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    tilt: float = 0.0
+    wall: float = 0.0  # Height of the stop wall at the edge of the pad towards +y (m), 0 for no wall.
+    contact: Contact = Contact()  # Contact and solver constants.
 
     @abc.abstractmethod
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one start. Consumes `key`.
 
         Args:
-            key: key of one trajectory.
-            shape: shape of the body.
-            pad: m, size of the pad along x and y.
+            key: Key of one trajectory.
+            shape: Geometry of the body.
+            pad: Size of the pad along x and y (m).
+
+        Returns:
+            Pose, time of the release and condition.
         """
 
     @abc.abstractmethod
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "c"]) -> Float[Array, "3"]:
-        """Gravity in the sensor frame, less the acceleration of the pad (m/s^2), for one time step.
+        """Return gravity minus the acceleration of the pad during one time step (m/s^2, sensor frame).
 
         Args:
-            time: s, at which the step begins, 0 at frame 0.
-            condition: of the start.
+            time: Time at which the step begins (s), 0 at frame 0.
+            condition: Condition of the start, (c,), in SI units.
         """
 
     @abc.abstractmethod
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """The number of the outcome, from the true or predicted poses of the first and the last frame."""
+        """Return the number of the outcome, given the true or predicted poses (7,) of the first and the last frame."""
 
     def velocity(self, condition: Float[Array, "c"]) -> Float[Array, "6"]:
-        """Velocity of the object on its release: m/s of the mesh frame's origin, rad/s; sensor frame."""
+        """Return the velocity of the object on its release, by default 0.
+
+        Args:
+            condition: Condition of the start, (c,), in SI units.
+
+        Returns:
+            Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), (6,), in the sensor frame.
+        """
         del condition
         return jnp.zeros(6)
 
     def drift(self, condition: Float[Array, "c"]) -> Float[Array, "2"]:
-        """Velocity over the pad (m/s, x and y) that a freely sliding object receives. Figures show it as an arrow."""
+        """Return the velocity over the pad of an object without friction (m/s, x and y). Figures draw it as an arrow.
+
+        Args:
+            condition: Condition of the start, (c,), in SI units.
+        """
         return self.velocity(condition)[:2]
 
     @property
     def steps(self) -> int:
-        """Time steps in one frame's interval."""
+        """Number of time steps from one frame to the next."""
         return round(1 / (self.rate * self.contact.timestep))
 
     @property
     def condition_scale(self) -> tuple[float, ...]:
-        """Typical size (SI units) of each number of its condition."""
+        """Typical size of each number of the condition, in SI units."""
         return tuple(q.scale for q in self.quantities for _ in range(2 if q.vector else 1))
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) at the front of the condition. The numbers after them are scalars."""
+        """Number of vectors (x, y) at the beginning of the condition. The remaining numbers are scalars."""
         return sum(quantity.vector for quantity in self.quantities)
 
     @property
@@ -178,10 +196,10 @@ class Scenario(abc.ABC):
         return tuple(outcome for outcome in self.outcomes if outcome != Outcome.FELL_OFF)
 
     def named(self, number: int) -> str:
-        """The outcome with a number in words: "fell off".
+        """Return the outcome with a given number in words, such as "fell off".
 
         Raises:
-            ValueError: the scenario has no such outcome.
+            ValueError: The scenario has no outcome with this number.
         """
         names = {int(outcome): in_words(outcome) for outcome in self.outcomes}
         if number not in names:
@@ -189,7 +207,7 @@ class Scenario(abc.ABC):
         return names[number]
 
     def described(self, condition: Float[Array | np.ndarray, "c"]) -> str:
-        """A condition in words: "acceleration (3.1, -7.2) m/s², duration 0.085 s"."""
+        """Describe a condition (c,) in words, such as "acceleration (3.1, -7.2) m/s², duration 0.085 s"."""
         words, rest = [], np.asarray(condition).tolist()
         for quantity in self.quantities:
             own, rest = (rest[:2], rest[2:]) if quantity.vector else (rest[:1], rest[1:])
@@ -198,7 +216,7 @@ class Scenario(abc.ABC):
         return ", ".join(words)
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
-        """Draw the hidden values of one trajectory. Consumes `key`."""
+        """Draw the hidden properties of one trajectory. Consumes `key`."""
         fill, shell, friction, high, around = jax.random.split(key, 5)
 
         def draw(key: PRNGKeyArray, limits: tuple[float, float]) -> Float[Array, ""]:
@@ -218,7 +236,7 @@ class Scenario(abc.ABC):
         """Raise an error unless the scenario can be simulated.
 
         Raises:
-            ValueError: a field, which the message names, is of another kind or out of range.
+            ValueError: A field has a value of the wrong type or out of range. The message names the field.
         """
         _check_kinds(self)
         _check_times(self)
@@ -233,6 +251,7 @@ class Scenario(abc.ABC):
 
 
 def _check_kinds(scenario: Scenario) -> None:
+    """Raise a ValueError unless each field has a value of the same kind as its default."""
     defaults = {name: getattr(Scenario, name) for name in ("rate", "frames", *_RANGES, "tilt", "wall", "contact")}
     for field in dataclasses.fields(scenario):
         if field.default_factory is not dataclasses.MISSING:
@@ -246,6 +265,7 @@ def _check_kinds(scenario: Scenario) -> None:
 
 
 def _check_times(scenario: Scenario) -> None:
+    """Raise a ValueError unless there is a frame, and the interval of a frame is a whole number of time steps."""
     rate, timestep = scenario.rate, scenario.contact.timestep
     if not rate > 0 or not timestep > 0:
         raise ValueError(
@@ -262,7 +282,7 @@ def _check_times(scenario: Scenario) -> None:
 
 
 def _check_meanings(scenario: Scenario) -> None:
-    """Raise an error unless outcomes have numbers of their own, and vectors come first in the condition."""
+    """Raise a ValueError unless the numbers of the outcomes are unique and vectors come first in the condition."""
     numbers = [int(outcome) for outcome in scenario.outcomes]
     if int(Outcome.FELL_OFF) not in numbers:
         raise ValueError(
@@ -271,8 +291,8 @@ def _check_meanings(scenario: Scenario) -> None:
     taken = [o for o in scenario.outcomes if not isinstance(o, Outcome) and int(o) in {int(known) for known in Outcome}]
     if taken or len(set(numbers)) < len(numbers):
         raise ValueError(
-            f"scenario.outcomes has the numbers {numbers}, but each outcome needs one of its own, and 0 to "
-            f"{max(Outcome)} are those of physics.Outcome: number others from 100"
+            f"scenario.outcomes has the numbers {numbers}, but each outcome needs a unique number, and 0 "
+            f"to {max(Outcome)} are reserved for physics.Outcome: number other outcomes from 100"
         )
     kinds = [quantity.vector for quantity in scenario.quantities]
     if sorted(kinds, reverse=True) != kinds:
@@ -281,24 +301,24 @@ def _check_meanings(scenario: Scenario) -> None:
 
 
 Variant = Literal["default", "off", "wide-friction", "off-centre"]
-_RANGES = ("fill", "shell_scale", "friction")  # of hidden values
+_RANGES = ("fill", "shell_scale", "friction")  # fields with ranges of hidden properties
 _AnyScenario = TypeVar("_AnyScenario", bound=Scenario)
 
 
 def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
-    """Change the ranges of a scenario's hidden values.
+    """Return a copy of a scenario with other ranges of its hidden properties.
 
     Args:
-        scenario: its other fields stay the same.
-        name: one of `Variant`. `off` hides nothing: every value is the middle of its range, and contents have settled
-            at the base. `wide-friction` draws friction from U(.3, .9) in any scenario. `off-centre` freezes contents in
-            any direction, as on the slope by default.
+        scenario: Scenario to copy. Its other fields stay the same.
+        name: Name of the variant. "default" changes nothing. "off" hides nothing: every value is the middle of its
+            range, and contents settle at the object's base. "wide-friction" draws friction from 0.3 to 0.9.
+            "off-centre" lets contents settle in any direction, as `Inclined` does by default.
 
     Returns:
         A scenario of the same class.
 
     Raises:
-        ValueError: the name is unknown, or the scenario lacks a field that the variant changes.
+        ValueError: The name is unknown, or the scenario lacks a field that the variant changes.
     """
     middle = {field: (sum(getattr(scenario, field)) / 2,) * 2 for field in _RANGES}
     changes: dict[str, dict[str, Any]] = {
@@ -308,7 +328,7 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
         "off-centre": {"tilt": math.pi},
     }
     if name not in changes:
-        raise ValueError(f"unknown variant {name!r} of the hidden values: name must be one of {', '.join(changes)}")
+        raise ValueError(f"name is {name!r}, but it must be one of {', '.join(changes)}")
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
         raise ValueError(
@@ -319,25 +339,25 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
 
 
 def fell_off(pose: Float[Array, "*n 7"]) -> Bool[Array, "*n"]:
-    """Whether an object has left the pad, from its true or predicted pose."""
+    """Return for each true or predicted pose, (..., 7), whether the object has left the pad."""
     return pose[..., 2] < FELL_OFF_HEIGHT
 
 
 def upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The shortest turn that takes a unit vector to +z."""
+    """Return the quaternion of the shortest rotation that turns a unit vector to +z."""
     upside_down = up[2] < -0.9999
     turn = jnp.stack([1 + up[2], up[1], -up[0], 0.0])
     return geometry.normalize(jnp.where(upside_down, jnp.array([0.0, 1.0, 0.0, 0.0]), turn))
 
 
 def random_yaw(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """Draw a turn about the vertical."""
+    """Draw the quaternion of a rotation about the vertical by a uniform angle."""
     angle = jax.random.uniform(key, maxval=2 * jnp.pi)
     return geometry.quat_canonical(geometry.quat_from_rotvec(jnp.stack([0.0, 0.0, angle])))
 
 
 def random_place(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Float[Array, "2"]:
-    """Draw a place (m) from a disc of some radius (m) about the pad's centre."""
+    """Draw a place (m) from a disc of radius `size` (m) about the pad's centre. `radius` and `angle` are keys."""
     r = size * jnp.sqrt(jax.random.uniform(radius))
     a = jax.random.uniform(angle, maxval=2 * jnp.pi)
     return jnp.stack([r * jnp.cos(a), r * jnp.sin(a)])

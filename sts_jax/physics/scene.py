@@ -48,23 +48,30 @@ _SCENE = """
 
 @dataclasses.dataclass(frozen=True)
 class Contact:
-    """The contact and solver constants of a scenario, with MuJoCo's names and meanings."""
+    """The contact and solver constants of a scenario, as MuJoCo defines them."""
 
-    timestep: float = 0.0005  # s
-    time_constant: float = 0.003  # s, solref. Stiff: less than 0.1 mm deep at rest, about 1 mm at impact
-    damping_ratio: float = 0.8  # solref. A gel bounces little, but most drops still touch, part and touch again
-    # A contact that is stiff at first touch, or whose `width` is short for the time step, rattles under a sliding
-    # object, and its friction is then off by up to 10 %. With a long `width`, an object that leans over an edge sinks
-    # in and tips early. C MuJoCo behaves the same.
-    soft: float = 0.02  # solimp at first touch
-    hard: float = 0.99  # solimp at `width`
-    width: float = 0.00002  # m, solimp
-    torsional: float = 0.005  # m, torsional friction (MuJoCo's default)
-    # Rolling friction widens the base over which an object topples by its own length, so it must be much smaller.
-    rolling: float = 0.0002  # m
-    impratio: float = 10.0  # stiffness of friction against the normal force, so that objects at rest do not creep
-    iterations: int = 8  # Newton iterations of one step
-    ls_iterations: int = 8  # line-search iterations of one Newton iteration
+    timestep: float = 0.0005  # Time step (s).
+    # Time constant of the contact (s), the first number of MuJoCo's solref. The default is stiff: an object is less
+    # than 0.1 mm deep in the pad at rest and about 1 mm at impact.
+    time_constant: float = 0.003
+    # Damping ratio of the contact, the second number of solref. A gel bounces little, but most dropped objects still
+    # leave the pad and touch it again.
+    damping_ratio: float = 0.8
+    # Impedance at first touch, the first number of MuJoCo's solimp. A contact that is stiff at first touch rattles
+    # under a sliding object, and so does a contact whose `width` is short for the time step. Its friction is then
+    # wrong by up to 10 %.
+    soft: float = 0.02
+    hard: float = 0.99  # Impedance at the depth `width`, the second number of solimp.
+    # Depth over which the impedance rises (m), the third number of solimp. With a long `width`, an object that leans
+    # over an edge sinks in and tips early. C MuJoCo behaves in the same way.
+    width: float = 0.00002
+    torsional: float = 0.005  # Torsional friction (m), MuJoCo's default.
+    # Rolling friction (m). It widens the base over which an object topples by its own length, so it must be small.
+    rolling: float = 0.0002
+    # Stiffness of friction relative to the normal force. A high value keeps objects at rest from creeping.
+    impratio: float = 10.0
+    iterations: int = 8  # Largest number of Newton iterations in a step.
+    ls_iterations: int = 8  # Largest number of line-search iterations in a Newton iteration.
 
 
 class Box(NamedTuple):
@@ -75,7 +82,7 @@ class Box(NamedTuple):
 
 
 def boxes(pad: tuple[float, float], wall: float) -> list[Box]:
-    """The fixed boxes: the pad, and the wall if its height (m) is not 0."""
+    """Return the fixed boxes: the pad, and the stop wall if its height `wall` (m) is not 0."""
     beneath = WALL_DEPTH if wall else 0.0  # the pad extends beneath the wall
     centre, half = [0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2]
     found = [Box(np.array(centre), np.array(half))]
@@ -87,6 +94,7 @@ def boxes(pad: tuple[float, float], wall: float) -> list[Box]:
 
 
 def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[str], asset: str, inert: str) -> str:
+    """Write the scene as MuJoCo's XML, with geoms `shapes` for the object and attributes `inert` for the wall."""
     friction = f"0.5 {contact.torsional} {contact.rolling}"
     fixed = [
         f'<geom name="{name}" type="box" pos="{" ".join(map(str, box.centre))}" size="{" ".join(map(str, box.half))}" '
@@ -106,16 +114,16 @@ def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact,
     """Compile the scene for C MuJoCo, which finds the contacts itself. `set_rigid` replaces the mass properties.
 
     Args:
-        parts: (p, n, 3) m, points of the convex parts that collide, in the mesh frame.
-        pad: (x, y) m, size of the pad.
-        contact: contact and solver constants.
-        wall: m, height of the stop wall, 0 for none.
+        parts: Points of the convex parts that collide, (p, n, 3), in the mesh frame (m).
+        pad: Size of the pad along x and y (m).
+        contact: Contact and solver constants.
+        wall: Height of the stop wall (m), 0 for none.
     """
     return mujoco.MjModel.from_xml_string(scene_xml(parts, pad, contact, wall))
 
 
 def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> str:
-    """The scene of `compile_scene` as MuJoCo's XML."""
+    """Return the scene of `compile_scene`, which has the same arguments, as MuJoCo's XML."""
     meshes, shapes = [], []
     for index, part in enumerate(np.unique(parts, axis=0)):
         points = " ".join(f"{x:.9g}" for x in np.unique(part, axis=0).ravel())
@@ -129,10 +137,11 @@ def set_rigid(
 ) -> None:
     """Write an object's mass (kg), centre of mass (m), inertia about it (kg m^2) and friction into a model.
 
-    Also update all constants derived from them (`mj_setConst`). Stale ones would change the stiffness of the contacts.
+    All constants that MuJoCo derives from these values are updated, too (`mj_setConst`). Outdated constants would
+    change the stiffness of the contacts.
 
     Raises:
-        ValueError: a mass, inertia or friction is not positive, or a value is not finite.
+        ValueError: Mass, friction or a principal moment of inertia is not positive, or a value is not finite.
     """
     if not (np.isfinite(mass) and mass > 0):
         raise ValueError(f"mass is {mass} kg, but it must be positive and finite")
@@ -173,7 +182,7 @@ DRAWN = (
 def template(
     pad: tuple[float, float], contact: Contact, wall: float = 0.0
 ) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
-    """The scene that MJX steps for every object.
+    """Return the scene that MJX steps for every object, as models of MuJoCo and MJX and data of MJX.
 
     Small boxes stand in for the object, because MJX reserves four contacts with the pad for each box. `collide` finds
     the contacts of the object itself with pad and wall.
@@ -185,13 +194,13 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """The values that `set_rigid` changed, under the names of `mjx.Model`'s fields."""
+    """Return the values that `set_rigid` changed, by the names of `mjx.Model`'s fields and in the types of `like`."""
     fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 
 
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """The position stage of `mjx.forward`, with the given contacts instead of those of the stand-in boxes."""
+    """Run the position stage of `mjx.forward` with the given contacts instead of the contacts of the stand-in boxes."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
     data = mjx.collision(model, data)
     # MJX has no public way to pass contacts in. If this path moves, `tree_replace` fails at the first step.
@@ -200,13 +209,13 @@ def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
 
 
 def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """`mjx.step` (semi-implicit Euler) with the given contacts."""
+    """Advance the data by one `mjx.step` (semi-implicit Euler) with the given contacts."""
     data = mjx.fwd_velocity(model, position(model, data, contacts))
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
     return mjx.euler(model, SOLVER.solve(model, data))
 
 
 def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:
-    """Force (N, sensor frame) and moment about the object's origin (N m, mesh frame) of some of the contacts."""
+    """Sum force (N, sensor frame) and moment about the object's origin (N m, mesh frame) over a slice of contacts."""
     rows = slice(contacts.start * CONDIM, contacts.stop * CONDIM)
     return data._impl.efc_force[rows] @ data._impl.efc_J[rows]

@@ -1,4 +1,4 @@
-"""`simulate`: draws starts and hidden values on the host, and rolls chunks of trajectories in MJX or C MuJoCo."""
+"""`simulate`: random starts and hidden properties, and their trajectories, computed in chunks by MJX or C MuJoCo."""
 
 import concurrent.futures
 import contextlib
@@ -26,10 +26,10 @@ from sts_jax.physics.trajectory import Trajectory
 from sts_jax.sensor import Sensor
 
 # m, thickness of the paper's gel. A trajectory in which the object goes deeper is drawn again. Contacts are found once
-# per step, so a fast-turning object whose corner hits at 3 m/s is 3 mm deep before they push.
+# per step, so a corner that hits the pad at 3 m/s can be 3 mm deep before a contact pushes it (at steps of 1 ms).
 SUNK_LIMIT = 0.005
-ATTEMPTS = 5  # draws of one trajectory before giving up
-WORKERS = 2  # chunks at once in MJX, because XLA runs these small steps on one CPU core each
+ATTEMPTS = 5  # draws of one trajectory before an error is raised
+WORKERS = 2  # chunks that MJX simulates at the same time, because XLA runs each chunk on one CPU core
 
 
 class _Accepted(NamedTuple):
@@ -38,7 +38,7 @@ class _Accepted(NamedTuple):
     starts: Start
     hidden: Hidden
     rolled: Rolled
-    attempt: Int[np.ndarray, "n"]  # draws discarded before
+    attempt: Int[np.ndarray, "n"]  # number of draws that failed before
 
 
 def simulate(
@@ -53,35 +53,38 @@ def simulate(
     chunk: int = 32,
     engine: Engine | None = None,
 ) -> Trajectory:
-    """Simulate `num` trajectories of each body with random starts and hidden values.
+    """Simulate `num` trajectories of each body with random starts and hidden properties.
 
-    Trajectory j of body i depends on `key`, i, j and the body, not on the number of other trajectories. Trajectories
-    that are non-finite or sink deeper into the pad than SUNK_LIMIT are drawn again with a fresh key (`resampled`).
+    Trajectory j of body i depends on `key`, i, j and the body, not on the number of other trajectories. A trajectory
+    fails if it has non-finite values or the object sinks more than 5 mm into the pad or the stop wall. It is then drawn
+    again with another key. `Trajectory.resampled` counts the failures.
 
     Args:
-        key: for the whole set.
-        body: one body, or a sequence of different ones.
-        sensor: `sensor.gel.size` is the pad's size.
+        key: Key of the whole set, from `jax.random.key`.
+        body: One body, or a sequence of bodies.
+        sensor: Sensor whose `gel.size` is the size of the pad.
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
-        num: trajectories of each body.
-        hidden: (bodies * num,) each, `up` (bodies * num, 3), body-major. Replaces the drawn values. The starts remain
-            those of `key`, except where `resampled` is not 0.
-        progress: True shows a bar on standard error or in a notebook. MJX compiles for tens of seconds before the first
-            chunk is done. A function is called after each chunk with the number of trajectories done so far.
-        chunk: trajectories that MJX steps at once. Another number compiles anew and rounds differently. Larger ones
-            suit a GPU. C MuJoCo takes at most this many, of one body, in one thread. Its results do not depend on it.
-        engine: "mujoco" is C MuJoCo on all CPU cores, where it is several times as fast and compiles nothing. "mjx"
-            runs on the device of JAX. None takes the faster one, "mujoco" if `jax.default_backend()` is "cpu". Both
-            have the same starts and hidden values for a key.
+        num: Number of trajectories of each body.
+        hidden: Hidden properties that replace the random ones, ordered body by body. Its arrays have the shape
+            (bodies * num,), and `up` has the shape (bodies * num, 3). The starts remain those of `key`, except where
+            `resampled` is not 0.
+        progress: True shows a progress bar on standard error. MJX compiles for tens of seconds before the first chunk
+            is done. A function is called after each chunk with the number of trajectories done so far.
+        chunk: Number of trajectories that MJX steps at once. Another number compiles anew and rounds differently.
+            Larger chunks suit a GPU. C MuJoCo simulates at most this many trajectories of one body at once in each
+            thread, and its results do not depend on the number.
+        engine: "mujoco" is C MuJoCo on all CPU cores. It compiles nothing and is several times as fast as MJX on a CPU.
+            "mjx" runs on JAX's default device. None selects the faster one: "mujoco" if `jax.default_backend()` is
+            "cpu", else "mjx". Both engines draw the same starts and hidden properties from a key.
 
     Returns:
-        bodies * num trajectories, body-major.
+        `num` trajectories of body 0, then `num` trajectories of body 1, and so on.
 
     Raises:
-        BodyError: (a ValueError) a body cannot start in the scenario, has bad values, or has a trajectory that fails in
-            every attempt.
-        ValueError: another argument, which the message names, is out of range.
-        TypeError: an argument is of another type.
+        BodyError: A body cannot start in the scenario, has bad values, or has a trajectory that fails in five draws.
+            BodyError is a ValueError.
+        ValueError: Another argument is out of range. The message names the argument.
+        TypeError: An argument has the wrong type.
     """
     bodies = listed(body)
     check_key(key)
@@ -107,7 +110,7 @@ def simulate(
 
 @contextlib.contextmanager
 def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[int], object]]:
-    """The function to call with the number of trajectories done: the caller's, a bar's, or one without effect."""
+    """Provide the function to call with the number of trajectories done: the caller's function, or that of a bar."""
     if callable(progress):
         yield progress
         return
@@ -131,18 +134,18 @@ def _accepted(
     engine: Engine,
     report: Callable[[int], object],
 ) -> _Accepted:
-    """Draw and roll all trajectories, and those that fail again, until none fails.
+    """Draw and simulate all trajectories. Draw failed ones again until none fails.
 
     Args:
-        key: for the whole set.
-        setup: the properties of the trajectories.
-        given: hidden values that replace the drawn ones.
-        chunk: trajectories that one call rolls at most.
-        engine: the engine.
-        report: called with the number of trajectories done so far.
+        key: Key of the whole set.
+        setup: Properties of the trajectories that do not depend on the draws.
+        given: Hidden properties that replace the random ones, or None.
+        chunk: Largest number of trajectories in one call of the engine.
+        engine: Engine that simulates.
+        report: Function that is called with the number of trajectories done so far.
 
     Raises:
-        BodyError: a trajectory fails in every attempt.
+        BodyError: A body cannot start in the scenario, or a trajectory fails in every attempt.
     """
     count, scenario = len(setup.which), setup.scenario
     nth = np.arange(count) % (count // len(setup.bodies))
@@ -168,15 +171,15 @@ def _accepted(
             worst = int(attempt.argmax())
             raise BodyError(
                 int(setup.which[worst]),
-                f"trajectory {nth[worst]} is non-finite or sinks deeper than {SUNK_LIMIT} m in {ATTEMPTS} draws: "
-                "check the thickness of the hull and the mass",
+                f"trajectory {nth[worst]} is non-finite or sinks more than {SUNK_LIMIT} m into pad or wall in "
+                f"{ATTEMPTS} draws: check the thickness of the hull and the mass",
             )
     rolled = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
     return _Accepted(starts, hidden, rolled, attempt)
 
 
 def _chunks(setup: Setup, pending: np.ndarray, chunk: int, engine: Engine, workers: int) -> list[np.ndarray]:
-    """Pending trajectories in groups that one call rolls: of hulls of one size in MJX, of one body in C MuJoCo."""
+    """Group pending trajectories for calls of the engine: by the size of the hulls in MJX, by body in C MuJoCo."""
     sizes = np.array([body.hulls.size for body in setup.bodies])
     kind = (sizes[setup.which] if engine == "mjx" else setup.which)[pending]
     size = chunk if engine == "mjx" else min(chunk, -(-len(pending) // workers))
@@ -185,13 +188,13 @@ def _chunks(setup: Setup, pending: np.ndarray, chunk: int, engine: Engine, worke
 
 
 def _with_held(setup: Setup, sensor: Sensor, accepted: _Accepted, down: Float[np.ndarray, "n"]) -> Record:
-    """The records, with the wrench of the pad on objects that a hand holds against it in frame 0.
+    """Return the records, with the wrench of the pad on objects that a hand holds on the pad in frame 0.
 
     Args:
-        setup: the properties of the trajectories.
-        sensor: the sensor, whose gel determines the centre of pressure.
-        accepted: the accepted draws and their results.
-        down: m/s^2, gravity towards the pad in frame 0.
+        setup: Properties of the trajectories that do not depend on the draws.
+        sensor: Sensor whose gel determines the centre of pressure.
+        accepted: Accepted draws and their results.
+        down: Gravity towards the pad in frame 0 (m/s^2).
     """
     record, starts = accepted.rolled.record, jax.tree.map(np.asarray, accepted.starts)
     held = np.flatnonzero((starts.carried > 0) & (starts.held >= setup.scenario.steps))
@@ -207,7 +210,7 @@ def _with_held(setup: Setup, sensor: Sensor, accepted: _Accepted, down: Float[np
 
 
 def _trajectory(setup: Setup, sensor: Sensor, accepted: _Accepted) -> Trajectory:
-    """The results under the names of `Trajectory`."""
+    """Collect the results in a `Trajectory`."""
     scenario, ends = setup.scenario, jax.tree.map(jnp.asarray, accepted.rolled.ends)
     gravity = gravity_at(accepted.starts.condition, setup.time[:, -1:], scenario=scenario)[:, :, 0]
     record = jax.tree.map(jnp.asarray, _with_held(setup, sensor, accepted, -np.asarray(gravity[:, 0, 2])))

@@ -10,15 +10,16 @@ import jax.numpy as jnp
 with contextlib.redirect_stdout(io.StringIO()):  # mjx prints that warp, another engine, is not installed
     from mujoco import mjx as mjx
 
-SMALLEST_SLIP = 1e-6  # lower bound of |u + alpha v|^2 / |u|^2 in the line search, above float32's rounding
+SMALLEST_SLIP = 1e-6  # lower bound of |u + alpha v|^2 / |u|^2 in the line search, larger than float32's rounding
 
 
 def _sound_solver() -> ModuleType:
     """Load a copy of MJX 3.17's solver whose line search never computes NaN.
 
-    At each step length alpha, the line search takes the root of |u + alpha v|^2 = uu + alpha (2 uv + alpha vv). In
-    float32 this sum can be negative where the tangential part is zero, as in free fall, and the search then stops.
-    One in six first touches of drops without spin missed part of the contact's force (up to 0.15 m/s wrong).
+    At each step length alpha, the line search computes the root of |u + alpha v|^2 = uu + alpha (2 uv + alpha vv). Here
+    u is the tangential part of a contact's residual, and v is the change of u along the search direction. In float32
+    the sum can be negative where the tangential part is zero, as in free fall, and the search then stops. In one of six
+    drops without spin, the first touch missed part of the contact's force. Velocities were wrong by up to 0.15 m/s.
     """
     spec = importlib.util.find_spec("mujoco.mjx._src.solver")
     assert spec is not None

@@ -12,34 +12,36 @@ from sts_jax.physics.scenario import Hidden, Outcome
 
 
 class Trajectory(NamedTuple):
-    """n trajectories of one or more bodies, body-major, with f frames each."""
+    """n trajectories of one or more bodies, ordered body by body, with f frames each."""
 
-    time: Float[Array, "n f"]  # s, 0 at frame 0
-    pose: Float[Array, "n f 7"]  # mesh frame in the sensor frame, w >= 0
-    velocity: Float[Array, "n f 6"]  # m/s of the mesh frame's origin, rad/s; sensor frame
-    # N, N m about the sensor's origin, exerted by the pad on the object: the mean over the unbroken contact at the end
-    # of the frame's interval, or 0 if the last step of the interval has no contact. In frame 0 of an object that is
-    # held on the pad (`Start.carried`), the wrench under the held pose.
+    time: Float[Array, "n f"]  # Time (s), 0 at frame 0.
+    pose: Float[Array, "n f 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
+    # Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), in the sensor frame.
+    velocity: Float[Array, "n f 6"]
+    # Force (N) and moment about the sensor's origin (N m) of the pad on the object. The wrench is the mean over the
+    # unbroken contact at the end of the interval before the frame, or 0 if the last time step has no contact. Frame 0
+    # of an object that a hand holds on the pad (`Start.carried`) has the wrench under the held pose.
     wrench: Float[Array, "n f 6"]
-    contact: Bool[Array, "n f"]  # the pad pushes in the frame's last step
-    wall: Bool[Array, "n f"]  # the stop wall pushes in the frame's last step
-    gravity: Float[Array, "n f 3"]  # m/s^2, sensor frame
-    settled: Bool[Array, "n"]  # slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or gone from the pad
-    # Outcome from the poses of the first and the last frame. It is final where `settled`
+    contact: Bool[Array, "n f"]  # True if the pad pushes the object in the last time step before the frame.
+    wall: Bool[Array, "n f"]  # True if the stop wall pushes the object in the last time step before the frame.
+    gravity: Float[Array, "n f 3"]  # Gravity minus the acceleration of the pad, in the sensor frame (m/s^2).
+    # True if the object was slower than 5 mm/s and 0.1 rad/s for the last 0.2 s, or has left the pad.
+    settled: Bool[Array, "n"]
+    # Number of the outcome, from the poses of the first and the last frame. It is final where `settled` is True.
     outcome: Int[Array, "n"]
-    touches: Int[Array, "n"]  # contacts with pad or wall, separated by at least 5 ms
-    sunk: Float[Array, "n"]  # m, largest depth of the hull in pad or wall
-    condition: Float[Array, "n c"]  # the scenario's input
-    hidden: Hidden  # (n,) each, `up` (n, 3)
-    body: Int[Array, "n"]  # index into the sequence of bodies
-    resampled: Int[Array, "n"]  # draws discarded because non-finite or too deep
+    touches: Int[Array, "n"]  # Number of contacts with pad or wall, separated by at least 5 ms.
+    sunk: Float[Array, "n"]  # Largest depth of the hull in pad or wall (m).
+    condition: Float[Array, "n c"]  # Condition of the start (`Scenario.quantities`), in SI units.
+    hidden: Hidden  # Hidden properties: arrays of shape (n,), and `up` of shape (n, 3).
+    body: Int[Array, "n"]  # Index of the body in the sequence of bodies.
+    resampled: Int[Array, "n"]  # Number of discarded draws, which were non-finite or in which the object sank too deep.
 
     @property
     def outcomes(self) -> tuple[Outcome, ...]:
         """The outcome of each trajectory. `Outcome.FELL_OFF` prints as "fell off".
 
         Raises:
-            ValueError: the scenario has an outcome of its own, which `Scenario.named` names.
+            ValueError: An outcome is not a member of `Outcome`. Use `Scenario.named` instead.
         """
         return tuple(Outcome(int(number)) for number in np.ravel(self.outcome))
 
@@ -60,5 +62,5 @@ class Trajectory(NamedTuple):
 
 
 def _named(number: int) -> str:
-    """An outcome in words. Those that only a scenario of the user has are numbers."""
+    """Return an outcome in words, or as "outcome N" if `Outcome` has no member with this number."""
     return str(Outcome(number)) if number in set(Outcome) else f"outcome {number}"

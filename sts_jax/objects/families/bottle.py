@@ -1,4 +1,4 @@
-"""Bottles: straight, necked or tapered, with a label and a cap."""
+"""Bottles that are straight, tapered or have a thin neck, with a label and a cap."""
 
 import numpy as np
 
@@ -7,20 +7,20 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The bottle with its label, and the cap."""
-    radius = rng.uniform(11, 20)  # mm, base radius
+    """Draw a bottle: the bottle with its label, and the cap."""
+    radius = rng.uniform(11, 20)  # mm, radius of the base
     height = rng.uniform(80, 120)  # mm, with the cap
-    style = rng.integers(3)  # straight, necked, tapered: a third each
-    taper = rng.uniform(0.75, 1.3) if style == 2 else 1.0  # shoulder's radius over the base's
+    style = rng.integers(3)  # straight, with a neck or tapered: a third each
+    taper = rng.uniform(0.75, 1.3) if style == 2 else 1.0  # radius of the shoulder over radius of the base
     cap_height = height * rng.uniform(0.1, 0.2)
     neck = rng.uniform(0.32, 0.48) if style == 1 else rng.uniform(0.5, 0.8)
-    slope = rng.uniform(0.22, 0.38) if style == 1 else rng.uniform(0.04, 0.14)  # shoulder
-    label = np.sort([rng.uniform(0.08, 0.3), rng.uniform(0.6, 0.92)])  # over straight height
+    slope = rng.uniform(0.22, 0.38) if style == 1 else rng.uniform(0.04, 0.14)  # shoulder over total height
+    label = np.sort([rng.uniform(0.08, 0.3), rng.uniform(0.6, 0.92)])  # lower and upper end over height of the wall
 
     body, cap, paper, mark = colors.vivid(rng), colors.vivid(rng), colors.pale(rng), colors.vivid(rng)
-    if rng.uniform() < 0.5:  # half have a dark or white cap
+    if rng.uniform() < 0.5:  # half of the bottles have a dark or white cap
         cap = colors.dark(rng) if rng.uniform() < 0.5 else colors.WHITE
-    if rng.uniform() < 0.3:  # some are pale with a vivid label
+    if rng.uniform() < 0.3:  # three of ten are pale with a vivid label
         body, paper, mark = colors.pale(rng), colors.vivid(rng), colors.WHITE
 
     top = radius * taper

@@ -10,25 +10,25 @@ from sts_jax.objects.shapes import Part
 
 
 class _Size(NamedTuple):
-    """Dimensions before the camera is scaled to its length."""
+    """Dimensions (mm) of the housing and the viewfinder before the camera is scaled to its final length."""
 
     width: float
-    height: float  # of the housing
+    height: float
     depth: float
-    hump: float  # height of the viewfinder
-    side: float  # offset of lens and viewfinder
+    hump: float  # height of the viewfinder above the housing
+    side: float  # x of the centres of lens and viewfinder
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The camera, with the lens towards -y."""
+    """Draw a camera whose lens faces -y."""
     longest = rng.uniform(70, 120)  # mm
     width = 100.0
-    height = width * rng.uniform(0.55, 0.72)  # housing's height over width
+    height = width * rng.uniform(0.55, 0.72)  # height of the housing
     depth = width * rng.uniform(0.26, 0.4)
-    radius = height * rng.uniform(0.3, 0.4)  # lens over height
-    length = width * rng.uniform(0.16, 0.5)
-    hump = height * rng.uniform(0.14, 0.26)  # viewfinder
-    side = width * rng.uniform(-0.02, 0.1)  # offset of the lens over width
+    radius = height * rng.uniform(0.3, 0.4)  # radius of the lens
+    length = width * rng.uniform(0.16, 0.5)  # length of the lens
+    hump = height * rng.uniform(0.14, 0.26)  # height of the viewfinder
+    side = width * rng.uniform(-0.02, 0.1)  # offset of the lens and the viewfinder
     corner = depth * rng.uniform(0.14, 0.3)
     size = _Size(width, height, depth, hump, side)
 
@@ -43,7 +43,7 @@ def parts(rng: np.random.Generator) -> list[Part]:
     levels = [(1.0, 0.0), (1.0, 0.1 * height), (1.0, 0.76 * height), (1.0, height)]
     housing = shapes.loft(shapes.rings(outline, levels), [plate, skin, plate], interior=True)
     lens = shapes.move(_lens(radius, length, 14, barrel, ring), (side, front, height * 0.46), axis="-y")
-    # The grip is a ridge for the hand, on the left in the front view.
+    # The grip is a ridge for the hand, on the left when seen from the front.
     ridge = shapes.rectangle(width * 0.13, depth * 0.34, depth * 0.1)
     grip = shapes.loft(
         shapes.rings(ridge, [(0.85, 0.03 * height), (1.0, 0.2 * height), (0.9, 0.74 * height)]), skin * 0.7
@@ -54,7 +54,7 @@ def parts(rng: np.random.Generator) -> list[Part]:
 
 
 def _lens(radius: float, length: float, num: int, barrel: Color, ring: Color) -> Part:
-    """A lens barrel along +z from z = 0, with rings and recessed glass."""
+    """Return a lens barrel with rings and recessed glass, from z = 0 to z = `length`."""
     profile = [
         (radius * 0.96, 0),
         (radius * 0.96, length * 0.35),
@@ -71,7 +71,7 @@ def _lens(radius: float, length: float, num: int, barrel: Color, ring: Color) ->
 
 
 def _viewfinder(size: _Size, plate: Color) -> list[Part]:
-    """The hump with a flash on its front, and a window beside it."""
+    """Return the viewfinder's hump with a flash on its front, and a window beside it."""
     width, height, depth, hump, side = size
     front = -depth / 2
     lean = front * 0.7 * 0.95
@@ -90,7 +90,7 @@ def _viewfinder(size: _Size, plate: Color) -> list[Part]:
 
 
 def _controls(size: _Size, plate: Color, rng: np.random.Generator) -> list[Part]:
-    """The shutter button and the dial, screen and eyepiece behind, tripod socket and battery lid below."""
+    """Return button and dial on top, screen and eyepiece on the back, tripod socket and battery lid at the bottom."""
     width, height, depth, hump, side = size
     back = depth / 2
     red = colors.linear(np.array([0.8, 0.1, 0.1])) if rng.uniform() < 0.6 else colors.steel(rng)

@@ -12,12 +12,22 @@ SHEET = 1.5  # mm, thickness of the steel
 
 
 def handle(rng: np.random.Generator, length: float, end: float, lift: float) -> tuple[Part, Color, float]:
-    """The handle from x = 0 on the table to x = `end` at height `lift`, its steel colour and the width of its neck."""
-    arch = length * rng.uniform(0.015, 0.05)  # handle's rise over length
-    wide = length * rng.uniform(0.075, 0.12)  # its end's width
-    neck = length * rng.uniform(0.032, 0.045)  # its neck's width
+    """Draw the handle of a fork or a spoon.
+
+    Args:
+        rng: Generator of the random dimensions and colours.
+        length: Length of the whole fork or spoon (mm).
+        end: x of the end of the handle at the neck (mm). The other end lies on the table at x = 0.
+        lift: Height of the neck above the table (mm).
+
+    Returns:
+        The handle, the colour of its steel and the width of its neck (mm).
+    """
+    arch = length * rng.uniform(0.015, 0.05)  # rise of the handle in its middle
+    wide = length * rng.uniform(0.075, 0.12)  # width of its end
+    neck = length * rng.uniform(0.032, 0.045)  # width of its neck
     steel = colors.steel(rng)
-    coloured = rng.uniform() < 0.35  # a third have a coloured handle, thicker than the steel
+    coloured = rng.uniform() < 0.35  # a third of the handles are coloured, and thicker than the steel
     tint = colors.vivid(rng) if coloured else steel
 
     profile = PchipInterpolator(np.array([0.0, 0.35, 0.8, 1.0]) * end, [0.0, arch, 0.95 * lift, lift])

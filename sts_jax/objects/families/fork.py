@@ -10,18 +10,18 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The fork, lying, with the tines towards +x."""
+    """Draw a fork that lies on the table with its tines towards +x."""
     longest = rng.uniform(90, 130)  # mm
     length = 125.0
     tines = int(rng.integers(3, 5))  # 3 or 4
-    head = length * rng.uniform(0.15, 0.2)  # head's width
-    reach = length * rng.uniform(0.2, 0.28)  # tines' length
-    palm = length * rng.uniform(0.1, 0.15)  # neck to the roots of the tines
-    curl = length * rng.uniform(0.035, 0.07)  # how far the tips curl up
-    drop = length * rng.uniform(0.05, 0.09)  # how far the neck stands above the table
+    head = length * rng.uniform(0.15, 0.2)  # width of the head
+    reach = length * rng.uniform(0.2, 0.28)  # length of the tines
+    palm = length * rng.uniform(0.1, 0.15)  # from the neck to the roots of the tines
+    curl = length * rng.uniform(0.035, 0.07)  # height of the tips above the table
+    drop = length * rng.uniform(0.05, 0.09)  # height of the neck above the table
     end = length - reach - palm
     grip, steel, neck = handle(rng, length, end, drop)
-    # The middle line: from the neck down to the table, then up to the tips.
+    # The middle line runs from the neck down to the table, then up to the tips.
     line = PchipInterpolator([end, end + 0.75 * palm, end + palm, length], [drop, 0.04 * drop, 0.0, curl])
     square = shapes.rectangle(1.0, 1.0)
 

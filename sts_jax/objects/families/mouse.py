@@ -1,4 +1,4 @@
-"""Computer mice: a shell with keys and a wheel, some with the first centimetre of a cable."""
+"""Computer mice: a shell with keys and a wheel. Some have the first centimetre of a cable."""
 
 import numpy as np
 
@@ -7,14 +7,14 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The mouse, with the keys towards -y."""
-    longest = rng.uniform(60, 110)  # mm, with a cable's first centimetre
+    """Draw a computer mouse whose keys face -y."""
+    longest = rng.uniform(60, 110)  # mm, including the first centimetre of a cable
     length = 100.0
     width = length * rng.uniform(0.54, 0.7)
     height = length * rng.uniform(0.3, 0.42)
     peak = rng.uniform(-0.35, 0.05)  # position of the highest point, -1 (back) to 1 (front)
-    waist = rng.uniform(0.0, 0.12)
-    split = rng.uniform(0.0, 0.2)  # where the keys begin
+    waist = rng.uniform(0.0, 0.12)  # narrowing of the sides, as a share of the width
+    split = rng.uniform(0.0, 0.2)  # position where the keys begin, -1 (back) to 1 (front)
     corded = rng.uniform() < 0.5
 
     shell = colors.dark(rng) if rng.uniform() < 0.4 else colors.pale(rng) if rng.uniform() < 0.6 else colors.vivid(rng)
@@ -43,7 +43,7 @@ def parts(rng: np.random.Generator) -> list[Part]:
         share = (u - stations[i]) / (stations[i + 1] - stations[i])
         return coarse[i] * (1 - share) + coarse[i + 1] * share
 
-    # Seams are cut into the coarse faces, so that no vertex leaves their hull.
+    # Seams are cut into the coarse faces, so that no vertex lies outside their convex hull.
     along = np.sort([*stations, split, split + 0.02])
     rows = np.stack([between(u) for u in along])
     left, right = rows[:, 2:3], rows[:, 3:4]

@@ -1,4 +1,4 @@
-"""Scissors: two blades that are partly open, with a finger ring each."""
+"""Scissors, partly open: two blades with one finger ring each."""
 
 import numpy as np
 
@@ -8,16 +8,16 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The scissors, lying, with the tips towards +y."""
+    """Draw scissors that lie on the table with their tips towards +y."""
     longest = rng.uniform(80, 130)  # mm
-    blade = rng.uniform(42, 66)  # mm, pivot to tip
-    half = np.radians(rng.uniform(12, 40)) / 2  # degrees between the blades
-    broad = rng.uniform(7, 11)  # mm, blade's width at the pivot
-    ring = rng.uniform(8.5, 12)  # mm, half the finger hole's width
-    oval = rng.uniform(1.0, 1.6)  # its length over its width
-    shank = rng.uniform(10, 20)  # mm, pivot to the ring
-    tube = rng.uniform(2.2, 3.0)  # mm, half the ring's breadth
-    deep = rng.uniform(2.6, 3.6)  # mm, half the ring's height
+    blade = rng.uniform(42, 66)  # mm, from the pivot to the tip
+    half = np.radians(rng.uniform(12, 40)) / 2  # rad, half the angle between the blades
+    broad = rng.uniform(7, 11)  # mm, width of a blade at the pivot
+    ring = rng.uniform(8.5, 12)  # mm, half the width of a finger hole
+    oval = rng.uniform(1.0, 1.6)  # length of the finger hole over its width
+    shank = rng.uniform(10, 20)  # mm, from the pivot to the ring
+    tube = rng.uniform(2.2, 3.0)  # mm, half the thickness of the ring in the plane
+    deep = rng.uniform(2.6, 3.6)  # mm, half the height of the ring
     steel = colors.steel(rng)
     grip = colors.vivid(rng) if rng.uniform() < 0.8 else colors.dark(rng)
 

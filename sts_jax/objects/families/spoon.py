@@ -9,15 +9,15 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The spoon, lying, with the bowl towards +x."""
+    """Draw a spoon that lies on the table with its bowl towards +x."""
     longest = rng.uniform(90, 130)  # mm
     length = 125.0
-    bowl = length * rng.uniform(0.29, 0.38)  # bowl's length
-    width = bowl * rng.uniform(0.62, 0.82)  # its width over its length
-    sunk = rng.uniform(0.2, 0.32)  # its depth over its width
-    egg = rng.uniform(0.05, 0.22)  # how much narrower towards the tip
+    bowl = length * rng.uniform(0.29, 0.38)  # length of the bowl
+    width = bowl * rng.uniform(0.62, 0.82)  # width of the bowl
+    sunk = rng.uniform(0.2, 0.32)  # depth of the bowl over its width
+    egg = rng.uniform(0.05, 0.22)  # narrowing of the bowl towards the tip
     depth = sunk * width
-    rim = depth + SHEET / 2  # so that bowl and handle touch the table
+    rim = depth + SHEET / 2  # height of the rim, so that bowl and handle touch the table
     grip, steel, _ = handle(rng, length, length - bowl + 2.0, rim)
     c, s = shapes.circle(1.0, 14).T
 

@@ -11,23 +11,23 @@ STRAP = 2.2  # mm, thickness of the strap before the watch is scaled to its leng
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The watch, with the dial upwards and twelve o'clock towards +y."""
-    longest = rng.uniform(95, 130)  # mm, a small watch
-    radius = rng.uniform(15, 20)  # mm, of the case
-    thick = rng.uniform(7, 11)
-    band = radius * rng.uniform(0.9, 1.25)  # strap's width
-    narrow = rng.uniform(0.7, 0.95)  # its end's width over that
-    power = 2.0 if rng.uniform() < 0.7 else rng.uniform(3.0, 4.5)  # round, or squarish for a third
-    uneven = rng.uniform(0.45, 0.6)  # share of the strap half with holes
+    """Draw a watch whose dial faces up, with twelve o'clock towards +y."""
+    longest = rng.uniform(95, 130)  # mm, shorter than most real watches, to fit on the pad
+    radius = rng.uniform(15, 20)  # mm, radius of the case
+    thick = rng.uniform(7, 11)  # mm, thickness of the case
+    band = radius * rng.uniform(0.9, 1.25)  # width of the strap at the case
+    narrow = rng.uniform(0.7, 0.95)  # width of the strap's ends over `band`
+    power = 2.0 if rng.uniform() < 0.7 else rng.uniform(3.0, 4.5)  # round, or nearly square for a third
+    uneven = rng.uniform(0.45, 0.6)  # share of the strap's length in the half with holes
     metal = colors.steel(rng) if rng.uniform() < 0.6 else colors.hsv(0.115, 0.55, 0.83)
-    links = rng.uniform() < 0.35  # a third have a bracelet of links
+    links = rng.uniform() < 0.35  # a third of the watches have a bracelet of links
     strap = metal * 0.8 if links else _leather(rng)
     face = colors.WHITE if rng.uniform() < 0.5 else colors.dark(rng) if rng.uniform() < 0.5 else colors.vivid(rng) * 0.7
 
     pieces = [*_case(radius, thick, power, metal, face), *_dial(radius, thick - 0.9, face, metal, rng)]
     pieces += _crown_and_back(radius, thick, power, metal)
     for side, share in ((1, uneven), (-1, 1 - uneven)):
-        # From the lugs down to the table. The half towards +y ends in a tip, the other one in the buckle.
+        # Each half runs from the case down to the table. The half towards +y ends in a tip, the other in the buckle.
         reach = (longest - 2 * radius) * share
         t = np.linspace(0, 1, 9)
         y = side * (radius * 0.86 + (reach + radius * 0.14) * t)
@@ -50,14 +50,14 @@ def parts(rng: np.random.Generator) -> list[Part]:
 
 
 def _leather(rng: np.random.Generator) -> Color:
-    """The colour of a strap: brown, vivid or dark."""
+    """Draw the colour of a strap: brown, vivid or dark."""
     if rng.uniform() < 0.4:
         return colors.hsv(0.07, 0.7, 0.4)
     return colors.vivid(rng) if rng.uniform() < 0.6 else colors.dark(rng)
 
 
 def _case(radius: float, thick: float, power: float, metal: Color, face: Color) -> list[Part]:
-    """The case with a recessed dial."""
+    """Return the case with a recessed dial."""
     outline = shapes.ellipse(radius, radius, 16, power)
     rim, dial = thick, thick - 0.9
     levels = [(0.86, 0.0), (1.0, 0.35 * thick), (1.0, 0.7 * thick), (0.92, rim), (0.8, rim), (0.78, dial)]
@@ -67,7 +67,7 @@ def _case(radius: float, thick: float, power: float, metal: Color, face: Color) 
 
 
 def _dial(radius: float, height: float, face: Color, metal: Color, rng: np.random.Generator) -> list[Part]:
-    """Marks of the hours and two hands that show a random time, on the dial at a height."""
+    """Return the marks of the hours and two hands that show a random time, on the dial at a height (mm)."""
     ink = colors.BLACK if face.mean() > 0.3 else colors.WHITE
     marks = []
     for hour in range(12):
@@ -82,7 +82,7 @@ def _dial(radius: float, height: float, face: Color, metal: Color, rng: np.rando
 
 
 def _crown_and_back(radius: float, thick: float, power: float, metal: Color) -> list[Part]:
-    """The crown at three o'clock, and the plate below the case."""
+    """Return the crown at three o'clock, and the plate below the case."""
     crown = shapes.lathe([(1.6, 0), (1.6, 1.2), (2.3, 1.3), (2.3, 3.4)], metal * 0.8, num=10, ends=(None, metal))
     return [
         shapes.move(crown, (radius - 0.4, 0, 0.52 * thick), axis="x"),
@@ -92,7 +92,7 @@ def _crown_and_back(radius: float, thick: float, power: float, metal: Color) -> 
 
 
 def _holes(places: list[float]) -> list[Part]:
-    """Holes of the strap at some y, painted on both sides."""
+    """Return holes of the strap at several y (mm), painted on both sides."""
     spot = shapes.circle(1.0, 8)
     return [
         shapes.decal(spot, colors.BLACK, (0, y, height), axis=axis)
@@ -102,7 +102,7 @@ def _holes(places: list[float]) -> list[Part]:
 
 
 def _buckle(width: float, end: float, metal: Color) -> list[Part]:
-    """The buckle: a frame of three bars and a pin around the strap's end at y = `end`."""
+    """Return the buckle, a frame of three bars and a pin around the strap's end at y = `end` (mm)."""
     bars = (
         ((width, 1.8, STRAP), (0, end - 5.0, STRAP / 2)),
         ((1.8, 7.0, STRAP), (width / 2 - 0.9, end - 2.0, STRAP / 2)),

@@ -7,15 +7,15 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """The webcam, with the lens towards -y."""
+    """Draw a webcam whose lens faces -y."""
     longest = rng.uniform(55, 90)  # mm
-    ball = rng.uniform() < 0.5  # half have a ball as the head, half a bar
-    head = rng.uniform(13, 18)  # mm, half the head's height
-    stretch = rng.uniform(2.1, 3.2)  # a bar's half width over its half height
-    neck = head * rng.uniform(0.4, 1.2)
-    foot = head * rng.uniform(1.1, 1.7)  # half the foot's width
-    foot_depth = rng.uniform(0.7, 1.0)  # its depth over its width
-    eye = head * rng.uniform(0.5, 0.68)  # lens radius
+    ball = rng.uniform() < 0.5  # the head is a ball for half of the webcams, else a bar
+    head = rng.uniform(13, 18)  # half the height of the head
+    stretch = rng.uniform(2.1, 3.2)  # half the width of a bar over half its height
+    neck = head * rng.uniform(0.4, 1.2)  # length of the stalk between foot and head
+    foot = head * rng.uniform(1.1, 1.7)  # half the width of the foot
+    foot_depth = rng.uniform(0.7, 1.0)  # depth of the foot over its width
+    eye = head * rng.uniform(0.5, 0.68)  # radius of the lens
     shell = colors.dark(rng) if rng.uniform() < 0.4 else colors.pale(rng) if rng.uniform() < 0.5 else colors.vivid(rng)
     trim, base = colors.vivid(rng) if rng.uniform() < 0.5 else colors.steel(rng), colors.dark(rng)
 
@@ -42,7 +42,7 @@ def parts(rng: np.random.Generator) -> list[Part]:
             for row in (-1, 0, 1):
                 place = (side * 0.66 * stretch * h, front, centre + row * 0.36 * h)
                 pieces.append(shapes.decal(slot, ink, place, axis="-y"))
-    # A round stalk on a flat foot, and the cable behind.
+    # A round stalk on a flat foot, and the cable behind the stalk.
     stalk = [(4.4, thick), (3.4, thick + 0.5 * neck), (4.6, centre - 0.6 * h)]
     plate = shapes.rings(shapes.ellipse(foot, foot * foot_depth, 12, 2.6), [(1.0, 0.0), (0.84, thick)])
     t = np.linspace(0, 1, 7)
