@@ -356,6 +356,7 @@ def load(folder: str | Path) -> Dataset:
 
 
 def _read(path: Path, remedy: str | None = None) -> Any:
+    """Read a JSON file of a dataset. Errors name the file and the remedy."""
     if path.parent.exists() and not path.parent.is_dir():
         raise NotADirectoryError(f"{path.parent} is a file: give the folder of a collected dataset.")
     try:
@@ -367,6 +368,7 @@ def _read(path: Path, remedy: str | None = None) -> Any:
 
 
 def _whole_number(collection: dict, name: str, path: Path) -> int:
+    """A field of `collection.json`, which must be a whole number of at least 1."""
     value = collection.get(name)
     if type(value) is not int or value < 1:
         raise TornFileError(

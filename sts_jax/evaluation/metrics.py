@@ -1,6 +1,6 @@
 """Metrics of predictions for n items. An item is one held-out trajectory.
 
-The errors are per item, and the means over items take weights, which the bootstrap varies.
+Errors are arrays with one number per item. Means over items accept weights of the items, which the bootstrap varies.
 
 Predicted images are probabilities p, and the true images (targets) are grey values x, both in [0, 1]. The binary
 cross-entropy of a value is `BCE(x, p) = -x log p - (1 - x) log(1 - p)`. Its minimum is the entropy H(x) of the target:
@@ -84,20 +84,43 @@ def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | N
 
 
 def position_error(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Distances between the positions (m) of predicted and true poses `(n, 7)`, `(n,)`."""
+    """Compute the distances between predicted and true positions.
+
+    Args:
+        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        target: True poses, `(n, 7)`.
+
+    Returns:
+        Distances (m), `(n,)`.
+    """
     return np.linalg.norm(predicted[:, :3] - target[:, :3], axis=-1)
 
 
 def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Angles in [0, pi] between the orientations of predicted and true poses `(n, 7)`, `(n,)`."""
+    """Compute the angles between predicted and true orientations.
+
+    Args:
+        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        target: True poses, `(n, 7)`.
+
+    Returns:
+        Angles (rad), from 0 to pi, `(n,)`.
+    """
     dot = np.abs((predicted[:, 3:].astype(np.float64) * target[:, 3:]).sum(-1))
     return 2 * np.arccos(np.minimum(dot, 1))
 
 
 def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Angles in [0, pi] between the up axes (z axes of the objects) of predicted and true poses `(n, 7)`, `(n,)`.
+    """Compute the angles between predicted and true up axes, which are the z axes of the objects.
 
     A rotation about the up axis has no effect. It is invisible for round objects.
+
+    Args:
+        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        target: True poses, `(n, 7)`.
+
+    Returns:
+        Angles (rad), from 0 to pi, `(n,)`.
     """
     w, x, y, z = (np.stack([predicted, target])[..., i].astype(np.float64) for i in range(3, 7))
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], -1)
