@@ -67,7 +67,7 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
         np.testing.assert_array_equal(data.members(part, rendered=False), whole.members(part))
     for one, other in zip(data.pairs(np.array([4])), whole.pairs(np.array([4])), strict=True):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(ValueError, match=r"trajectories holds 3, which has no images \(num_rendered=1\): use `ends`"):
+    with pytest.raises(ValueError, match=r"trajectories contains 3, which has no images \(num_rendered=1\): use"):
         data.pairs(np.array([2, 3]))
     rows = evaluation.rows_of(data, "trajectory")
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), data.rendered())
@@ -195,8 +195,8 @@ def swap(one, other):
     ("endings", "message"),
     [
         ((".array_record",), r"00000-of-00002\.array_record is damaged or belongs to another shard"),
-        ((".npz",), r"00000-of-00002\.npz holds shard 1 instead of shard 0"),
-        ((".array_record", ".npz"), r"00000-of-00002\.npz holds shard 1 instead of shard 0"),
+        ((".npz",), r"00000-of-00002\.npz is shard 1 instead of shard 0"),
+        ((".array_record", ".npz"), r"00000-of-00002\.npz is shard 1 instead of shard 0"),
     ],
 )
 def test_swapped_shards_are_refused(copied, endings, message):
@@ -231,8 +231,8 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
             "object . must be in one part, but it occurs 2 times",
         ),
         (lambda split: split["train"].pop(), "object . must be in one part, but it occurs 0 times"),
-        (lambda split: split["test"].append(4), "test holds object 4, but the objects are 0 to 3"),
-        (lambda split: split["test"].append(-1), "test holds object -1"),
+        (lambda split: split["test"].append(4), "test contains object 4, but the objects are 0 to 3"),
+        (lambda split: split["test"].append(-1), "test contains object -1"),
         (lambda split: split["test"].append(1.5), "test must be a list of whole numbers"),
         (lambda split: split.pop("validation"), "must have the parts train, validation, test, got 'train', 'test'"),
         (lambda split: split.update(other=[]), "must have the parts train, validation, test, got .*'other'"),
@@ -257,7 +257,7 @@ def test_an_invalid_split_is_refused(copied, change, message):
         ("split.json", b"7", r"split\.json must have the parts train, validation, test, got a int"),
         ("collection.json", None, r"collection\.json is missing: .* is not a collected dataset"),
         ("collection.json", b"\xff", r"collection\.json cannot be read as JSON"),
-        ("collection.json", b"[]", r"collection\.json holds no collection"),
+        ("collection.json", b"[]", r"collection\.json does not describe a collection"),
         (
             "collection.json",
             b'{"format": 4}',
@@ -298,7 +298,7 @@ def test_an_older_dataset_must_be_collected_again(copied, older):
 
 @pytest.mark.parametrize("given", [[99], [-1], [0.5], [True, False], 0, "a"])
 def test_trajectories_that_do_not_exist_are_named(folder, given):
-    with pytest.raises(ValueError, match=r"trajectories (has the type|holds)"):
+    with pytest.raises(ValueError, match=r"trajectories (has the type|contains)"):
         inspect.unwrap(type(dataset.load(folder)).pairs)(dataset.load(folder), given)
 
 

@@ -34,7 +34,7 @@ def test_views_after_frames_are_read_in_the_given_order(tmp_path):
     records.write_images(path, [images, (views,)])
     back = records.read_views(path, np.array([7, 5]), resolution=(9, 7), total=8)
     np.testing.assert_array_equal(back, views[[2, 0]])
-    with pytest.raises(dataset.TornFileError, match=r"holds 8 records instead of 5"):
+    with pytest.raises(dataset.TornFileError, match=r"has 8 records instead of 5"):
         records.read_images(path, np.arange(5), resolution=(9, 7), total=5)
 
 
@@ -135,7 +135,7 @@ def test_both_files_of_another_shard_are_refused(tmp_path):
     one, other = shard(tmp_path, 0), shard(tmp_path, 1)
     for ending in (".array_record", ".npz"):
         one.with_suffix(ending).write_bytes(other.with_suffix(ending).read_bytes())
-    with pytest.raises(dataset.TornFileError, match=r"0\.npz holds shard 1 instead of shard 0: delete 0\.npz and"):
+    with pytest.raises(dataset.TornFileError, match=r"0\.npz is shard 1 instead of shard 0: delete 0\.npz and"):
         records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
 
 

@@ -63,7 +63,7 @@ def test_a_ceiling_of_the_first_items_is_compared_with_the_constant_on_these(sco
     assert summary["predictors"][evaluation.CEILING]["visual_skill"]["value"] == pytest.approx(skill)
     assert set(summary["differences"]) == {"model"}
     text = evaluation.table(summary, title="t")
-    assert f"{evaluation.CEILING}: the first 2 of them." in text
+    assert f'The metrics of "{evaluation.CEILING}" are over the first 2 trajectories.' in text
 
 
 def test_both_tables_have_their_columns(summary):
@@ -73,21 +73,23 @@ def test_both_tables_have_their_columns(summary):
 
     (short,) = heads(evaluation.table(summary, title="t"))
     assert short == [
-        *("predictor", "visual skill", "on object", "tactile skill", "position on pad, mean / median (mm)"),
-        *("axis on pad (deg)", "outcome, balanced accuracy / log loss (nats)", "energy score (mm) / coverage of 90 %"),
+        *("predictor", "visual skill", "visual skill on the object", "tactile skill"),
+        *("position on pad, mean / median (mm)", "up axis on pad (deg)"),
+        *("outcome, balanced accuracy / log loss (nats)", "energy score (mm) / coverage of 90 %"),
     ]
     complete, differences = heads(evaluation.full_table(summary, title="t"))
     assert complete == [
-        *("predictor", "visual BCE", "visual excess x1e-4", "visual skill", "visual on object"),
+        *("predictor", "visual BCE", "visual excess x1e-4", "visual skill", "visual skill on the object"),
         *("visual skill, best sample", "sharpness", "tactile BCE", "tactile excess x1e-4", "tactile skill"),
-        *("tactile on object", "position (mm)", "position, median (mm)", "position on pad (mm)"),
+        *("tactile skill on the object", "position (mm)", "position, median (mm)", "position on pad (mm)"),
         *("position on pad, median (mm)", "energy score (mm)", "coverage of 90 %", "angle (deg)", "angle on pad (deg)"),
-        *("axis (deg)", "axis on pad (deg)", "axis on pad, median (deg)", "outcome, balanced accuracy"),
+        *("up axis (deg)", "up axis on pad (deg)", "up axis on pad, median (deg)", "outcome, balanced accuracy"),
         *("log loss (nats)", "calibration error", "ROC area of falling off"),
     ]
     assert differences == [
-        *("predictor", "against", "visual skill", "visual on object", "tactile skill", "tactile on object"),
-        *("position on pad (mm)", "energy score (mm)", "axis on pad (deg)", "log loss (nats)"),
+        *("predictor", "baseline", "visual skill", "visual skill on the object", "tactile skill"),
+        *("tactile skill on the object", "position on pad (mm)", "energy score (mm)", "up axis on pad (deg)"),
+        "log loss (nats)",
     ]
     hidden = {f"{stream}_{kind}_object" for stream in ("visual", "tactile") for kind in ("bce", "excess")}
     assert (

@@ -1,4 +1,4 @@
-"""Datasets on disk: `collect` writes them shard by shard, `load` reads them as arrays."""
+"""Datasets on disk: `collect` simulates, renders and writes them, and `load` reads them as arrays."""
 
 from sts_jax._files import LockedError as LockedError
 from sts_jax._files import TornFileError as TornFileError

@@ -1,4 +1,8 @@
-"""Collect a dataset: objects, trajectories and frames. Each shard is a pure function of the collection and sensor."""
+"""Collection of a dataset: it makes the objects, simulates the trajectories and renders the frames.
+
+A dataset consists of shards. A shard is a pair of files for some of the objects. Its content is a pure function of the
+collection, the sensor and the index of the shard, so a missing shard can be made again at any time.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -24,18 +28,18 @@ from sts_jax.sensor import Sensor
 
 
 class Collected(NamedTuple):
-    """Summary of a whole dataset, as `collect` returns it."""
+    """Summary of a collected dataset, which `collect` returns."""
 
-    resampled: int  # number of discarded draws of trajectories
-    left_out: tuple[str, ...]  # one line for each object that was left out
+    resampled: int  # number of trajectories that were discarded and drawn again
+    left_out: tuple[str, ...]  # one line for each object that the dataset lacks, with the reason
 
 
 class Progress(NamedTuple):
-    """Progress of `collect`."""
+    """Progress of `collect` in one of its two stages, which alternate from shard to shard."""
 
-    done: int  # finished trajectories or frames
-    total: int
-    stage: str  # "trajectories" or "frames"
+    done: int  # finished trajectories of the dataset, or finished images of the current shard
+    total: int  # all trajectories of the dataset, or all images of the current shard
+    stage: str  # "trajectories" for the simulation, "frames" for the rendering
 
 
 def collect(
@@ -45,23 +49,27 @@ def collect(
     *,
     progress: Callable[[Progress], None] | None = None,
 ) -> Collected:
-    """Make every shard of a dataset that does not exist yet.
+    """Simulate and render a dataset, and write it to a folder.
+
+    The function makes only the shards that the folder lacks. The same call therefore resumes an interrupted collection.
 
     Args:
         collection: The description of the dataset.
-        sensor: The sensor that renders the frames.
-        folder: The folder for the shards, `collection.json`, `sensor.json` (for `Sensor.load`) and `split.json`.
-        progress: Called as trajectories and frames are finished.
+        sensor: The sensor for the simulation and the images.
+        folder: The folder of the dataset, created if it is missing. It receives the shards, `collection.json`,
+            `sensor.json` (for `Sensor.load`) and `split.json`.
+        progress: Function that is called when some trajectories or frames are finished.
 
     Returns:
-        For the whole dataset, the number of draws that were discarded because the trajectory became non-finite or the
-        object sank too deep, and the objects that were left out because all their draws failed or because they
-        could not be made.
+        Summary of the whole dataset, including shards of earlier calls. A trajectory is discarded and drawn again if it
+        becomes non-finite or the object sinks too deep into the pad. An object is left out if it cannot be made or
+        cannot be simulated.
 
     Raises:
-        ValueError: A constant of the sensor or a field of the collection is out of range, the folder holds another
-            collection (the message names the field) or one of an older format, the pad does not have the scenario's
-            symmetries, or no object of a shard can be simulated.
+        ValueError: A constant of the sensor or a field of the collection is out of range, the pad lacks the symmetries
+            of the scenario, or no object of a shard can be simulated. The error is also raised if the folder contains a
+            dataset of another collection, sensor or format. The message names the constant, the field or the file.
+        ImportError: `collection.parts` or a mesh file needs a package that is not installed.
         LockedError: Another process collects into the folder.
         TornFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.
         OSError: The disk is full, or the folder cannot be written to.
@@ -75,7 +83,7 @@ def collect(
 def _collect(
     collection: Collection, sensor: Sensor, folder: Path, progress: Callable[[Progress], None] | None
 ) -> Collected:
-    """Collect into a folder that is locked."""
+    """Do the work of `collect` in a folder that this process has locked."""
     description, constants, path = as_json(collection), sensor.constants(), folder / "collection.json"
     if path.exists():
         records.check_format(read_json(path, f"delete {folder} and collect again"), folder)
@@ -104,7 +112,7 @@ def _make_shard(
     identity: records.Identity,
     progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Write the shard with the index of an identity."""
+    """Simulate, render and write one shard. Its index is `identity.shard`."""
     index, first = identity.shard, identity.shard * collection.objects_per_shard
     members = np.arange(first, min(first + collection.objects_per_shard, collection.num_objects))
     key = jax.random.fold_in(jax.random.key(collection.seed), collection.num_objects + index)
@@ -113,7 +121,10 @@ def _make_shard(
     found, trajectory, failed = _simulated(collection, sensor, key, found, report)
     left_out += failed
     if trajectory is None:
-        raise ValueError(f"{folder}: no object of shard {index} can be simulated: {left_out[-1]}")
+        raise ValueError(
+            f"{folder}: no object of shard {index} can be simulated, for example {left_out[-1]}: use other objects or "
+            "another scenario"
+        )
     members, bodies = np.array(list(found)), list(found.values())
     frames = _frames_of(collection, members, trajectory)
     views = _views_of(collection, key, bodies, sensor)
@@ -130,7 +141,12 @@ def _simulated(
     bodies: dict[int, objects.Body],
     report: Callable[[int], None],
 ) -> tuple[dict[int, objects.Body], physics.Trajectory | None, list[str]]:
-    """The objects that can be simulated, their trajectories (None without objects), and a line for each other one."""
+    """Simulate some objects, and leave out those that cannot be simulated.
+
+    Returns:
+        The simulated objects by index, their trajectories (None if no object is left), and one line for each object
+        that was left out.
+    """
     bodies = dict(bodies)
     failed: list[str] = []
     while bodies:
@@ -155,7 +171,7 @@ def _simulated(
 def _arrays(
     members: np.ndarray, bodies: list[objects.Body], trajectory: physics.Trajectory, views: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """The arrays of a shard. Bodies are counted in the collection instead of in the shard."""
+    """The arrays of a shard. Its indices of bodies become indices of objects in the collection."""
     arrays = {f"trajectory/{name}": leaf for name, leaf in trajectory._asdict().items() if name != "hidden"}
     arrays |= {f"hidden/{name}": leaf for name, leaf in trajectory.hidden._asdict().items()}
     arrays["trajectory/body"] = members[arrays["trajectory/body"]].astype(np.int32)
@@ -169,7 +185,7 @@ def _arrays(
 
 
 def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, objects.Body], list[str]]:
-    """Objects by index, and a line for each that cannot be made, such as one whose file was deleted meanwhile."""
+    """Make objects. Return them by index, and one line for each that cannot be made (such as a deleted file)."""
     bodies, left_out = {}, []
     for number in members.tolist():
         try:
@@ -180,17 +196,18 @@ def _made(collection: Collection, members: np.ndarray) -> tuple[dict[int, object
 
 
 def _named(collection: Collection, number: int) -> str:
-    """The name of an object in a message."""
+    """The index of an object and its class or mesh file, for messages."""
     name = class_names(collection)[number] if collection.meshes is None else collection.meshes.names[number]
     return f"object {number} ({name})"
 
 
 def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.Trajectory) -> np.ndarray:
-    """The frames to render, as rows of (trajectory, frame, symmetry). Trajectories are counted within the shard."""
+    """The frames to render, as rows (index of the trajectory in the shard, frame, symmetry), int `(m, 3)`."""
     num, last = trajectory.pose.shape[0], trajectory.pose.shape[1] - 1
     rows: list[tuple[int, int, int]] = []
     for i in range(num):
-        # Full trajectories are spread over the objects: the first one of each, then the second one of each, ...
+        # The trajectories that are rendered in full are spread over the objects: the first one of each object, then the
+        # second one of each object, and so on.
         place, repeat = divmod(i, collection.num_per_object)
         if repeat >= collection.rendered_per_object:
             continue
@@ -199,12 +216,12 @@ def _frames_of(collection: Collection, members: np.ndarray, trajectory: physics.
         rows += [(i, t, 0) for t in (range(last + 1) if full else (0, last))]
         rows += [(i, t, symmetry) for symmetry in symmetries_of(collection) if symmetry for t in (0, last)]
     frames = np.array(rows, np.int32)
-    # Sorted by object and then by mirror image, because a call renders one body.
+    # Sorted by object, mirrored copies last. One call renders one body, and the mirrored object is another body.
     return frames[np.lexsort((frames[:, 2] >= 4, frames[:, 0] // collection.num_per_object))]
 
 
 def _solid(bodies: list[objects.Body], which: np.ndarray, hidden: physics.Hidden) -> dict[str, np.ndarray]:
-    """The true shape, mass (kg) and centre of mass (m, mesh frame) of each draw, float32."""
+    """Support function (m), mass (kg) and centre of mass (m, mesh frame) of the body of each trajectory or view."""
     rigid = physics.rigids(bodies, which, hidden)
     support = np.stack([objects.support(body) for body in bodies])
     return {"support": support[which], "mass": rigid.mass.astype(np.float32), "com": rigid.com.astype(np.float32)}
@@ -213,7 +230,7 @@ def _solid(bodies: list[objects.Body], which: np.ndarray, hidden: physics.Hidden
 def _views_of(
     collection: Collection, key: PRNGKeyArray, bodies: list[objects.Body], sensor: Sensor
 ) -> dict[str, np.ndarray]:
-    """The further starts to render: pose, index of the body in the shard, and `_solid`."""
+    """Draw the views of a shard: their poses, the indices of their bodies in the shard, and the arrays of `_solid`."""
     if not collection.num_views:
         shapes = {"pose": (0, 7), "support": (0, len(objects.DIRECTIONS)), "mass": (0,), "com": (0, 3)}
         return {"body": np.zeros(0, np.int32)} | {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
@@ -223,6 +240,8 @@ def _views_of(
 
 
 def _report(progress: Callable[[Progress], None] | None, before: int, total: int, stage: str) -> Callable[[int], None]:
+    """A function that reports `before` plus its argument to `progress`, if there is one."""
+
     def report(done: int) -> None:
         if progress is not None:
             progress(Progress(before + done, total, stage))

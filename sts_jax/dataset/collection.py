@@ -1,4 +1,4 @@
-"""The description of a dataset, and everything that follows from it alone: bodies, classes and the split by object."""
+"""`Collection` describes a dataset. Functions derive from it the objects, their classes and their split."""
 
 import dataclasses
 import math
@@ -11,32 +11,36 @@ from sts_jax.dataset import records
 from sts_jax.dataset.meshes import Meshes, open_library
 from sts_jax.sensor import Sensor
 
-PARTS = ("train", "validation", "test")  # of the split of the objects
+PARTS = ("train", "validation", "test")  # the parts into which the objects are split
 
 
 @dataclasses.dataclass(frozen=True)
 class Collection:
-    """Description of a dataset. Together with a `Sensor` it determines every byte of it.
+    """Description of a dataset. A collection and a `Sensor` determine every byte of the dataset.
 
-    The one exception are classes from outside the library, whose code the description names but does not contain.
+    Scenarios and procedural classes from outside the library are an exception. The description contains their names,
+    but not their code.
     """
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
-    categories: tuple[str, ...] = objects.CATEGORIES  # procedural classes, used in turn, see `objects.find_family`
-    meshes: Meshes | None = None  # objects from files instead (num_objects is their number)
-    parts: bool = False  # convex parts for objects whose hull fits badly (package coacd, ten seconds per object)
-    num_objects: int = 160
-    num_per_object: int = 4  # trajectories per object, each with new hidden values
-    num_full: int = 20  # trajectories with every frame rendered (other rendered ones: first and last frame)
-    num_rendered: int | None = None  # trajectories per object that have images, the first ones (None: all)
-    num_views: int = 0  # pictures per object at further starts, which are not simulated
-    symmetries: bool = True  # render first and last frames in all `scenario.symmetries`, or only as simulated
-    resolution: tuple[int, int] = (64, 64)  # height, width (pixels)
-    crop: bool = False  # the square around the object (the paper's view) instead of the whole pad
-    shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # of the objects for training, validation and test
-    objects_per_shard: int = 40
-    seed: int = 0
-    engine: physics.Engine = "mujoco"  # see `physics.simulate` (trajectories differ between engines)
+    # procedural classes, one object of each in turn (`objects.find_family` describes the allowed names)
+    categories: tuple[str, ...] = objects.CATEGORIES
+    # objects from mesh files, listed by `survey_meshes`, instead of procedural ones (num_objects must be their number)
+    meshes: Meshes | None = None
+    # split an object into convex parts if its hull fits badly (needs the package coacd, about ten seconds per object)
+    parts: bool = False
+    num_objects: int = 160  # number of objects
+    num_per_object: int = 4  # trajectories per object, each with newly drawn hidden values such as mass and friction
+    num_full: int = 20  # number of trajectories with images of all frames (the others: of the first and last frame)
+    num_rendered: int | None = None  # number of trajectories per object with images, from the first one on (None: all)
+    num_views: int = 0  # additional visual images per object, in initial poses that are not simulated
+    symmetries: bool = True  # also render turned and mirrored copies of first and last frames (`scenario.symmetries`)
+    resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
+    crop: bool = False  # images show the square around the object, as in the paper, instead of the whole pad
+    shares: tuple[float, float, float] = (0.7, 0.1, 0.2)  # shares of objects for training, validation and test (sum 1)
+    objects_per_shard: int = 40  # number of objects in one shard, which is written as a whole or not at all
+    seed: int = 0  # seed of the objects, the trajectories and the split
+    engine: physics.Engine = "mujoco"  # physics engine, see `physics.simulate` (trajectories differ between engines)
 
     @property
     def num_trajectories(self) -> int:
@@ -54,20 +58,27 @@ class Collection:
         return math.ceil(self.num_objects / self.objects_per_shard)
 
     def check(self, sensor: Sensor) -> None:
-        """Raise an error unless the collection can be made with a sensor.
+        """Raise an error if a field is invalid, or if the sensor does not suit the collection.
+
+        Args:
+            sensor: The sensor, whose pad must have the symmetries of the scenario.
 
         Raises:
-            ValueError: A field is out of range, a category is unknown, or the pad lacks the scenario's symmetries. The
-                message names the field.
+            ValueError: A field is out of range, a category is unknown, or the pad lacks the symmetries. The message
+                names the field.
         """
         sides = [float(side) for side in sensor.gel.size]
         quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
         if quarter_turns and sides[0] != sides[1]:
-            raise ValueError(f"symmetries=True needs a square pad, got gel.size={sides}: give one, or symmetries=False")
+            raise ValueError(
+                f"symmetries=True needs a square pad, got gel.size={sides} m: give a sensor with a square pad, or set "
+                "symmetries=False"
+            )
         if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
             raise ValueError(f"shares is {self.shares}, but the shares of the objects must be >= 0 and have sum 1")
         if self.meshes is not None and self.num_objects != len(self.meshes.names):
-            raise ValueError(f"num_objects={self.num_objects}, but meshes has {len(self.meshes.names)} objects")
+            count = len(self.meshes.names)
+            raise ValueError(f"num_objects={self.num_objects}, but meshes has {count} objects: set num_objects={count}")
         if self.meshes is None and not self.categories:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
         for category in self.categories if self.meshes is None else ():
@@ -89,20 +100,28 @@ class Collection:
 
 
 def class_names(collection: Collection) -> tuple[str, ...]:
-    """The class of each object of a collection, `num_objects` names."""
+    """The class of each object of a collection, in the order of the objects."""
     if collection.meshes is not None:
         return collection.meshes.labels
     return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))
 
 
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
-    """Make objects of a collection, given their indices (n,).
+    """Make some objects of a collection.
 
-    A procedural object has a key of its own, so that object i does not depend on the other objects that are made.
+    Each procedural object has its own random key. Object i therefore does not depend on the other indices.
+
+    Args:
+        collection: The description of the dataset.
+        indices: Indices of the objects, int `(n,)`.
+
+    Returns:
+        The n objects, in the given order.
 
     Raises:
         FileNotFoundError: A mesh file no longer exists.
-        ValueError: No body can be made from an object.
+        ImportError: `collection.parts` or a mesh file needs a package that is not installed.
+        ValueError: An object cannot be made. The message gives the reason.
     """
     if collection.meshes is not None:
         library, where = open_library(collection.meshes, collection.parts)
@@ -119,7 +138,7 @@ def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Bod
 
 
 def head(collection: Collection, count: int) -> Collection:
-    """The collection of the first `count` objects only."""
+    """A copy of the collection that has only its first `count` objects."""
     meshes = collection.meshes
     if meshes is None:
         return dataclasses.replace(collection, num_objects=count)
@@ -128,9 +147,15 @@ def head(collection: Collection, count: int) -> Collection:
 
 
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
-    """Indices of the objects for training, validation and test, shuffled by the seed, with classes spread evenly."""
+    """Split the objects of a collection into parts for training, validation and test.
+
+    The split is random and depends on `collection.seed`. Each part has nearly the same proportions of the classes.
+
+    Returns:
+        Sorted indices of the objects for each of `train`, `validation` and `test`.
+    """
     rng = np.random.default_rng([collection.seed, 1])
-    # Each block has one object of every class that has one left, so that a cut spreads the classes evenly.
+    # Each block has one object of every class that is not used up, so the parts have equal proportions of the classes.
     names = np.array(class_names(collection))
     members = [rng.permutation(np.flatnonzero(names == name)) for name in dict.fromkeys(names.tolist())]
     blocks = [rng.permutation([m[i] for m in members if i < len(m)]) for i in range(max(map(len, members)))]
@@ -140,7 +165,12 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
 
 
 def symmetries_of(collection: Collection) -> tuple[int, ...]:
-    """Symmetries of the pad in which the first and last frames of a trajectory are rendered. 0 is the identity."""
+    """The symmetries of the pad in which the first and last frames of each trajectory are rendered.
+
+    Returns:
+        Numbers from 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then turns by s % 4 quarter turns
+        about z. 0 is the identity.
+    """
     return collection.scenario.symmetries if collection.symmetries else (0,)
 
 
@@ -149,7 +179,7 @@ def as_json(collection: Collection) -> dict:
     content = dataclasses.asdict(collection)
     scenario = collection.scenario
     content["scenario"] = {"name": type(scenario).__name__, **content["scenario"]}
-    # Left out where it is 1, so that the descriptions of older datasets, whose conditions have one vector, stay valid.
+    # Omitted if it is 1, because the descriptions of older datasets do not have this field and must stay valid.
     if scenario.quantities and scenario.vectors != 1:
         content["scenario"]["vectors"] = scenario.vectors
     return {"format": records.FORMAT, **content}

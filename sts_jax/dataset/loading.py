@@ -1,4 +1,4 @@
-"""Load a dataset as arrays: trajectories, rendered frames, and pairs of first and last moments."""
+"""Loading of a dataset as arrays: trajectories, rendered images, and pairs of first and last frames."""
 
 import dataclasses
 from pathlib import Path
@@ -14,59 +14,68 @@ from sts_jax.dataset.symmetry import turn, turn_condition
 
 
 class Pairs(NamedTuple):
-    """First and last moments of some trajectories, in memory. `n` is trajectories times symmetries."""
+    """First and last frames of some trajectories, in memory. The index along axis 1 is 0 for first and 1 for last.
 
-    visual: np.ndarray  # uint8 (n, 2, height, width, 3): first, last
-    tactile: np.ndarray  # uint8 (n, 2, height, width, 3)
-    segmentation: np.ndarray  # bool (n, 2, height, width)
-    pose: np.ndarray  # float32 (n, 2, 7)
-    contact: np.ndarray  # bool (n, 2): the pad pushes the object
-    condition: np.ndarray  # float32 (n, c): the scenario's input, SI units, turned like the pose
-    outcome: np.ndarray  # int32 (n,), physics.Outcome
-    object: np.ndarray  # int64 (n,), index of the object in the collection
-    trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
-    support: np.ndarray  # float32 (n, 128), m: `objects.support` of the body, or of the mirrored body
-    mass: np.ndarray  # float32 (n,), kg, with the trajectory's hidden values
-    com: np.ndarray  # float32 (n, 3), m, centre of mass in the mesh frame, mirrored like the body
+    `n` is the number of trajectories, multiplied by the number of symmetries if `Dataset.pairs` adds copies.
+    """
+
+    visual: np.ndarray  # uint8 (n, 2, height, width, 3): images of the visual stream
+    tactile: np.ndarray  # uint8 (n, 2, height, width, 3): images of the tactile stream
+    segmentation: np.ndarray  # bool (n, 2, height, width): pixels that show the object
+    pose: np.ndarray  # float32 (n, 2, 7): mesh frame in the sensor frame, position (m) and quaternion
+    contact: np.ndarray  # bool (n, 2): true if the pad pushes on the object
+    condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units), transformed like the pose
+    outcome: np.ndarray  # int32 (n,): number of the outcome, one of `Scenario.outcomes`
+    object: np.ndarray  # int32 (n,): index of the object in the collection
+    trajectory: np.ndarray  # int64 (n,): index of the trajectory in the dataset
+    support: np.ndarray  # float32 (n, 128): support function of the body or of its mirror image (m), `objects.support`
+    mass: np.ndarray  # float32 (n,): mass of the object with its contents (kg)
+    com: np.ndarray  # float32 (n, 3): centre of mass in the mesh frame (m), mirrored like the body
 
 
 class Ends(NamedTuple):
-    """First and last poses of some trajectories, with the true shape and mass, and without images."""
+    """First and last poses of some trajectories, with the true shapes and masses but without images."""
 
-    pose: np.ndarray  # float32 (n, 2, 7): first, last
-    condition: np.ndarray  # float32 (n, c): the scenario's input, SI units
-    outcome: np.ndarray  # int32 (n,), physics.Outcome
-    support: np.ndarray  # float32 (n, 128), m: `objects.support` of the body
-    mass: np.ndarray  # float32 (n,), kg, with the trajectory's hidden values
-    com: np.ndarray  # float32 (n, 3), m, centre of mass in the mesh frame
-    object: np.ndarray  # int64 (n,), index of the object in the collection
-    trajectory: np.ndarray  # int64 (n,), index of the trajectory in the dataset
+    pose: np.ndarray  # float32 (n, 2, 7): first and last pose, mesh frame in the sensor frame
+    condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units)
+    outcome: np.ndarray  # int32 (n,): number of the outcome, one of `Scenario.outcomes`
+    support: np.ndarray  # float32 (n, 128): support function of the body (m), see `objects.support`
+    mass: np.ndarray  # float32 (n,): mass of the object with its contents (kg)
+    com: np.ndarray  # float32 (n, 3): centre of mass in the mesh frame (m)
+    object: np.ndarray  # int64 (n,): index of the object in the collection
+    trajectory: np.ndarray  # int64 (n,): index of the trajectory in the dataset
 
 
 class Views(NamedTuple):
-    """Pictures of some objects at starts that are not simulated, in memory."""
+    """Visual images of some objects in initial poses that are not simulated, in memory."""
 
-    visual: np.ndarray  # uint8 (m, height, width, 3)
-    pose: np.ndarray  # float32 (m, 7)
-    support: np.ndarray  # float32 (m, 128), m: `objects.support` of the body
-    mass: np.ndarray  # float32 (m,), kg, with hidden values drawn for the view
-    com: np.ndarray  # float32 (m, 3), m, centre of mass in the mesh frame
-    object: np.ndarray  # int64 (m,), index of the object in the collection
+    visual: np.ndarray  # uint8 (m, height, width, 3): images of the visual stream
+    pose: np.ndarray  # float32 (m, 7): mesh frame in the sensor frame, position (m) and quaternion
+    support: np.ndarray  # float32 (m, 128): support function of the body (m), see `objects.support`
+    mass: np.ndarray  # float32 (m,): mass of the object with its contents, which are drawn for each view (kg)
+    com: np.ndarray  # float32 (m, 3): centre of mass in the mesh frame (m)
+    object: np.ndarray  # int64 (m,): index of the object in the collection
 
 
 def reduced(pairs: Pairs, size: int) -> Pairs:
-    """The same moments with images of a lower resolution, which are means over blocks of pixels.
+    """Reduce the images of pairs to a lower resolution, by means over square blocks of pixels.
 
     Args:
-        pairs: moments with square images.
-        size: pixels, new side of the images, which divides their present side.
+        pairs: Pairs with square images.
+        size: New side of the images (pixels). It must divide the present side.
+
+    Returns:
+        The pairs with smaller images. A pixel of the segmentation is true if at least half of its block is true.
 
     Raises:
-        ValueError: the images are not square, or their side is not a multiple of `size`.
+        ValueError: The images are not square, or their side is not a multiple of `size`.
     """
     height, width = pairs.visual.shape[2:4]
     if height != width or size < 1 or height % size:
-        raise ValueError(f"size is {size}, but it must divide the side of square images, got {height} x {width} pixels")
+        raise ValueError(
+            f"size is {size}, but the images are {height} x {width} pixels: they must be square, with a side that is a "
+            "multiple of size"
+        )
     return pairs._replace(
         visual=_means(pairs.visual, size),
         tactile=_means(pairs.tactile, size),
@@ -75,11 +84,20 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
 
 
 def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
-    """Reduce single square images `(side, side, channels)` as `reduced` does."""
+    """Reduce square images to a lower resolution, by means over square blocks of pixels.
+
+    Args:
+        images: Images by name, uint8 `(*n, side, side, channels)`.
+        size: New side of the images (pixels). It must divide the present side.
+
+    Returns:
+        The smaller images by name, uint8 `(*n, size, size, channels)`.
+    """
     return {name: _means(image, size) for name, image in images.items()}
 
 
 def _means(images: np.ndarray, size: int) -> np.ndarray:
+    """Means over blocks of pixels, rounded to the type of the images."""
     factor = images.shape[-2] // size
     blocks = images.reshape(*images.shape[:-3], size, factor, size, factor, images.shape[-1])
     return ((blocks.sum((-4, -2), dtype=np.uint32) + factor**2 // 2) // factor**2).astype(images.dtype)
@@ -87,24 +105,37 @@ def _means(images: np.ndarray, size: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """A dataset. Images are read on request, and everything else is in memory."""
+    """A dataset of `num` trajectories, opened by `load`. Images are read on request. All other data are in memory."""
 
     collection: dict  # content of collection.json
     identity: str  # SHA-256 of all collected data and of the split
-    split: dict[str, np.ndarray]  # name -> object indices
-    trajectory: dict[str, np.ndarray]  # leaves of physics.Trajectory, all shards: (num, ...)
-    hidden: dict[str, np.ndarray]  # leaves of physics.Hidden, (num,)
-    solid: dict[str, np.ndarray]  # support, mirrored (support of the mirrored body), mass, com: (num, ...)
-    view: dict[str, np.ndarray]  # pose, body, support, mass, com of each view: (k, ...)
-    frames: np.ndarray  # int (m, 3): trajectory, frame, symmetry of every stored image, in order of the shards
-    shards: tuple[Path, ...]
-    shard_of: np.ndarray  # int (m,): index of the shard of each stored image
-    record_of: np.ndarray  # int (m,): index of its record in the shard
+    split: dict[str, np.ndarray]  # indices of the objects in each part: `train`, `validation` and `test`
+    trajectory: dict[str, np.ndarray]  # fields of `physics.Trajectory` by name, each (num, ...)
+    hidden: dict[str, np.ndarray]  # fields of `physics.Hidden` by name, each (num, ...)
+    # `support`, `mass` and `com` of each trajectory as in `Pairs`, and `mirrored`, the support function of the mirrored
+    # body. Each is (num, ...).
+    solid: dict[str, np.ndarray]
+    view: dict[str, np.ndarray]  # `pose`, `body`, `support`, `mass` and `com` of each of the k views, each (k, ...)
+    frames: np.ndarray  # int (m, 3): trajectory, frame and symmetry of each stored frame, in the order of the shards
+    shards: tuple[Path, ...]  # file of the images of each shard
+    shard_of: np.ndarray  # int (m,): index of the shard of each stored frame
+    record_of: np.ndarray  # int (m,): index of the record of each stored frame in its shard
     view_shard_of: np.ndarray  # int (k,): index of the shard of each view
-    view_record_of: np.ndarray  # int (k,): index of its record in the shard
+    view_record_of: np.ndarray  # int (k,): index of the record of each view in its shard
 
     def images(self, rows: np.ndarray) -> records.Images:
-        """Read the images of some rows of `frames`, in the given order."""
+        """Read the images of some stored frames.
+
+        Args:
+            rows: Indices of rows of `frames`, int `(n,)`.
+
+        Returns:
+            The images of the n frames, in the given order.
+
+        Raises:
+            FileNotFoundError: A shard is missing.
+            TornFileError: A shard is damaged. The message names it.
+        """
         height, width = self.collection["resolution"]
         out = records.Images(
             np.empty((len(rows), height, width, 3), np.uint8),
@@ -131,25 +162,26 @@ class Dataset:
         return np.unique(self.frames[:, 0]).astype(np.int64)
 
     def full_trajectories(self) -> np.ndarray:
-        """Indices of the trajectories that have every frame rendered."""
+        """Indices of the trajectories that have images of every frame."""
         plain = self.frames[self.frames[:, 2] == 0]
         counts = np.bincount(plain[:, 0], minlength=len(self.trajectory["outcome"]))
         return np.flatnonzero(counts == self.trajectory["pose"].shape[1])
 
     def strip(self, trajectory: int) -> records.Images:
-        """Read every frame of one fully rendered trajectory, in time order."""
+        """Read the images of one trajectory of `full_trajectories`, given its index, in the order of time."""
         rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
         return self.images(rows[np.argsort(self.frames[rows, 1])])
 
     def members(self, part: str, *, rendered: bool = True) -> np.ndarray:
-        """Indices of the trajectories of `train`, `validation` or `test`.
+        """Indices of the trajectories of one part of the split.
 
         Args:
-            part: One of these names.
-            rendered: Whether to return only trajectories with images, which `pairs` loads. `ends` loads all.
+            part: Name of the part: `train`, `validation` or `test`.
+            rendered: True to return only the trajectories that have images, which `pairs` needs. False to return all
+                trajectories, of which `ends` returns the poses.
 
         Raises:
-            ValueError: The name is unknown.
+            ValueError: `part` is another name.
         """
         found = np.flatnonzero(np.isin(self.trajectory["body"], self._part(part)))
         return found[np.isin(found, self.rendered())] if rendered else found
@@ -160,10 +192,10 @@ class Dataset:
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
-        """First and last poses of some trajectories, with images or without. No image is read.
+        """First and last poses of some trajectories, which may lack images.
 
         Args:
-            trajectories: Their indices.
+            trajectories: Indices of the trajectories, int `(n,)`.
 
         Raises:
             ValueError: An index is not a whole number or is out of range.
@@ -181,13 +213,18 @@ class Dataset:
         )
 
     def views(self, part: str) -> Views:
-        """Pictures, possibly none, of the objects of `train`, `validation` or `test` at further starts.
+        """Read the visual images of the objects of one part in initial poses that are not simulated.
 
         Args:
-            part: One of these names.
+            part: Name of the part: `train`, `validation` or `test`.
+
+        Returns:
+            The images and poses, with m = 0 if the collection has `num_views=0`.
 
         Raises:
-            ValueError: The name is unknown.
+            ValueError: `part` is another name.
+            FileNotFoundError: A shard is missing.
+            TornFileError: A shard is damaged. The message names it.
         """
         rows = np.flatnonzero(np.isin(self.view["body"], self._part(part)))
         height, width = self.collection["resolution"]
@@ -204,33 +241,36 @@ class Dataset:
         return Views(visual, pose, support, mass, com, self.view["body"][rows].astype(np.int64))
 
     def _checked(self, trajectories: Any) -> np.ndarray:
-        """Indices of trajectories as int64. Raise a ValueError if they are invalid."""
+        """Return indices of trajectories as int64, or raise a ValueError if one is invalid."""
         trajectories, count = np.asarray(trajectories), len(self.trajectory["outcome"])
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
                 f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
-                "a list of indices (np.flatnonzero turns a mask into one)."
+                "a list of whole numbers (np.flatnonzero turns a mask into indices)."
             )
         outside = trajectories[(trajectories < 0) | (trajectories >= count)]
         if outside.size:
-            raise ValueError(f"trajectories holds {outside[0]}, but the dataset has trajectories 0 to {count - 1}.")
+            raise ValueError(f"trajectories contains {outside[0]}, but the dataset has trajectories 0 to {count - 1}.")
         return trajectories.astype(np.int64)
 
     def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
-        """First and last moments of some trajectories.
+        """Read the first and last frames of some trajectories, with the true shapes and masses.
 
         Args:
-            trajectories: Their indices.
-            symmetries: Whether to add the turned and mirrored copies that the collection rendered.
+            trajectories: Indices of the trajectories, int `(n,)`.
+            symmetries: True to add the turned and mirrored copies that the collection rendered. Each trajectory is
+                directly followed by its copies.
 
         Raises:
             ValueError: An index is not a whole number or is out of range, or its trajectory has no images.
+            FileNotFoundError: A shard is missing.
+            TornFileError: A shard is damaged. The message names it.
         """
         trajectories = self._checked(trajectories)
         without = trajectories[~np.isin(trajectories, self.rendered())]
         if without.size:
             raise ValueError(
-                f"trajectories holds {without[0]}, which has no images (num_rendered="
+                f"trajectories contains {without[0]}, which has no images (num_rendered="
                 f"{self.collection['num_rendered']}): use `ends`, or take indices from `members` or `rendered`."
             )
         last = self.trajectory["pose"].shape[1] - 1
@@ -264,12 +304,17 @@ class Dataset:
 
 
 def load(folder: str | Path) -> Dataset:
-    """Open a folder that `collect` has finished, and verify it. Every image is read once, in about 1 s per GB.
+    """Open and verify a dataset that `collect` has finished. The verification takes about 1 s per GB.
+
+    Args:
+        folder: The folder that `collect` has written.
 
     Raises:
-        FileNotFoundError: The folder or one of its files is missing. The message names it.
+        FileNotFoundError: The folder or one of its files is missing, or the collection is not finished. The message
+            names the file.
+        NotADirectoryError: `folder` is a file.
         TornFileError: A file is damaged, or belongs to another dataset or shard. The message names it.
-        ValueError: The dataset has an older format.
+        ValueError: Another version of the library wrote the dataset in another format.
     """
     folder = Path(folder)
     path = folder / "collection.json"
@@ -284,7 +329,7 @@ def load(folder: str | Path) -> Dataset:
         path = records.shard_path(folder, count, index)
         if not path.with_suffix(".npz").exists():
             raise FileNotFoundError(
-                f"{path.with_suffix('.npz')} is missing: the collection is not finished. Run it again to resume it."
+                f"{path.with_suffix('.npz')} is missing: the collection is not finished. Collect again to resume it."
             )
         parts.append(records.read_shard(path, records.Identity(made_of, seen_by, index)))
         shards.append(path)
@@ -292,7 +337,7 @@ def load(folder: str | Path) -> Dataset:
     leaves = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "frames"}
     sizes = [len(part["frames"]) for part in parts]
     views = [len(part["view/body"]) for part in parts]
-    contents = [sha256(shard.with_suffix(".npz")) for shard in shards]  # each holds the hash of its images
+    contents = [sha256(shard.with_suffix(".npz")) for shard in shards]  # each contains the checksum of its images
     return Dataset(
         collection=collection,
         identity=digest([made_of, seen_by, {name: part.tolist() for name, part in split.items()}, contents]),
@@ -311,17 +356,19 @@ def load(folder: str | Path) -> Dataset:
 
 
 def _read(path: Path, remedy: str | None = None) -> Any:
+    """Read a JSON file of a dataset. Errors name the file and the remedy."""
     if path.parent.exists() and not path.parent.is_dir():
         raise NotADirectoryError(f"{path.parent} is a file: give the folder of a collected dataset.")
     try:
         return read_json(path, remedy or f"delete {path.parent} and collect again")
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of one, or collect into it."
+            f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of one, or call `collect`."
         ) from None
 
 
 def _whole_number(collection: dict, name: str, path: Path) -> int:
+    """A field of `collection.json`, which must be a whole number of at least 1."""
     value = collection.get(name)
     if type(value) is not int or value < 1:
         raise TornFileError(
@@ -332,8 +379,8 @@ def _whole_number(collection: dict, name: str, path: Path) -> int:
 
 
 def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
-    """Read the split of the objects. Each object must be in exactly one part."""
-    remedy = f"delete {path} and start the collection again, which writes it anew"
+    """Read `split.json`, and check that each object is in exactly one part."""
+    remedy = f"delete {path} and start the collection again, which writes the file anew"
     content = _read(path, remedy)
     if not isinstance(content, dict) or set(content) != set(PARTS):
         parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
@@ -344,7 +391,7 @@ def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
         outside = [i for i in part if not 0 <= i < num_objects]
         if outside:
             raise TornFileError(
-                f"{path}: {name} holds object {outside[0]}, but the objects are 0 to {num_objects - 1}: {remedy}."
+                f"{path}: {name} contains object {outside[0]}, but the objects are 0 to {num_objects - 1}: {remedy}."
             )
     named = np.array([i for part in content.values() for i in part], np.int64)
     times = np.bincount(named, minlength=num_objects)

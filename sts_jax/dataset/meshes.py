@@ -12,20 +12,20 @@ from scipy import spatial
 
 from sts_jax import objects, physics
 
-SAME = 1e-5  # m, largest difference between files of one mesh in several formats
+SAME = 1e-5  # m, largest distance between triangles of one mesh in two file formats, which round differently
 
 
 @dataclasses.dataclass(frozen=True)
 class Meshes:
-    """Objects from files, see `survey_meshes`."""
+    """The mesh files of a collection, listed by `survey_meshes`."""
 
-    folder: str
-    names: tuple[str, ...]  # names of items of `objects.library`
-    labels: tuple[str, ...]  # class of each
-    digest: str  # SHA-256 of the names and files
-    cache: str | None = None  # folder, see `objects.library`
-    scale: float | None = None  # m, length of one unit of the files
-    up: Literal["x", "y", "z"] | None = None
+    folder: str  # folder of the mesh files
+    names: tuple[str, ...]  # path of each file within the folder, or its model id in ShapeNetSem
+    labels: tuple[str, ...]  # class of each object
+    digest: str  # SHA-256 of the names and contents of the files
+    cache: str | None = None  # folder that keeps the processed objects (None: they are not kept)
+    scale: float | None = None  # length of one unit of the files (m), None as in `survey_meshes`
+    up: Literal["x", "y", "z"] | None = None  # axis of the files that becomes +z, None as in `survey_meshes`
 
 
 def survey_meshes(
@@ -39,35 +39,41 @@ def survey_meshes(
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Meshes, str]:
-    """List the objects of a folder of meshes, or of ShapeNetSem, that a scenario can use.
+    """List the mesh files in a folder that a scenario can use.
+
+    Files with the same mesh count as one object, whatever their names and formats. Otherwise, one object could be in
+    both the training and the test part of a dataset.
 
     Args:
-        folder: See `objects.library`.
-        scenario: The scenario that the objects are for.
-        classes: The classes to use, see `mesh_classes`. Empty means all.
+        folder: Folder of mesh files with one sub-folder per class, or of ShapeNetSem (see `objects.library`).
+        scenario: The scenario in which the objects are simulated.
+        classes: The classes to use, a subset of `mesh_classes(folder)`. Empty means all.
         scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
         up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
-        parts: Whether objects whose hull fits badly collide as convex parts.
-        cache: Folder that keeps the processed objects.
-        progress: Called with a line for each object.
+        parts: True to split an object into convex parts if its hull fits badly. This needs the package coacd.
+        cache: Folder that keeps the processed objects, so that later calls read them faster. None keeps nothing.
+        progress: Function that is called with a line of text after each object.
 
     Returns:
-        The usable objects, and a listing of them and of the objects that were left out, with the reasons. Files with
-        the same mesh count as one object, whatever their names and formats, so that no mesh is in two parts of the
-        split.
+        The usable objects, and a text. The text lists the usable objects and the others, with the reason for each.
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        ValueError: The folder holds no mesh, no usable mesh, or no mesh of one of the classes.
+        ImportError: `parts` or a mesh file needs a package that is not installed.
+        ValueError: The folder has no mesh, no usable mesh, or no mesh of one of the classes, or `scale` or `up` is out
+            of range.
     """
     library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts)
     unknown = sorted(set(classes) - set(library.classes))
     if unknown:
-        raise ValueError(f"{folder} holds no {', '.join(unknown)}: choose among {', '.join(library.classes)}")
+        raise ValueError(
+            f"classes contains {', '.join(unknown)}, but {folder} has only the classes {', '.join(library.classes)}: "
+            "choose among these"
+        )
     items = tuple(item for item in library.items if not classes or item.label in classes)
     library, listing = objects.survey(dataclasses.replace(library, items=items), progress=progress)
     usable, digest = [], hashlib.sha256()
-    seen: dict[int, list[tuple[str, np.ndarray]]] = {}  # name and `_triangles`, by the number of triangles
+    seen: dict[int, list[tuple[str, np.ndarray]]] = {}  # names and `_triangles`, by number of triangles
     for index, item in enumerate(library.items):
         body = objects.read(library, index).body
         reason = physics.refusal(body, scenario)
@@ -84,21 +90,24 @@ def survey_meshes(
         usable.append(item)
         digest.update(item.name.encode() + hashlib.sha256(item.path.read_bytes()).digest())
     if not usable:
-        raise ValueError(f"{folder} holds no object that can be used:\n{listing}")
+        raise ValueError(
+            f"{folder} has no object that can be used in {type(scenario).__name__}. Give another folder, or repair the "
+            f"files. The reasons are:\n{listing}"
+        )
     names, labels = tuple(item.name for item in usable), tuple(item.label for item in usable)
     kept = None if cache is None else str(cache)
     return Meshes(str(folder), names, labels, digest.hexdigest(), kept, scale, up), listing
 
 
 def _triangles(body: objects.Body) -> np.ndarray:
-    """The centres of a body's triangles (n, 3), without the padding."""
+    """The centres of a body's triangles in the mesh frame (m), `(n, 3)`, without the padding."""
     corners = np.asarray(body.vertices)[np.asarray(body.faces)]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     return corners[area > 0].mean(1)
 
 
 def _same(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two meshes with the same number of triangles have them at the same places, in any order."""
+    """Return whether two arrays of n triangle centres contain the same points up to SAME, in any order."""
     box = [np.stack([x.min(0), x.max(0)]) for x in (one, other)]
     if np.abs(box[0] - box[1]).max() > SAME:
         return False
@@ -107,12 +116,20 @@ def _same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
-    """The classes of the objects of a folder (see `objects.library`). No mesh is opened."""
+    """List the classes of the mesh files in a folder, without opening a file.
+
+    Args:
+        folder: Folder of mesh files with one sub-folder per class, or of ShapeNetSem (see `objects.library`).
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: The folder has no mesh.
+    """
     return objects.library(folder).classes
 
 
 @functools.lru_cache
 def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
-    """The library of some meshes, and the index of each of its items by name."""
+    """The `objects.library` of the folder of some meshes, and the index of each of its items by name."""
     library = objects.library(meshes.folder, cache=meshes.cache, scale=meshes.scale, up=meshes.up, parts=parts)
     return library, {item.name: index for index, item in enumerate(library.items)}

@@ -1,10 +1,12 @@
 """Shards on disk. A file is written as a whole or not at all, and the same inputs give the same bytes.
 
-A shard is two files. `NAME.array_record` holds one record per rendered frame: the visual image, the tactile image
+A shard is two files. `NAME.array_record` has one record per rendered frame: the visual image, the tactile image
 (`uint8`, `(height, width, 3)`) and the segmentation (bits), in that order. The frames are followed by one record per
-view, which holds the visual image only. `NAME.npz` holds everything small as named arrays. It is written last, and a
-shard without it counts as missing. It also holds the shard's `Identity` and the SHA-256 of its record file, so that
-neither file can be exchanged for one of another shard or dataset.
+view, which has the visual image only. A view shows an object in an initial pose that is not simulated.
+
+`NAME.npz` contains all other data as named arrays. It is written last, and a shard without it counts as missing. It
+also contains the `Identity` of the shard and the SHA-256 of `NAME.array_record`. A reader therefore notices if one of
+the two files comes from another shard or dataset.
 """
 
 import io
@@ -18,7 +20,7 @@ from array_record.python.array_record_module import ArrayRecordReader, ArrayReco
 from sts_jax import physics
 from sts_jax._files import TornFileError, sha256, write_bytes, write_whole
 
-FORMAT = 4  # of a dataset's files, incremented when older files can no longer be read
+FORMAT = 4  # format of a dataset's files, incremented when older files can no longer be read
 ARRAYS = {  # names of the arrays in a shard's .npz, apart from its identity
     *(f"trajectory/{name}" for name in physics.Trajectory._fields if name != "hidden"),
     *(f"hidden/{name}" for name in physics.Hidden._fields),
@@ -27,7 +29,7 @@ ARRAYS = {  # names of the arrays in a shard's .npz, apart from its identity
     "frames",
     "left_out",
 }
-# One frame per group, so that a random read decompresses one frame only.
+# One record per group, because a read decompresses the whole group.
 WRITER_OPTIONS = "group_size:1,zstd:3"
 
 
@@ -42,25 +44,31 @@ class Images(NamedTuple):
 class Identity(NamedTuple):
     """Identity of a shard: its dataset, sensor and index."""
 
-    collection: str  # `digest` of collection.json
-    sensor: str  # `digest` of sensor.json
+    collection: str  # SHA-256 of the content of collection.json
+    sensor: str  # SHA-256 of the content of sensor.json
     shard: int  # index of the shard
 
 
 def shard_path(folder: Path, count: int, index: int) -> Path:
-    """The record file of shard `index` of `count`."""
+    """Path of the record file of shard `index` in a dataset of `count` shards."""
     return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
 
 
 def check_format(content: Any, folder: Path) -> None:
-    """Check that this version reads a dataset, given the content of its `collection.json`.
+    """Check that this version of the library can read a dataset.
+
+    Args:
+        content: The content of the dataset's `collection.json`.
+        folder: The folder of the dataset, for messages.
 
     Raises:
         TornFileError: The content is not the description of a collection.
         ValueError: The dataset was written by an older or newer version.
     """
     if not isinstance(content, dict):
-        raise TornFileError(f"{folder / 'collection.json'} holds no collection: delete {folder} and collect again.")
+        raise TornFileError(
+            f"{folder / 'collection.json'} does not describe a collection: delete {folder} and collect again."
+        )
     written = content.get("format", 1)  # the first format had no number
     if written != FORMAT:
         raise ValueError(
@@ -76,9 +84,9 @@ def write_shard(
 
     Args:
         path: The `.array_record` file.
-        frames: The records, batch by batch: `Images` of the frames, then `(visual,)` of the views.
-        arrays: Everything else, with the names ARRAYS.
-        identity: Identity of the shard.
+        frames: Batches of images: `Images` of the frames, then tuples `(visual,)` of the views.
+        arrays: All other data, one array for each name in ARRAYS.
+        identity: The identity of the shard, which `read_shard` checks.
 
     Raises:
         OSError: A file cannot be written. The message names it.
@@ -111,7 +119,7 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
         raise TornFileError(f"{small} lacks {', '.join(lacking)}: {again}.")
     there = {name.partition("/")[2]: arrays.pop(name).item() for name in names}
     if there["shard"] != identity.shard:
-        raise TornFileError(f"{small} holds shard {there['shard']} instead of shard {identity.shard}: {again}.")
+        raise TornFileError(f"{small} is shard {there['shard']} instead of shard {identity.shard}: {again}.")
     for name in ("collection", "sensor"):
         if there[name] != getattr(identity, name):
             raise TornFileError(
@@ -128,14 +136,22 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write named arrays to an `.npz` file, as a whole or not at all."""
+    """Write named arrays to an `.npz` file, as a whole or not at all.
+
+    Args:
+        path: The file.
+        arrays: The arrays by name.
+
+    Raises:
+        OSError: The file cannot be written. The message names it.
+    """
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
     write_bytes(path, buffer.getvalue())
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
-    """Write the images of each batch in order to an array_record file, as a whole or not at all."""
+    """Write batches of images to an array_record file, one record per frame, as a whole or not at all."""
 
     def write(temporary: Path) -> None:
         writer = _or_os_error(ArrayRecordWriter, str(temporary), WRITER_OPTIONS)
@@ -161,14 +177,14 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        TornFileError: The file is not a complete `.npz`. The remedy is to delete it and collect again.
+        TornFileError: The file is not a complete `.npz` file. The message names it.
     """
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             return dict(arrays)
     except FileNotFoundError:
         raise
-    except Exception as error:  # a damaged zip file raises any of five types
+    except Exception as error:  # np.load raises errors of five types for damaged files
         raise TornFileError(f"{path} is damaged ({error}): delete it and start the collection again.") from error
 
 
@@ -177,13 +193,16 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
     Args:
         path: The `.array_record` file.
-        indices: Indices of the records, `(n,)`.
-        resolution: Height and width of every image.
-        total: Number of records that the file must hold (from the shard's arrays).
+        indices: Indices of the records, int `(n,)`.
+        resolution: Height and width of every image (pixels).
+        total: Number of records that the file must have, according to the shard's arrays.
+
+    Returns:
+        The images of the n frames, in the given order.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        TornFileError: The file is truncated or holds another number of records.
+        TornFileError: The file is truncated or has another number of records.
     """
     height, width = resolution
     size = height * width * 3
@@ -198,7 +217,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
 
 def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
-    """Read some views of a shard, `uint8 (n, height, width, 3)`. Arguments and errors are those of `read_images`."""
+    """Read the images of some views, uint8 `(n, height, width, 3)`. Arguments and errors are those of `read_images`."""
     return _read_records(path, indices, total).reshape(-1, *resolution, 3)
 
 
@@ -213,9 +232,9 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
         records = reader.read([int(i) for i in indices]) if count == total and len(indices) else []
         reader.close()
     except (RuntimeError, ValueError, IndexError) as error:
-        raise TornFileError(f"{path} is torn ({error}): {again}.") from error
+        raise TornFileError(f"{path} is damaged ({error}): {again}.") from error
     if count != total:
-        raise TornFileError(f"{path} is torn, because it holds {count} records instead of {total}: {again}.")
+        raise TornFileError(f"{path} is damaged, because it has {count} records instead of {total}: {again}.")
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
 
 

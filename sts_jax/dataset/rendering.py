@@ -1,4 +1,4 @@
-"""Rendering of the frames of a dataset, in parallel and as they are stored."""
+"""Rendering of the frames of a dataset: on all CPU cores, in the types of the stored images."""
 
 import concurrent.futures
 import functools
@@ -18,9 +18,9 @@ from sts_jax.dataset.symmetry import turn, turn_wrench
 from sts_jax.frame import sense
 from sts_jax.sensor import Sensor
 
-# Frames rendered by one compiled call. The last call of an object is padded. A CPU renders frames one after another.
+# Number of frames that one compiled call renders. The last call of an object is padded to this number.
 RENDER_BATCH = 32
-CPU_RENDER_BATCH = 8
+CPU_RENDER_BATCH = 8  # fewer, because a CPU renders the frames one after another
 
 
 class _Job(NamedTuple):
@@ -29,7 +29,7 @@ class _Job(NamedTuple):
     body: objects.Body
     pose: np.ndarray  # (n, 7)
     wrench: np.ndarray  # (n, 6)
-    is_view: bool  # whether only the visual image is kept
+    is_view: bool  # true for views, of which only the visual image is stored
 
 
 def render(
@@ -41,19 +41,19 @@ def render(
     views: dict[str, np.ndarray],
     report: Callable[[int], None],
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Render a shard in batches, with one thread per core, because one call keeps only one core busy.
+    """Render the images of a shard in batches, with one thread per CPU core because one call uses only one core.
 
     Args:
         collection: The description of the dataset.
         sensor: The sensor.
         bodies: The objects of the shard.
-        trajectory: Their trajectories, as NumPy arrays, with bodies counted in the shard.
-        frames: Rows of (trajectory, frame, symmetry), sorted by object and then by mirror image, (m, 3).
-        views: The poses and bodies of the views, sorted by object.
-        report: Called with the number of finished images.
+        trajectory: The trajectories of these objects as NumPy arrays. `trajectory.body` is an index into `bodies`.
+        frames: Rows (trajectory, frame, symmetry), int `(m, 3)`, sorted by object, with mirrored copies last.
+        views: The arrays `pose` and `body` of the views, sorted by object. `body` is an index into `bodies`.
+        report: Function that is called with the number of finished images.
 
     Yields:
-        The records in order: `Images` of the frames, then `(visual,)` of the views.
+        Batches of images: `Images` of the frames, then tuples `(visual,)` of the views.
     """
     size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
     turned = {
@@ -99,7 +99,19 @@ def render_uint8(
     resolution: tuple[int, int],
     crop: bool,
 ) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
-    """Render frames of one object as they are stored: visual and tactile in `uint8`, segmentation in bool."""
+    """Render frames of one object in the types of the stored images.
+
+    Args:
+        sensor: The sensor.
+        body: The object.
+        pose: Poses of the mesh frame in the sensor frame, position (m) and quaternion.
+        wrench: Wrenches of the pad on the object: force (N) and moment about the sensor's origin (N m).
+        resolution: Height and width of the images (pixels).
+        crop: True to show the square around the object instead of the whole pad.
+
+    Returns:
+        The images of the visual and of the tactile stream, and the segmentation, bool `(n, h, w)`.
+    """
 
     def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         frame = sense(sensor, body, *item, resolution=resolution, crop=crop)
@@ -111,7 +123,15 @@ def render_uint8(
 
 
 def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
-    """Both streams (`uint8`) and the segmentation (bool) of the untouched sensor, as the collection renders them."""
+    """Render the sensor without an object, in the resolution of a collection.
+
+    Args:
+        sensor: The sensor.
+        collection: The description of the dataset.
+
+    Returns:
+        Images without the leading axis: visual and tactile `(height, width, 3)`, segmentation `(height, width)`.
+    """
     body = make_bodies(collection, np.array([0]))[0]
     gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])
     images = render_uint8(sensor, body, gone, jnp.zeros((1, 6)), resolution=collection.resolution, crop=collection.crop)

@@ -12,7 +12,14 @@ from sts_jax import geometry
 
 
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
-    """A pose under a symmetry of the pad. A mirrored pose belongs to the mirrored body, see `objects.mirror`."""
+    """Transform a pose by a symmetry of the pad.
+
+    A mirrored pose is the pose of the mirrored body, see `objects.mirror`.
+
+    Args:
+        pose: Pose of the mesh frame in the sensor frame, position (m) and quaternion.
+        symmetry: Number of the symmetry, 0 to 7.
+    """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
     spin = geometry.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
@@ -22,7 +29,12 @@ def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
 
 
 def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n 6"]:
-    """A wrench about the sensor's origin under a symmetry of the pad."""
+    """Transform a wrench by a symmetry of the pad.
+
+    Args:
+        wrench: Force (N) and moment about the sensor's origin (N m).
+        symmetry: Number of the symmetry, 0 to 7.
+    """
     if symmetry >= 4:
         wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
     spin = geometry.quat_from_rotvec(jnp.array([0.0, 0.0, symmetry % 4 * math.pi / 2]))
@@ -31,7 +43,13 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
 
 
 def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int = 1) -> Float[Array, "*n c"]:
-    """A condition under a symmetry of the pad. It begins with so many vectors (x, y), and the other numbers stay."""
+    """Transform the condition of a scenario by a symmetry of the pad.
+
+    Args:
+        condition: Vectors (x, y) in the plane of the pad, followed by scalars, which do not change.
+        symmetry: Number of the symmetry, 0 to 7.
+        vectors: Number of vectors at the beginning of the condition.
+    """
     if condition.shape[-1] == 0:
         return condition
     parts = [condition[..., 2 * vectors :]]

@@ -1,4 +1,4 @@
-"""Evaluation of predictions: metrics per item, tables with intervals, ceilings and figures."""
+"""Evaluation of predictions: errors, metrics, baselines, the best possible prediction, tables and figures."""
 
 from sts_jax.evaluation import figures, gap, metrics
 from sts_jax.evaluation.catalogue import COLUMNS, METRICS

@@ -1,8 +1,10 @@
 """Distances between real and simulated images: per pixel, in a feature space, and by a classifier.
 
-Images are `uint8 (n, height, width, 3)`, one stream at a time. Each image belongs to a group, its trajectory. A group
-that occurs on both sides shows the same object in the same poses, and the two sides are then called matched: image i of
-one side belongs to image i of the other. Either all groups occur on both sides, or none does.
+Every function compares two sides, a set of real and a set of simulated images. Images are uint8
+`(n, height, width, 3)` of one stream. Each image has a group number, which is the number of its trajectory.
+
+The sides are matched if both contain the same groups. Image i of one side and image i of the other then show the same
+object in the same pose. Sides that are not matched must have no group in common.
 """
 
 from typing import NamedTuple
@@ -12,34 +14,34 @@ import numpy as np
 
 from sts_jax.evaluation import metrics
 
-LEVELS = 3  # scales of the features, each with half the resolution of the one before
-CELLS = 4  # of the features along each side of the image
-LEAST_SIDE = 4 * CELLS * 2 ** (LEVELS - 1)  # pixels, so that a cell of the coarsest scale has 4 x 4
-GREY_LEVEL = 1 / 255  # least scale of a feature, so that rounding does not count
-PERMUTATIONS = 999
-FOLDS = 5
-REPEATS = 5  # cross-validations with other folds, which are averaged
-PENALTY = 10.0  # of the classifier's squared weights, for features of unit variance
+LEVELS = 3  # number of scales of the features, each with half the resolution of the previous one
+CELLS = 4  # number of cells of the features along each side of the image
+LEAST_SIDE = 4 * CELLS * 2 ** (LEVELS - 1)  # pixels, side for which a cell of the coarsest scale has 4 x 4 pixels
+GREY_LEVEL = 1 / 255  # least standard deviation by which a feature is divided, so that rounding has no large effect
+PERMUTATIONS = 999  # number of permutations of the permutation test
+FOLDS = 5  # number of folds of a cross-validation
+REPEATS = 5  # number of cross-validations with different folds, whose accuracies are averaged
+PENALTY = 10.0  # weight of the classifier's L2 regularisation, for features of unit variance
 
 
 class Streams(NamedTuple):
-    """Images of both streams and their groups."""
+    """n images of both streams, and their groups."""
 
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
-    group: np.ndarray  # int (n,): trajectory of each image
+    group: np.ndarray  # int (n,): number of the trajectory of each image
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval over groups."""
+    """A value with its 95 % bootstrap interval over groups."""
 
     value: float
-    low: float
-    high: float
+    low: float  # lower limit of the interval
+    high: float  # upper limit of the interval
 
 
 class PixelErrors(NamedTuple):
-    """Differences of matched images. Values are those of 8-bit images, 0 to 255."""
+    """Differences between matched images, in grey levels of 8-bit images (0 to 255)."""
 
     mae: Estimate  # mean absolute error
     rmse: Estimate  # root of the mean squared error
@@ -48,26 +50,26 @@ class PixelErrors(NamedTuple):
 
 
 class Distance(NamedTuple):
-    """A distance of two distributions with the p-value of the hypothesis that they are equal."""
+    """A distance between two distributions."""
 
     value: float
-    p: float
+    p: float  # p-value of the hypothesis that both distributions are equal
 
 
 def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> PixelErrors:
-    """Differences of matched images, with intervals over groups (bootstrap).
+    """Compute the differences between matched images, with bootstrap intervals over groups.
 
     Args:
-        real: `uint8 (n, height, width, 3)`.
-        simulated: Same shape. Image i belongs to image i of `real`.
-        group: `(n,)`.
+        real: Real images, uint8 `(n, height, width, 3)`.
+        simulated: Simulated images of the same shape. Image i shows the same object in the same pose as `real[i]`.
+        group: Number of the trajectory of each image, int `(n,)`.
 
     Raises:
-        ValueError: The images are not uint8, or their shapes differ.
+        ValueError: The images are not uint8, there is none, their shapes differ, or `group` has another length.
     """
     _check(real, simulated, group, group)
     if real.shape != simulated.shape:
-        raise ValueError(f"matched images must have equal shapes, got real {real.shape}, simulated {simulated.shape}")
+        raise ValueError(f"real and simulated must have equal shapes, got {real.shape} and {simulated.shape}")
     each = np.array([_differences(a, b) for a, b in zip(real, simulated, strict=True)])
 
     def summary(weight: np.ndarray) -> np.ndarray:
@@ -82,17 +84,18 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
 
 
 def features(images: np.ndarray) -> np.ndarray:
-    """Colours and oriented gradients of images in a grid of 4 x 4 cells, without anything that was learned.
+    """Compute colours and oriented gradients of images in a grid of 4 x 4 cells. No network is involved.
 
-    Each cell has the mean of each colour, and at each of three scales the mean absolute difference of neighbours of the
-    grey image in four directions: across, down, both diagonals. Brightness, vignetting and colour change the means.
-    Noise, blur, edges and texture change the differences.
+    A cell has two kinds of features. The colours are the means of the three channels. The gradients are the mean
+    absolute differences of neighbouring pixels of the grey image, in four directions (horizontal, vertical and both
+    diagonals) and at three scales. Brightness, vignetting and colour change the colours. Noise, blur, edges and texture
+    change the gradients.
 
     Args:
-        images: `uint8 (n, height, width, 3)`, at least `LEAST_SIDE` pixels high and wide.
+        images: Images, uint8 `(n, height, width, 3)`, at least `LEAST_SIDE` pixels high and wide.
 
     Returns:
-        `(n, 240)`, grey values in [0, 1]: 48 colours, then 64 gradients of each scale from fine to coarse.
+        Features in [0, 1], `(n, 240)`: 48 colours, then 64 gradients of each scale from fine to coarse.
 
     Raises:
         ValueError: The images are not uint8 or too small.
@@ -110,24 +113,28 @@ def features(images: np.ndarray) -> np.ndarray:
 def energy_distance(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray, *, seed: int = 0
 ) -> Distance:
-    """Normalised energy distance of two sets of features, 0 for equal distributions, 1 for sets that are far apart.
+    """Compute the normalised energy distance `1 - (E|X - X'| + E|Y - Y'|) / (2 E|X - Y|)` of two sets of features.
 
-    `1 - (E|X - X'| + E|Y - Y'|) / (2 E|X - Y|)` with real features X, X' and simulated ones Y, Y'. Each feature is
-    divided by its standard deviation over both sets, or by a grey level if that is larger. All three means are taken
-    over pairs of images of different groups only. The estimate is therefore not biased by the number of images or by
-    matched pairs, and for equal distributions it varies around 0, below 0 too.
+    X and X' are two real images, and Y and Y' are two simulated ones. The distance is 0 for equal distributions and 1
+    for sets that are far apart. Each feature is divided by its standard deviation over both sets, or by one grey level
+    if that is larger.
 
-    The p-value is that of a permutation test: matched groups swap their sides at random, other groups change them.
+    The three means are taken over pairs of images of different groups only. The number of images and the matching of
+    the sides therefore cause no bias. For equal distributions, the estimate varies around 0 and may be negative.
+
+    The p-value comes from a permutation test. A permutation swaps the two sides of each matched group at random. If the
+    sides are not matched, it assigns the groups to the sides at random.
 
     Args:
-        real: `(n, k)`, see `features`.
-        simulated: `(m, k)`.
-        real_group: `(n,)`.
-        simulated_group: `(m,)`.
-        seed: Of the permutations.
+        real: Features of the real images, from `features`, `(n, k)`.
+        simulated: Features of the simulated images, `(m, k)`.
+        real_group: Number of the trajectory of each real image, int `(n,)`.
+        simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
+        seed: Seed of the permutations.
 
     Raises:
-        ValueError: Some groups are matched and others not, a value is not finite, or a side has fewer than 2 groups.
+        ValueError: Only some groups occur on both sides, a value is not finite, a shape is wrong, or a side has fewer
+            than 2 groups.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
     """
@@ -159,21 +166,24 @@ def energy_distance(
 def told_apart(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray
 ) -> Estimate:
-    """Cross-validated accuracy of a classifier of real and simulated images. No group is in both fit and test.
+    """Compute the cross-validated accuracy of a classifier that distinguishes real from simulated images.
 
-    A logistic regression on standardised features, in five cross-validations of five folds. All images of a group are
-    in the same fold, those of both sides if they are matched. The accuracy is the mean over both sides, so 0.5 is
-    chance. The interval is that of the groups that were judged (bootstrap), not of those that the classifier was fitted
-    to.
+    The classifier is a logistic regression on standardised features. There are five cross-validations of five folds,
+    whose accuracies are averaged. All images of a group are in the same fold, on both sides if they are matched, so the
+    classifier is never tested on a group that it was fitted to.
+
+    The accuracy is the mean over both sides, so 0.5 is chance. Its bootstrap interval is over the groups that were
+    tested. It does not include the variation of the groups that the classifier was fitted to.
 
     Args:
-        real: `(n, k)`, see `features`.
-        simulated: `(m, k)`.
-        real_group: `(n,)`.
-        simulated_group: `(m,)`.
+        real: Features of the real images, from `features`, `(n, k)`.
+        simulated: Features of the simulated images, `(m, k)`.
+        real_group: Number of the trajectory of each real image, int `(n,)`.
+        simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
 
     Raises:
-        ValueError: Some groups are matched and others not, a value is not finite, or a side has fewer than 5 groups.
+        ValueError: Only some groups occur on both sides, a value is not finite, a shape is wrong, or a side has fewer
+            than 5 groups.
         ImportError: scikit-learn is not installed.
     """
     try:
@@ -231,28 +241,29 @@ def _described(image: np.ndarray) -> np.ndarray:
 
 
 def _cells(values: np.ndarray) -> np.ndarray:
-    """Means of the grid's cells."""
+    """Mean of each cell of the grid of CELLS x CELLS cells."""
     return cv2.resize(values, (CELLS, CELLS), interpolation=cv2.INTER_AREA)
 
 
 def _check(real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray) -> None:
+    """Raise an error for invalid images and groups."""
     for name, images, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
         if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3 or not len(images):
             raise ValueError(
                 f"{name} must be uint8 of shape (n, height, width, 3) with n >= 1, got {images.dtype} of {images.shape}"
             )
         if group.shape != images.shape[:1]:
-            raise ValueError(f"group must name the trajectory of each of the {len(images)} images, got {group.shape}")
+            raise ValueError(f"group must have one number per image of {name} ({len(images)}), got shape {group.shape}")
 
 
 def _matched(
     real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simulated_group: np.ndarray, *, least: int = 2
 ) -> bool:
-    """Whether the groups are matched. Raises an error for invalid features and groups."""
+    """Return whether the sides are matched, or raise an error for invalid features and groups."""
     for name, values, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
         if values.ndim != 2 or group.shape != values.shape[:1]:
             raise ValueError(
-                f"{name} must have the shape (n, k) and its groups (n,), got {values.shape}, {group.shape}"
+                f"{name} must have the shape (n, k) and {name}_group (n,), got {values.shape} and {group.shape}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite, got {values[~np.isfinite(values)][0]}")
@@ -263,12 +274,13 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            f"{len(common)} trajectories occur on both sides and others do not: keep those on both sides, or give "
-            "all of one side other numbers"
+            f"{len(common)} trajectories occur on both sides, but the sides do not match: keep only the common "
+            "trajectories, with equally many images on both sides, or give the sides different group numbers"
         )
     return True
 
 
 def _estimate(value: float, draws: np.ndarray) -> Estimate:
+    """A value with the interval of its bootstrap values."""
     with np.errstate(invalid="ignore"):
         return Estimate(float(value), *metrics.interval(draws))

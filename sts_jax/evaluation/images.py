@@ -1,4 +1,4 @@
-"""The images of both streams at rest, judged without poses: for recordings of a real sensor."""
+"""Evaluation of predicted last images of both streams without poses, for recordings of a real sensor."""
 
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
@@ -14,21 +14,31 @@ STREAMS = ("visual", "tactile")
 
 @runtime_checkable
 class Streams(Protocol):
-    """First and last images of some trajectories, such as `hardware.Moments` or `dataset.Pairs`."""
+    """First and last images of n trajectories, such as `hardware.Moments` or `dataset.Pairs`."""
 
     @property
     def visual(self) -> np.ndarray:
-        """Images of the visual stream, uint8 (n, 2, height, width, 3)."""
+        """First and last images of the visual stream, uint8 `(n, 2, height, width, 3)`."""
 
     @property
     def tactile(self) -> np.ndarray:
-        """Images of the tactile stream, uint8 (n, 2, height, width, 3)."""
+        """First and last images of the tactile stream, uint8 `(n, 2, height, width, 3)`."""
 
 
 def image_baselines(train: Streams, test: Streams) -> dict[str, Predicted]:
-    """Predictions without learning: the mean last image, the input itself, and the end of the nearest input.
+    """Predict the last images without a trained model, in three ways.
 
-    The nearest input is the training trajectory whose first visual image has the smallest squared distance.
+    - The constant is the mean last image of the training trajectories.
+    - The copy predicts that the last image equals the first one.
+    - The nearest neighbour is the last image of the training trajectory whose first visual image has the smallest
+      squared distance.
+
+    Args:
+        train: The training trajectories.
+        test: The held-out trajectories.
+
+    Returns:
+        The predictions for `test` by name.
     """
     inputs, queries = (own.visual[:, 0].reshape(len(own.visual), -1).astype(np.float32) for own in (train, test))
     nearest = ((inputs**2).sum(1) - 2 * queries @ inputs.T).argmin(1)
@@ -46,29 +56,35 @@ def image_baselines(train: Streams, test: Streams) -> dict[str, Predicted]:
 def image_summary(
     predictions: Mapping[str, Predicted], test: Streams, *, num: int = 2000, seed: int = 0
 ) -> dict[str, dict]:
-    """Cross-entropy and skill of predicted images, with 95 % bootstrap intervals over trajectories.
+    """Compute cross-entropy and skill of predicted images, with 95 % bootstrap intervals over trajectories.
+
+    Skill is 1 minus the ratio of the excess to that of a reference prediction. The excess is the cross-entropy minus
+    the entropy of the true image.
 
     Args:
-        predictions: Predictions by name, with those of `image_baselines`. A stream that is not predicted is None.
+        predictions: Predictions of the last images by name, including those of `image_baselines`. A stream that a
+            predictor does not predict is None.
         test: The held-out trajectories.
-        num: Number of bootstrap draws.
-        seed: Seed of the draws.
+        num: Number of bootstrap samples.
+        seed: Seed of the bootstrap.
 
     Returns:
-        By stream: `floor`, the smallest possible cross-entropy (the entropy of the true images), and `predictors`. They
-        have by name `bce` (nats per pixel and channel), and the skills `skill` against the mean training image and
-        `skill_copy` against the copy of the input. Each is a dictionary of `value`, `low` and `high`.
+        A dictionary for each stream. `floor` is the entropy of the true images, which is the smallest possible
+        cross-entropy (nats per pixel and channel). `predictors` contains three metrics for each name: `bce`, the
+        cross-entropy, `skill`, relative to the mean training image, and `skill_copy`, relative to the copy of the
+        input. Each metric is a dictionary of `value`, `low` and `high`.
 
     Raises:
         ValueError: A baseline is missing, or a prediction has another shape than the true images.
     """
     missing = [name for name in (CONSTANT, COPY) if name not in predictions]
     if missing:
-        raise ValueError(f"predictions lacks {', '.join(missing)}: add those of evaluation.image_baselines")
+        raise ValueError(f"predictions lacks {', '.join(missing)}: add the results of evaluation.image_baselines")
     return {stream: _of_stream(predictions, test, stream, num, seed) for stream in STREAMS}
 
 
 def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str, num: int, seed: int) -> dict:
+    """The part of `image_summary` for one stream."""
     truth = _last(test, stream)
     errors: dict[str, ImageError] = {}
     for name, predicted in predictions.items():
@@ -76,7 +92,7 @@ def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str,
         if images is None:
             continue
         if images.shape != truth.shape:
-            raise ValueError(f"{name}: {stream} has shape {images.shape}, but the true images have {truth.shape}")
+            raise ValueError(f"prediction {name}: {stream} has shape {images.shape}, but it must be {truth.shape}")
         errors[name] = image_error(in_unit(images), truth)
     reference = errors[CONSTANT]
     floor = mean_per_pixel(reference.bce - reference.excess, reference.pixels)

@@ -1,8 +1,11 @@
-"""Metrics of predictions, per item, so that items can be grouped in any way.
+"""Metrics of predictions for n items. An item is one held-out trajectory.
 
-Predicted images are probabilities in [0, 1]. Targets are grey values, so that the binary cross-entropy is at least the
-entropy of the target: `BCE(x, p) = H(x) + KL(x || p)`. The excess is the KL term, which a better prediction can reduce.
-The skill is one minus the ratio of the excess to that of the mean training image.
+Errors are arrays with one number per item. Means over items accept weights of the items, which the bootstrap varies.
+
+Predicted images are probabilities p, and the true images (targets) are grey values x, both in [0, 1]. The binary
+cross-entropy of a value is `BCE(x, p) = -x log p - (1 - x) log(1 - p)`. Its minimum is the entropy H(x) of the target:
+`BCE(x, p) = H(x) + KL(x || p)`. The excess is the divergence KL(x || p), which is 0 for a perfect prediction. The skill
+is 1 minus the ratio of the excess to that of the mean training image.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,30 +13,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Predicted probabilities are kept at least half a grey level from 0 and 1, so that stored images can be predictions.
+# Predicted probabilities are limited to half a grey level from 0 and 1, so that an 8-bit image has a finite BCE.
 HALF_LEVEL = 1 / 510
-FLOOR = 1e-3  # outcome probabilities below this count as this in the log loss
-BINS = 10  # of equal width in [0, 1], for the calibration of outcome probabilities
+FLOOR = 1e-3  # least probability of an outcome in the log loss, to which smaller ones are raised
+BINS = 10  # number of bins of equal width in [0, 1], for the calibration of outcome probabilities
 LEVEL = 0.9  # probability of the region whose coverage is measured
-_CHUNK = 128  # items whose images are compared at once, which bounds the memory
-_CLOSE = 1e-6  # m, the distance below which the geometric median's weights no longer grow
+_CHUNK = 128  # number of items whose images are compared at once, which limits the memory
+_CLOSE = 1e-6  # m, least distance in the weights of the geometric median, which keeps them finite
 
 
 class ImageError(NamedTuple):
-    """Cross-entropy and excess of predicted images, summed over the pixels that count."""
+    """Cross-entropy and excess of n predicted images, summed over the selected pixels of each image."""
 
-    bce: np.ndarray  # (n,) nats, summed over pixels and channels
-    excess: np.ndarray  # (n,) nats, bce less the entropy of the target
-    pixels: np.ndarray  # (n,) number of pixels times channels
+    bce: np.ndarray  # (n,): binary cross-entropy, summed over pixels and channels (nats)
+    excess: np.ndarray  # (n,): `bce` minus the entropy of the target (nats)
+    pixels: np.ndarray  # (n,): number of selected pixels times the number of channels
 
 
 def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> ImageError:
-    """Binary cross-entropy of predicted images and its excess over the targets' entropy.
+    """Compute the binary cross-entropy of predicted images, and its excess over the entropy of the targets.
 
     Args:
-        predicted: Probabilities `(n, height, width, 3)`.
-        target: Grey values in [0, 1], same shape.
-        mask: Which pixels count, bool `(n, height, width)` (default: all).
+        predicted: Predicted images in [0, 1], `(n, height, width, 3)`.
+        target: True images in [0, 1], `(n, height, width, 3)`.
+        mask: The pixels to use, bool `(n, height, width)` (default: all).
     """
     if len(target) > _CHUNK:
         cuts = [slice(start, start + _CHUNK) for start in range(0, len(target), _CHUNK)]
@@ -49,34 +52,75 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
 
 
 def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = None) -> float:
-    """`1 - excess / excess of the constant prediction`, over all items with their weights."""
+    """Compute the skill, `1 - excess / excess of the constant prediction`, with both sums over all items.
+
+    Args:
+        error: Errors of the predictor for n items.
+        constant: Errors of the constant prediction for the same items.
+        weight: Weights of the items, `(n,)` (default: 1).
+
+    Returns:
+        The skill, or NaN if the excess of the constant prediction is 0.
+    """
     w = np.ones(len(error.excess)) if weight is None else weight
     reference = float((w * constant.excess).sum())
     return 1 - float((w * error.excess).sum()) / reference if reference > 0 else float("nan")
 
 
 def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Mean per pixel of an error that is summed over the pixels that count."""
+    """Divide the sum of an error over all items by the sum of the numbers of pixels.
+
+    Args:
+        values: Errors of the items, each summed over its pixels, `(n,)`.
+        count: Numbers of pixels of the items, `(n,)`.
+        weight: Weights of the items, `(n,)` (default: 1).
+
+    Returns:
+        The mean, or NaN without pixels.
+    """
     w = np.ones(len(values)) if weight is None else weight
     total = float((w * count).sum())
     return float((w * values).sum()) / total if total > 0 else float("nan")
 
 
 def position_error(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Distance of positions, metres `(n,)`, from poses `(n, 7)`."""
+    """Compute the distances between predicted and true positions.
+
+    Args:
+        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        target: True poses, `(n, 7)`.
+
+    Returns:
+        Distances (m), `(n,)`.
+    """
     return np.linalg.norm(predicted[:, :3] - target[:, :3], axis=-1)
 
 
 def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Angle between orientations, radians `(n,)` in [0, pi], from poses `(n, 7)` with unit quaternions."""
+    """Compute the angles between predicted and true orientations.
+
+    Args:
+        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        target: True poses, `(n, 7)`.
+
+    Returns:
+        Angles (rad), from 0 to pi, `(n,)`.
+    """
     dot = np.abs((predicted[:, 3:].astype(np.float64) * target[:, 3:]).sum(-1))
     return 2 * np.arccos(np.minimum(dot, 1))
 
 
 def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Angle between the up axes of two orientations, radians `(n,)` in [0, pi].
+    """Compute the angles between predicted and true up axes, which are the z axes of the objects.
 
-    A turn about the axis itself does not count. It is invisible for round objects.
+    A rotation about the up axis has no effect. It is invisible for round objects.
+
+    Args:
+        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        target: True poses, `(n, 7)`.
+
+    Returns:
+        Angles (rad), from 0 to pi, `(n,)`.
     """
     w, x, y, z = (np.stack([predicted, target])[..., i].astype(np.float64) for i in range(3, 7))
     up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w**2 - x**2 - y**2 + z**2], -1)
@@ -84,10 +128,13 @@ def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def best_of(errors: Sequence[ImageError]) -> ImageError:
-    """The error of each item's best sample: the one with the smallest excess.
+    """Select the sample with the smallest excess of each item.
 
     Args:
-        errors: One per sample.
+        errors: The errors of the first sample of all items, of the second sample of all items, and so on.
+
+    Returns:
+        The errors of the best samples.
     """
     excess = np.stack([error.excess for error in errors])
     best, item = excess.argmin(0), np.arange(excess.shape[1])
@@ -95,24 +142,30 @@ def best_of(errors: Sequence[ImageError]) -> ImageError:
 
 
 def gradient_energy(images: np.ndarray) -> np.ndarray:
-    """Sum of the squared differences of neighbouring pixels along both axes, `(*n,)`.
+    """Compute the sum of the squared differences of neighbouring pixels along both axes, a measure of sharpness.
 
     Args:
-        images: Grey values in [0, 1], `(*n, height, width, 3)`.
+        images: Images in [0, 1], `(*n, height, width, 3)`.
+
+    Returns:
+        Sums over pixels and channels, `(*n,)`.
     """
     down, across = (np.diff(images, axis=axis) for axis in (-3, -2))
     return (down.astype(np.float64) ** 2).sum((-3, -2, -1)) + (across.astype(np.float64) ** 2).sum((-3, -2, -1))
 
 
 def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Energy score of samples of a position, `E|X - y| - E|X - X'| / 2`, in the unit of the positions, `(n,)`.
+    """Compute the energy score `E|X - y| - E|X - X'| / 2` of samples X of a position, whose true value is y.
 
-    The second mean is taken over the k (k - 1) pairs of different samples, so that the expectation does not depend on
-    k. The score of one sample is its distance, so that a deterministic prediction scores its absolute error.
+    X' is another sample. The second mean is taken over the k (k - 1) pairs of different samples, so the expected score
+    does not depend on k. The score of a single sample is its distance from the true position.
 
     Args:
-        samples: `(k, n, d)`.
-        target: `(n, d)`.
+        samples: k samples of the positions, `(k, n, d)`.
+        target: True positions, `(n, d)`.
+
+    Returns:
+        Scores in the unit of the positions, `(n,)`. Lower is better.
 
     Source: Gneiting and Raftery (2007), Strictly proper scoring rules, prediction, and estimation.
     """
@@ -125,43 +178,50 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> np.ndarray:
-    """Whether the target lies in the central region of some samples, `(n,)`. The mean over items is the coverage.
+    """Determine whether true positions lie in the central region of their samples.
 
-    The target and the k samples are ranked by their mean distance from each other. The region leaves out the
-    outermost points. For a calibrated predictor the target is a draw like the samples, whatever their distribution, so
-    that its rank is one of 1 to k + 1 with equal probability. A rank r counts `level (k + 1) - (r - 1)`, limited to
-    [0, 1], so that the mean is `level` for every k. Points of equal distance share the mean of their counts.
+    The mean of the results over all items is the coverage. It equals `level` for a calibrated predictor, for every k
+    and every distribution.
+
+    The true position and its k samples are sorted by their mean distance from each other, the most central point first.
+    If the predictor is calibrated, the true position has the distribution of the samples, so each rank r from 1 to
+    k + 1 has the same probability. The result is `level (k + 1) - (r - 1)`, limited to [0, 1]. It is 1 for inner ranks,
+    0 for outer ranks, and a fraction for the rank at the border of the region. Points of equal mean distance share the
+    mean of their results.
 
     Args:
-        samples: `(k, n, d)`, k >= 1.
-        target: `(n, d)`.
-        level: Probability of the region.
+        samples: k samples of the positions, `(k, n, d)`, k >= 1.
+        target: True positions, `(n, d)`.
+        level: Probability of the central region.
+
+    Returns:
+        Numbers from 0 (outside) to 1 (inside), `(n,)`.
     """
     points = np.concatenate([target[None], samples]).astype(np.float64)
     outlying = np.linalg.norm(points[:, None] - points[None], axis=-1).sum(1)  # (k + 1, n)
-    # Sums of the same distances differ by rounding.
+    # Equal sums may differ by rounding, because their terms are added in another order.
     tolerance = 1e-9 * outlying.max(0)
     inner = (outlying < outlying[0] - tolerance).sum(0)
-    ties = (np.abs(outlying - outlying[0]) <= tolerance).sum(0)  # the target included
+    ties = (np.abs(outlying - outlying[0]) <= tolerance).sum(0)  # includes the target
 
-    def counted(ranks: np.ndarray) -> np.ndarray:  # sum of the counts of ranks 1 to `ranks`
+    def counted(ranks: np.ndarray) -> np.ndarray:  # sum of the results of ranks 1 to `ranks`
         return np.minimum(ranks, level * len(points))
 
     return (counted(inner + ties) - counted(inner)) / ties
 
 
 def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
-    """The central pose of some samples.
+    """Compute the central pose of samples.
 
-    Its position has the smallest mean distance from the samples (geometric median). Its orientation is that of the
-    sample with the smallest mean angle to the others.
+    The position is the geometric median: the point with the smallest mean distance from the samples. The orientation is
+    that of the sample with the smallest mean angle to the other samples.
 
     Args:
-        samples: `(k, n, 7)`, unit quaternions.
-        iterations: Iterations of Weiszfeld's method.
+        samples: k samples of n poses with unit quaternions, `(k, n, 7)`.
+        iterations: Number of iterations of Weiszfeld's method, which computes the geometric median.
 
     Returns:
-        `(n, 7)`.
+        Central poses, `(n, 7)`.
     """
     place = samples[..., :3].astype(np.float64)
     middle = place.mean(0)
@@ -175,32 +235,36 @@ def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
 
 
 def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -> np.ndarray:
-    """Minus the logarithm of the true outcome's probability, nats `(n,)`.
+    """Compute minus the logarithm of the true outcomes' probabilities.
 
     Args:
-        probability: `(n, c)`.
-        label: The column of the true outcome, int `(n,)`.
-        floor: Smaller probabilities count as this, so that no single item decides the mean.
+        probability: Probabilities of c outcomes for n items, `(n, c)`.
+        label: Columns of the true outcomes, int `(n,)`.
+        floor: Smallest probability that is used. Smaller ones are raised to it, so that no single item dominates the
+            mean.
+
+    Returns:
+        Log losses (nats), `(n,)`.
     """
     return -np.log(np.maximum(probability[np.arange(len(label)), label], floor))
 
 
 class Reliability(NamedTuple):
-    """Frequency of outcomes that were predicted with similar confidence, in bins."""
+    """The probabilities of likeliest outcomes and their frequencies, in bins of the probability."""
 
-    confidence: np.ndarray  # (bins,) mean probability of the likeliest outcome, nan in empty bins
-    accuracy: np.ndarray  # (bins,) share of the items in which that outcome came true
-    items: np.ndarray  # (bins,) number of items, weighted
+    confidence: np.ndarray  # (bins,): mean probability of the likeliest outcome, NaN in empty bins
+    accuracy: np.ndarray  # (bins,): share of items whose likeliest outcome is the true one, NaN in empty bins
+    items: np.ndarray  # (bins,): number of items, or sum of their weights
 
 
 def reliability(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> Reliability:
-    """How often the likeliest outcome came true, against its probability.
+    """Compare the probability of the likeliest outcome with the share of items in which it is the true one.
 
     Args:
-        confidence: Probability of the likeliest outcome, `(n,)`.
-        right: Whether it came true, bool `(n,)`.
+        confidence: Probability of the likeliest outcome of each item, `(n,)`.
+        right: True if the likeliest outcome is the true one, bool `(n,)`.
         weight: Weights of the items, `(n,)` (default: 1).
         bins: Number of bins of equal width in [0, 1].
     """
@@ -214,9 +278,19 @@ def reliability(
 def calibration_error(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> float:
-    """Expected calibration error: the mean over items of |accuracy - confidence| of their bins.
+    """Compute the expected calibration error: the mean over items of |accuracy - confidence| of their bins.
 
-    The arguments are those of `reliability`.
+    The accuracy of a bin is the share of its items whose likeliest outcome is the true one. Its confidence is the mean
+    probability of the likeliest outcome.
+
+    Args:
+        confidence: Probability of the likeliest outcome of each item, `(n,)`.
+        right: True if the likeliest outcome is the true one, bool `(n,)`.
+        weight: Weights of the items, `(n,)` (default: 1).
+        bins: Number of bins of equal width in [0, 1].
+
+    Returns:
+        The error, or NaN if the sum of the weights is 0.
 
     Source: Guo et al. (2017), On calibration of modern neural networks.
     """
@@ -227,12 +301,15 @@ def calibration_error(
 
 
 def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Area under the ROC curve: the probability that a positive item scores above a negative one. Ties count half.
+    """Compute the area under the ROC curve: the probability that a positive item scores above a negative one.
 
     Args:
-        positive: bool `(n,)`.
-        score: `(n,)`.
+        positive: True for positive items, bool `(n,)`.
+        score: Scores of the items, `(n,)`. Pairs with equal scores count half.
         weight: Weights of the items, `(n,)` (default: 1).
+
+    Returns:
+        The area, or NaN if all items with a weight above 0 are positive or all are negative.
     """
     w = np.ones(len(score)) if weight is None else weight
     _, place = np.unique(score, return_inverse=True)
@@ -242,7 +319,15 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
 
 
 def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """The weighted median, which is the mean of the lower and the upper median, or nan if there is no weight."""
+    """Compute the weighted median, the mean of the lower and the upper median.
+
+    Args:
+        values: Values of the items, `(n,)`.
+        weight: Weights of the items, `(n,)` (default: 1).
+
+    Returns:
+        The median, or NaN if the sum of the weights is 0.
+    """
     w = np.ones(len(values)) if weight is None else weight
     order = np.argsort(values, kind="stable")
     upto = np.cumsum(w[order])
@@ -253,7 +338,16 @@ def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
 
 
 def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Mean over the classes that occur of the share of their items that are predicted correctly."""
+    """Compute the balanced accuracy: the mean, over the classes, of the share of their items predicted correctly.
+
+    Args:
+        predicted: Predicted classes, int `(n,)`.
+        target: True classes, int `(n,)`. Only classes that occur here are used.
+        weight: Weights of the items, `(n,)` (default: 1).
+
+    Returns:
+        The balanced accuracy, or NaN if the sum of the weights is 0.
+    """
     w = np.ones(len(target)) if weight is None else weight
     shares = []
     for label in np.unique(target):
@@ -264,10 +358,15 @@ def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndar
 
 
 def best_threshold(score: np.ndarray, positive: np.ndarray) -> float:
-    """The threshold above which a score predicts `positive` with the best balanced accuracy.
+    """Find the threshold for which `score > threshold` predicts `positive` with the best balanced accuracy.
 
-    If only one class occurs, the threshold is half the smallest score (all are positive) or twice the largest score
-    (none is positive).
+    Args:
+        score: Scores of the items, `(n,)`.
+        positive: True for positive items, bool `(n,)`.
+
+    Returns:
+        The threshold. If all items are positive, it is half the smallest score. If none is positive, it is twice the
+        largest score.
     """
     if positive.all():
         return float(score.min()) / 2
@@ -282,16 +381,17 @@ def best_threshold(score: np.ndarray, positive: np.ndarray) -> float:
 def bootstrap(
     groups: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], *, num: int = 2000, seed: int = 0
 ) -> np.ndarray:
-    """Distribution of a statistic when whole groups (objects) are drawn with replacement.
+    """Compute a statistic for bootstrap samples, in which whole groups of items are drawn with replacement.
 
     Args:
-        groups: The group of each item, `(n,)`.
-        statistic: Maps item weights `(n,)` to a value or array of values.
-        num: Number of draws.
-        seed: Seed of the draws.
+        groups: Group of each item, such as its object, `(n,)`.
+        statistic: Function of the weights of the items, `(n,)`, that returns a value or an array of values. The weight
+            of an item is how often its group was drawn.
+        num: Number of bootstrap samples.
+        seed: Seed of the random numbers.
 
     Returns:
-        `(num, ...)` values.
+        Values of the statistic, `(num, ...)`.
     """
     rng = np.random.default_rng(seed)
     _, member = np.unique(groups, return_inverse=True)
@@ -301,10 +401,11 @@ def bootstrap(
 
 
 def interval(draws: np.ndarray) -> tuple[float, float]:
-    """The central 95 % of bootstrap draws, ignoring draws in which the statistic is undefined."""
+    """Compute a 95 % interval from bootstrap values: their 2.5 % and 97.5 % quantiles, without NaN."""
     low, high = np.nanpercentile(draws, [2.5, 97.5])
     return float(low), float(high)
 
 
 def _xlogx(x: np.ndarray) -> np.ndarray:
+    """x log x, with the value 0 at x = 0."""
     return np.where(x > 0, x * np.log(np.where(x > 0, x, 1)), 0)

@@ -1,4 +1,4 @@
-"""Outcomes of predictions, and probabilities of outcomes."""
+"""Outcomes from predicted poses and images, and probabilities of outcomes from samples."""
 
 import enum
 from collections.abc import Sequence
@@ -13,34 +13,52 @@ OUTCOMES: tuple[enum.IntEnum, ...] = tuple(physics.Outcome)
 
 
 def named(outcome: int, outcomes: Sequence[enum.IntEnum] = OUTCOMES) -> str:
-    """The name of an outcome, such as `fell_off`, among the outcomes of a scenario."""
+    """The name of the outcome with a number, such as `fell_off`, given the outcomes of the scenario."""
     return next(one.name.lower() for one in outcomes if int(one) == outcome)
 
 
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """`scenario.outcome` of first and last poses `(n, 7)`, true or predicted."""
+    """Determine the outcomes of trajectories from their first and last poses.
+
+    Args:
+        scenario: The scenario of the trajectories.
+        first: First poses, `(n, 7)`.
+        last: Last poses, true or predicted, `(n, 7)`.
+
+    Returns:
+        Numbers of the outcomes, int `(n,)`.
+    """
     return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
 
 
 def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
-    """Probabilities `(n, c)` of outcomes from samples of the outcome.
+    """Estimate the probabilities of outcomes from samples.
 
-    One more sample is spread evenly over the outcomes, so that no probability is 0.
+    A probability is the share of the samples with this outcome. One additional sample is spread evenly over all
+    outcomes, so no probability is 0.
 
     Args:
-        outcome: Outcome of each sample, int `(k, n)`.
-        outcomes: `scenario.outcomes`, in the order of the columns.
+        outcome: Number of the outcome of each of k samples for n items, int `(k, n)`.
+        outcomes: The c outcomes of the scenario, `scenario.outcomes`.
+
+    Returns:
+        Probabilities, `(n, c)`, with the columns in the order of `outcomes`.
     """
     counts = (outcome[..., None] == np.array([int(one) for one in outcomes])).sum(0)
     return (counts + 1 / len(outcomes)) / (len(outcome) + 1)
 
 
 def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
-    """Frequency of each outcome `(c,)`, with one more item that is spread evenly, so that no frequency is 0.
+    """Compute the frequencies of the outcomes among training trajectories.
+
+    One additional trajectory is spread evenly over all outcomes, so no frequency is 0.
 
     Args:
-        outcome: Outcomes of training trajectories, int `(n,)`.
-        outcomes: `scenario.outcomes`.
+        outcome: Number of the outcome of each trajectory, int `(n,)`.
+        outcomes: The c outcomes of the scenario, `scenario.outcomes`.
+
+    Returns:
+        Frequencies, `(c,)`, in the order of `outcomes`.
     """
     return shares(outcome[:, None], outcomes)[0]
 
@@ -48,20 +66,32 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
 def outcome_of_image(
     visual: np.ndarray, blank: np.ndarray, threshold: float, stays: int = int(physics.Outcome.RESTS)
 ) -> np.ndarray:
-    """The outcome from an image: `FELL_OFF` if its distance from the empty image is at most a threshold.
+    """Determine from the last visual images whether the objects fell off.
 
-    Other distinctions depend on how an object lies on the pad, which is not read from images.
+    The outcome is `FELL_OFF` if the image is almost that of the sensor without an object. The outcomes of objects that
+    stay on the pad depend on their poses, and this function does not distinguish them.
 
     Args:
-        visual: Images `(n, height, width, 3)` in [0, 1].
-        blank: The image of the untouched sensor, `(height, width, 3)`.
-        threshold: Largest `emptiness` of an image without an object.
-        stays: The outcome of the other images.
+        visual: Images in [0, 1], `(n, height, width, 3)`.
+        blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
+        threshold: Largest result of `emptiness` for an image without an object.
+        stays: Number of the outcome of all other images.
+
+    Returns:
+        Numbers of the outcomes, int `(n,)`.
     """
     empty = emptiness(visual, blank) <= threshold
     return np.where(empty, int(physics.Outcome.FELL_OFF), stays)
 
 
 def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Mean absolute difference `(n,)` of images `(n, height, width, 3)` in [0, 1] from the empty sensor's."""
+    """Mean absolute difference of images from that of the sensor without an object. It is 0 for an empty image.
+
+    Args:
+        visual: Images in [0, 1], `(n, height, width, 3)`.
+        blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
+
+    Returns:
+        Differences, `(n,)`, in [0, 1].
+    """
     return np.abs(visual - blank).mean((1, 2, 3))

@@ -1,4 +1,4 @@
-"""Predictions of the images and poses at the end of held-out trajectories, from any subset of a model's inputs."""
+"""Predictions of the last frames of held-out trajectories, from any subset of a model's inputs."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -12,38 +12,45 @@ from sts_jax.dataset import Pairs
 from sts_jax.evaluation.metrics import best_threshold
 from sts_jax.evaluation.outcomes import emptiness, outcome_of_image, outcome_of_pose, shares
 
-TRUE_STATE = "visual and the true state"  # inputs that a simulation provides: pose, shape and mass of the object
-_CHUNK = 64  # items predicted by one call
+TRUE_STATE = "visual and the true state"  # the true state: pose, shape and mass of the object, from the simulation
+_CHUNK = 64  # number of trajectories that one call predicts
 
 
 class Predicted(NamedTuple):
-    """The predicted last moment of `n` trajectories. Quantities that are not predicted are None.
+    """The predicted last frames of n trajectories. Quantities that are not predicted are None.
 
-    With samples, `visual` and `tactile` are their means and `pose` is a point prediction.
+    A prediction is a single frame, or a distribution that is given by k samples. In the second case, `visual` and
+    `tactile` are the means of the samples, and `pose` is a central pose.
     """
 
-    visual: np.ndarray | None = None  # (n, height, width, 3), float in [0, 1] or uint8
-    tactile: np.ndarray | None = None  # (n, height, width, 3), float in [0, 1] or uint8
-    pose: np.ndarray | None = None  # float (n, 7)
-    outcome: np.ndarray | None = None  # int (n,), physics.Outcome
-    samples: "Predicted | None" = None  # k draws of the whole prediction, (k, n, ...), or None if it is deterministic
-    outcome_probability: np.ndarray | None = None  # float (n, c), in the order of `scenario.outcomes`
+    visual: np.ndarray | None = None  # visual images, (n, height, width, 3), float in [0, 1] or uint8
+    tactile: np.ndarray | None = None  # tactile images, (n, height, width, 3), float in [0, 1] or uint8
+    pose: np.ndarray | None = None  # float (n, 7): position (m) and quaternion
+    outcome: np.ndarray | None = None  # int (n,): number of the outcome, one of `Scenario.outcomes`
+    samples: "Predicted | None" = None  # k samples with a further first axis, (k, n, ...), or None for a single frame
+    outcome_probability: np.ndarray | None = None  # float (n, c), in the order of `Scenario.outcomes`
 
 
 def first(predicted: Predicted, count: int) -> Predicted:
-    """The prediction for the first `count` items."""
+    """The prediction for the first `count` trajectories only."""
     return _mapped(lambda leaves, axis: leaves[0][:count] if axis == 0 else leaves[0][:, :count], [predicted])
 
 
 def joined(parts: Sequence[Predicted]) -> Predicted:
-    """One prediction for the items of several predictions of the same quantities, in order."""
+    """Concatenate several predictions of the same quantities into one prediction for all their trajectories."""
     return _mapped(np.concatenate, parts)
 
 
 def _mapped(
     function: Callable[[Sequence[np.ndarray], int], np.ndarray], parts: Sequence[Predicted], axis: int = 0
 ) -> Predicted:
-    """Apply a function of several arrays and their axis of items to every quantity of several predictions."""
+    """Combine several predictions into one, quantity by quantity.
+
+    Args:
+        function: Function of the arrays of one quantity, one from each prediction, and of their axis of trajectories.
+        parts: The predictions.
+        axis: The axis of trajectories: 0 for predictions, 1 for samples.
+    """
 
     def apply(leaves: Sequence[np.ndarray | None]) -> np.ndarray | None:
         there = [leaf for leaf in leaves if leaf is not None]
@@ -61,21 +68,21 @@ def _mapped(
 
 
 def in_unit(image: np.ndarray) -> np.ndarray:
-    """Grey values in [0, 1] of an image of `uint8` or of floats in [0, 1]."""
+    """Convert an image of `uint8` to float32 in [0, 1]. An image of floats in [0, 1] stays the same."""
     return image.astype(np.float32) / 255 if image.dtype == np.uint8 else image
 
 
 @runtime_checkable
 class Forecaster(Protocol):
-    """A model of the last moment, such as `sts_jax.Predictor`."""
+    """A model that predicts the last frame from the first one, such as `sts_jax.Predictor`."""
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """The inputs that it accepts, some of `visual`, `tactile` and `pose`."""
+        """The inputs that the model accepts: some of `visual`, `tactile` and `pose`."""
 
     @property
     def preprocessing(self) -> training.Preprocessing:
-        """How it encodes poses, for the input `state`."""
+        """The preprocessing of the model. Its scaling of poses is needed for the input `state`."""
 
     def __call__(
         self,
@@ -88,23 +95,27 @@ class Forecaster(Protocol):
         key: Any = None,
         num_samples: int = 0,
     ) -> Any:
-        """Predict from the modalities that are given.
+        """Predict from the inputs that are not None. `sts_jax.Predictor` describes the arguments.
 
         Returns:
-            An object with `visual`, `tactile`, `pose`, `outcome_probability` and `samples` as in
+            An object with the fields `visual`, `tactile`, `pose`, `outcome_probability` and `samples` of
             `sts_jax.predict.Prediction`.
         """
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: Any = None) -> Any:
-        """Predict without any input."""
+        """Predict without any input but the condition, for a batch of the given shape."""
 
 
 def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tuple[str, ...]]:
-    """All subsets of the inputs of a model, by a description such as "from visual and pose".
+    """List all subsets of the inputs of a model.
 
     Args:
-        modalities: The inputs of the model. If it has none, the only subset is the empty one.
-        state: Whether the model also accepts the true state beside a visual image, as state-space models do.
+        modalities: The inputs of the model, `predictor.modalities`. Without any, the only subset is the empty one.
+        state: True if the model also accepts the true state (pose, shape and mass) together with a visual image.
+            State-space models accept it.
+
+    Returns:
+        The subsets, by descriptions such as "from visual and pose".
     """
     usable = tuple(modalities)
     if not usable:
@@ -129,25 +140,28 @@ def predict(
     blank: np.ndarray | None = None,
     num_samples: int = 0,
 ) -> Predicted:
-    """The prediction of a model for held-out trajectories, from some of its inputs.
+    """Predict the last frames of held-out trajectories with a model, from some of its inputs.
 
-    The outcome is that of the pose. With samples, its probabilities are the shares of the samples' outcomes, unless the
-    model predicts them itself. In a scenario with two outcomes, the outcome of a model without a pose depends on
-    whether its image is empty, if `validation` and `blank` are given. Otherwise it has no outcome.
+    The predicted outcome follows from the predicted pose. The outcome probabilities are those of the model if it
+    predicts them. Otherwise they are the shares of the outcomes among the samples, if there are samples.
+
+    A model that predicts no pose has an outcome only if the scenario has two outcomes and `validation` and `blank` are
+    given. Its outcome is then `FELL_OFF` if the predicted visual image is empty.
 
     Args:
         predictor: The model.
-        inputs: Some of its modalities, and possibly `state`. Empty for the prediction without any input.
-        test: The held-out trajectories, with images of the resolution that the model takes.
+        inputs: Some of `predictor.modalities`, and possibly `state`, the true state. An empty list predicts without any
+            input.
+        test: The held-out trajectories, with images of the resolution that the model expects.
         scenario: The scenario of the trajectories.
-        validation: Trajectories on which the threshold of an empty image is chosen.
-        blank: The visual image of the untouched sensor, `(height, width, 3)` in [0, 1].
+        validation: Trajectories on which the threshold for an empty image is chosen.
+        blank: Visual image of the sensor without an object, in [0, 1], `(height, width, 3)`.
         num_samples: Number of samples of each prediction, or 0 for none.
     """
     names = tuple(inputs)
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
-        """Predict in calls of equal size, which bounds the memory. The last call repeats an item to be as long."""
+        """Predict in calls of equal size, which limits the memory. The last call is padded with its last trajectory."""
         count = len(pairs.object)
         size, parts = min(count, _CHUNK), []
         for number, start in enumerate(range(0, count, size)):
@@ -171,7 +185,7 @@ def predict(
 def _asked(
     predictor: Forecaster, names: tuple[str, ...], pairs: Pairs, rows: np.ndarray, num_samples: int, seed: int
 ) -> Predicted:
-    """The prediction for some items, from the inputs `names`, with images of samples in `uint8`."""
+    """Predict the trajectories `rows` of `pairs` from the inputs `names`. The images of samples become `uint8`."""
     condition = pairs.condition[rows] if pairs.condition.shape[1] else None
     if names:
         out = predictor(
@@ -196,6 +210,7 @@ def _asked(
 
 
 def _true_states(predictor: Forecaster, pairs: Pairs, rows: np.ndarray) -> np.ndarray:
+    """The true states of the trajectories `rows`, in the encoding of the model."""
     return training.state_codes(
         predictor.preprocessing, pairs.pose[rows, 0], pairs.support[rows], pairs.mass[rows], pairs.com[rows]
     )

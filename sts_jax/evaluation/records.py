@@ -1,4 +1,7 @@
-"""The records of an evaluation: `Scores`, the errors of a predictor, and `Metric`, a column of a table."""
+"""The types of an evaluation: `Scores`, the errors of a predictor, and `Metric`, a number computed from them.
+
+An item is one held-out trajectory. n is the number of items.
+"""
 
 import dataclasses
 import functools
@@ -12,80 +15,87 @@ from sts_jax.dataset import Pairs
 from sts_jax.evaluation.metrics import ImageError
 from sts_jax.evaluation.predictions import Predicted
 
-Statistic = Callable[[np.ndarray], float]  # a number as a function of the weights of the items (n,)
-Errors = Callable[[Predicted, Pairs], np.ndarray | None]  # one number per item (n,)
+Statistic = Callable[[np.ndarray], float]  # a function of the weights of the items (n,) that returns a number
+Errors = Callable[[Predicted, Pairs], np.ndarray | None]  # returns one number per item (n,)
 
 
 class Scores(NamedTuple):
-    """Errors of one predictor, per item. The errors of quantities that it does not predict are None.
+    """Errors of one predictor for n held-out trajectories. Errors of quantities that it does not predict are None.
 
-    The fields from `coverage` to `fell_off` are for predicted distributions. The energy score of a deterministic
-    position is its error.
+    For a prediction without samples, `coverage` and `best` are None, and the energy score is the position error. For a
+    prediction without outcome probabilities, `log_loss`, `confidence`, `right` and `fell_off` are None.
     """
 
-    visual: ImageError | None
-    visual_object: ImageError | None
-    tactile: ImageError | None
-    tactile_object: ImageError | None
-    position: np.ndarray | None  # m (n,)
-    angle: np.ndarray | None  # rad (n,)
-    axis: np.ndarray | None  # rad (n,), of the up axes
-    outcome: np.ndarray | None  # int (n,)
-    energy: np.ndarray | None = None  # m (n,), energy score of the position
-    coverage: np.ndarray | None = None  # (n,), see `metrics.coverage`
-    best: ImageError | None = None  # visual error of each item's sample with the smallest excess
-    gradient: np.ndarray | None = None  # (n,) gradient energy of the image, or mean over the visual samples
-    gradient_target: np.ndarray | None = None  # (n,) gradient energy of the true images
-    log_loss: np.ndarray | None = None  # nats (n,), of the outcome
-    confidence: np.ndarray | None = None  # (n,) probability of the likeliest outcome
-    right: np.ndarray | None = None  # bool (n,), whether that outcome came true
-    fell_off: np.ndarray | None = None  # (n,) probability of FELL_OFF
-    further: dict[str, np.ndarray] | None = None  # (n,) each, the `errors` of metrics by their name
+    visual: ImageError | None  # error of the visual images
+    visual_object: ImageError | None  # error of the visual images over the object's pixels in the true last frame
+    tactile: ImageError | None  # error of the tactile images
+    tactile_object: ImageError | None  # error of the tactile images over the object's pixels in the true last frame
+    position: np.ndarray | None  # (n,): distance of the predicted from the true position (m)
+    angle: np.ndarray | None  # (n,): angle between the predicted and the true orientation (rad)
+    axis: np.ndarray | None  # (n,): angle between the predicted and the true up axis (rad)
+    outcome: np.ndarray | None  # int (n,): number of the predicted outcome
+    energy: np.ndarray | None = None  # (n,): energy score of the position (m)
+    coverage: np.ndarray | None = None  # (n,): 0 to 1, see `metrics.coverage`
+    best: ImageError | None = None  # error of the visual sample with the smallest excess of each item
+    gradient: np.ndarray | None = None  # (n,): gradient energy of the visual image, or its mean over the visual samples
+    gradient_target: np.ndarray | None = None  # (n,): gradient energy of the true visual image
+    log_loss: np.ndarray | None = None  # (n,): minus the logarithm of the true outcome's probability (nats)
+    confidence: np.ndarray | None = None  # (n,): probability of the likeliest outcome
+    right: np.ndarray | None = None  # bool (n,): true if the likeliest outcome is the true one
+    fell_off: np.ndarray | None = None  # (n,): probability that the object falls off
+    further: dict[str, np.ndarray] | None = None  # (n,) each: the results of `Metric.errors`, by the metric's name
 
     def first(self, count: int) -> "Scores":
-        """The errors of the first `count` items."""
+        """Return the errors of the first `count` items."""
         cut: Scores = jax.tree.map(lambda leaf: leaf[:count], self)  # None stays None
         return cut
 
 
 class Judged(NamedTuple):
-    """The errors of one predictor, and the reference and the truth of the same items."""
+    """The input of `Metric.statistic`: the errors of one predictor, the errors of the constant, and the true items."""
 
-    scores: Scores
-    constant: Scores  # of the constant prediction, the reference of the skill
-    test: Pairs
+    scores: Scores  # errors of the predictor
+    constant: Scores  # errors of the constant prediction for the same items, to which the skill is relative
+    test: Pairs  # the items
 
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """A number that summaries and tables have for each predictor.
+    """A number that describes the quality of a predictor in summaries and tables.
 
-    Predicted images are too large to keep, so a metric is computed in two steps. `score` calls `errors`, which makes
-    one number per item of a prediction. `summarise` calls `statistic`, which makes a function of the weights of the
-    items of these numbers. The bootstrap over objects evaluates that function. Without `statistic`, the metric is the
-    weighted mean of `errors`. A metric of the errors that `Scores` has anyway needs no `errors`.
+    A metric is computed in two steps, because predicted images are too large to keep. First, `score` calls `errors`,
+    which returns one number per item. Then `summarise` calls `statistic`, which returns a function of the weights of
+    the items. The bootstrap over objects evaluates this function with many weights.
+
+    A metric needs at least one of the two functions. Without `statistic`, it is the weighted mean of `errors`. Without
+    `errors`, `statistic` uses the fields of `Scores`.
 
     Raises:
-        ValueError: The metric has neither `errors` nor a `statistic`, its name is empty, or a field is out of range.
+        ValueError: The metric has neither `errors` nor `statistic`, its name is empty, or a field is out of range.
     """
 
-    name: str  # under which summaries list it
-    errors: Errors | None = None  # of a prediction of n items, `(n,)`, or None if it does not predict the quantity
-    unit: str = ""  # of the column, shown in brackets
-    digits: int = 3  # decimals in the column
-    factor: float = 1.0  # from the number in the summary (SI units) to the column's unit, such as 1e3 for mm
-    heading: str = ""  # of the column (default: the name, with spaces)
-    statistic: Callable[[Judged], Statistic | None] | None = None  # None if a predictor does not have the metric
-    interval: bool = True  # whether the column shows the interval
-    column: bool = True  # whether the complete table has the metric. Summaries always have it.
-    # "higher" or "lower", the better values. A metric with a direction is a column of the differences from baselines.
+    name: str  # name of the metric in summaries
+    # Function of the predictions and the true items that returns one number per item, `(n,)`. It returns None if the
+    # predictor does not predict the quantity.
+    errors: Errors | None = None
+    unit: str = ""  # unit in the table, in brackets behind the heading
+    digits: int = 3  # number of decimals in the table
+    factor: float = 1.0  # value in the table divided by the value in the summary (SI units), such as 1e3 for mm
+    heading: str = ""  # heading of the column in the table (default: the name, with spaces)
+    # Function that returns the metric as a function of the weights of the items, `(n,)`. It returns None if the
+    # predictor does not predict the quantity.
+    statistic: Callable[[Judged], Statistic | None] | None = None
+    interval: bool = True  # true if the table shows the interval
+    column: bool = True  # true if the complete table has the metric (summaries always have it)
+    # "higher" or "lower": which values are better. The complete table then also shows the differences from the
+    # baselines. None: it does not.
     compared: str | None = None
-    note: str = ""  # a sentence above the table that explains the metric
+    note: str = ""  # sentences above the table that explain the metric
 
     def __post_init__(self) -> None:
         if not self.name:
             raise ValueError(
-                "name of a metric is empty: give the name under which summaries list it, such as 'height_error'"
+                "name of a metric is empty: give the name that it has in summaries, such as 'height_error'"
             )
         if self.errors is None and self.statistic is None:
             raise ValueError(f"metric {self.name!r} has neither errors nor statistic: give a function as one of them")
@@ -96,12 +106,19 @@ class Metric:
 
     @property
     def title(self) -> str:
-        """The heading of its column, with the unit."""
+        """The heading of the column, with the unit."""
         heading = self.heading or self.name.replace("_", " ")
         return f"{heading} ({self.unit})" if self.unit else heading
 
     def of(self, judged: Judged) -> Statistic | None:
-        """The metric of one predictor as a function of the weights of its items, or None if it does not have it."""
+        """Return the metric of one predictor as a function of the weights of the items, `(n,)`.
+
+        Args:
+            judged: The errors of the predictor.
+
+        Returns:
+            The function, or None if the predictor does not predict the quantity.
+        """
         if self.statistic is not None:
             return self.statistic(judged)
         values = (judged.scores.further or {}).get(self.name)
@@ -109,12 +126,12 @@ class Metric:
 
 
 class Column(NamedTuple):
-    """A column of the short table: one metric, or several of one quantity with a slash between them."""
+    """A column of the short table: one metric, or several metrics with a slash between their values."""
 
     heading: str
     metrics: tuple[Metric, ...]
 
 
 def mean(values: np.ndarray, weight: np.ndarray) -> float:
-    """The weighted mean, or nan if there is no weight."""
+    """The weighted mean, or nan if the sum of the weights is 0."""
     return float((weight * values).sum() / weight.sum()) if weight.sum() > 0 else float("nan")

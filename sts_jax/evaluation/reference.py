@@ -1,4 +1,4 @@
-"""Baselines, which predict without learning, and the names of the reference predictors."""
+"""Baselines, which predict without a trained model, and the names of all reference predictors."""
 
 import numpy as np
 
@@ -15,14 +15,25 @@ CEILINGS = (CEILING, ONE_REROLL)
 
 
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
-    """Predictions without learning: the mean target, the input itself, the target of the nearest input, and a rule.
+    """Predict the last frame without a trained model, in four ways.
 
-    The neighbour is the training item whose first visual image is nearest in squared distance. The squared distance of
-    the condition, if there is one, has the same weight: both are divided by their variance in the training set, the
-    condition number by number.
+    - The constant is the mean last frame of the training trajectories. Its outcome is the most frequent one, and its
+      outcome probabilities are the frequencies.
+    - The copy predicts that the last frame equals the first one.
+    - The nearest neighbour is the last frame of one training trajectory: the one whose first visual image has the
+      smallest squared distance. If the scenario has a condition, its squared distance is added. Images and conditions
+      have the same weight, because each distance is divided by the variance in the training set, separately for each
+      number of the condition.
+    - The rule "rests below its start" keeps x, y and the orientation of the first pose. Its height is the median height
+      of the training objects that stay on the pad. It predicts no images.
 
-    The rule keeps x, y and the orientation of the start, at the median height of the training objects that stay on
-    the pad. It predicts no images.
+    Args:
+        scenario: The scenario of the trajectories.
+        train: The training trajectories.
+        test: The held-out trajectories.
+
+    Returns:
+        The predictions for `test`, by the names BASELINES.
     """
     inputs = train.visual[:, 0].reshape(len(train.visual), -1).astype(np.float32)
     queries = test.visual[:, 0].reshape(len(test.visual), -1).astype(np.float32)

@@ -1,4 +1,8 @@
-"""The best possible prediction, from repeated simulations of a start with other hidden values."""
+"""The ceiling: the best possible prediction of a last frame from the first pose.
+
+It comes from re-rolls. A re-roll is another simulation of the same first pose and condition with newly drawn hidden
+values. Hidden values are properties that a camera cannot see, such as the fill level and the friction.
+"""
 
 import concurrent.futures
 import os
@@ -19,7 +23,7 @@ from sts_jax.physics.simulation import ATTEMPTS
 from sts_jax.sensor import Sensor
 
 RENDER_BATCH = 32  # frames rendered by one compiled call
-_SAME = 1e-4  # largest difference of a first pose from the given start (m, or entries of a quaternion)
+_SAME = 1e-4  # largest difference between the first poses of a re-roll and its item (m, or entries of a quaternion)
 
 
 def ceiling(
@@ -31,28 +35,31 @@ def ceiling(
     *,
     progress: Callable[[int], object] | None = None,
 ) -> Predicted:
-    """The best prediction from a first pose and condition alone: ends with newly drawn hidden values.
+    """Compute the best possible prediction from the first pose and the condition, by repeated simulation.
 
-    Each item's object is released at rest from its first pose, `times` times. The true end is another such draw, so
-    that this distribution is calibrated, and no predictor from shape, pose and condition has a better expected log loss
-    or excess than infinitely many re-rolls. Touch in the first moment reveals a part of the hidden values, so that a
-    model that uses it can exceed this ceiling.
+    Each item (held-out trajectory) is simulated again `times` times. Its object is released at rest in its first pose,
+    each time with newly drawn hidden values such as fill level and friction. The true last frame is one more draw from
+    the same distribution, so the prediction is calibrated. With infinitely many re-rolls, no predictor that knows only
+    shape, pose and condition has a better expected log loss or excess.
+
+    The tactile image of the first frame reveals a part of the hidden values. A model that uses this image can
+    therefore exceed the ceiling.
 
     Args:
         collection: The collection of the items.
-        sensor: The sensor that renders the ends.
-        test: The items. Ends are rendered as in the collection, at the resolution of the items.
-        times: Number of re-rolls per item.
+        sensor: The sensor that renders the last frames.
+        test: The items. The last frames get the resolution of their images.
+        times: Number of re-rolls per item, >= 1.
         key: The random key of the re-rolls.
-        progress: Called with the number of simulated re-rolls.
+        progress: Function that is called with the number of finished re-rolls.
 
     Returns:
-        Means over the re-rolls, `metrics.centre` of their poses, and the re-rolls as samples (images in `uint8`). The
-        outcome probabilities are their `shares`.
+        A prediction with the re-rolls as samples (images in `uint8`). Its images are their means, its pose is
+        `metrics.centre` of their poses, and its outcome probabilities are `shares` of their outcomes.
 
     Raises:
         ValueError: `times` is below 1.
-        RuntimeError: A re-roll did not begin at its item's first pose.
+        RuntimeError: A re-roll did not begin in the first pose of its item, because of an error in the library.
     """
     if times < 1:
         raise ValueError(f"times must be >= 1, got {times}")
@@ -66,7 +73,10 @@ def ceiling(
     first = np.asarray(traj.pose[:, 0]).reshape(len(test.object), times, 7)
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
-        raise RuntimeError(f"a re-roll began {off:.3g} from its item's first pose: simulate changed its keys")
+        raise RuntimeError(
+            f"a re-roll began {off:.3g} from the first pose of its item: simulate changed its keys, and _replayed in "
+            "rerolls.py must follow"
+        )
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])
 
@@ -88,10 +98,10 @@ def ceiling(
 def _replayed(
     scenario: physics.Scenario, pose: np.ndarray, condition: np.ndarray, times: int, key: PRNGKeyArray
 ) -> Any:
-    """The scenario with given starts: every trajectory of body i begins at rest at `pose[i]`.
+    """A copy of the scenario with given first poses: every trajectory of body i begins at rest in `pose[i]`.
 
-    `simulate` does not accept starts but draws them from keys. The scenario therefore finds the index of the body by
-    comparing its key with the keys of all bodies.
+    `simulate` draws first poses from keys and cannot be given any. The new scenario therefore finds the index of the
+    body: it compares the key that it receives with the keys of all bodies.
     """
 
     @jax.jit
@@ -104,10 +114,10 @@ def _replayed(
     known, body = np.asarray(key_of(*index)), index[0]
 
     class Replayed(type(scenario)):  # type: ignore[misc]  # any of the scenarios
-        """A scenario whose starts are given instead of drawn."""
+        """A scenario whose first poses are given instead of drawn."""
 
         def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-            """The start of the body with this key, not finite if there is none."""
+            """The start of the body with this key. Its pose is NaN if no body has the key."""
             del shape, pad
             same = (jnp.asarray(known) == jax.random.key_data(key)).all(-1)
             mine = jnp.asarray(body)[jnp.argmax(same)]
@@ -126,9 +136,9 @@ def _drawn(
     wrench: np.ndarray,
     size: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render both streams of all ends (`uint8`), object by object, in calls of equal size and one thread per core.
+    """Render both streams of all last frames (`uint8`), object by object, with one thread per CPU core.
 
-    The images have the resolution of the collection, or are reduced to `size` if that is not its height.
+    The images have the resolution of the collection. They are reduced to `size` if its height is not `size`.
     """
     same = size == collection.resolution[0]
     jobs = [

@@ -1,4 +1,4 @@
-"""Errors of predictions of the last moment, per item."""
+"""Errors of predictions of the last frame. An item is one held-out trajectory."""
 
 import enum
 import functools
@@ -34,18 +34,23 @@ def score(
     frequency: np.ndarray | None = None,
     metrics: Sequence[Metric] = METRICS,
 ) -> Scores:
-    """Errors per item of a prediction of the last moment.
+    """Compute the errors of a predictor, for each held-out trajectory (item).
 
-    With `outcome_probability` and `frequency`, the outcome that is judged is the one with the largest ratio of
-    probability to frequency. This decision has the best expected balanced accuracy, in which a rare outcome counts as
-    much as a common one.
+    The predicted outcome follows from the probabilities of the outcomes, if the prediction has them and `frequency` is
+    given. It is the outcome with the largest ratio of probability to frequency. This decision has the best expected
+    balanced accuracy, in which a rare outcome counts as much as a common one.
 
     Args:
-        predicted: Prediction of all items, or of the first ones only.
+        predicted: The prediction of all items, or of the first ones only.
         test: The held-out items.
-        outcomes: `scenario.outcomes`, for predictions with `outcome_probability`.
-        frequency: Frequency of each outcome among training trajectories, from `frequency`.
-        metrics: The `errors` of these metrics are computed too.
+        outcomes: The outcomes of the scenario, `scenario.outcomes`. They are needed if the prediction has
+            `outcome_probability`.
+        frequency: Frequency of each outcome among the training trajectories, `(c,)`, from `evaluation.frequency`. None
+            keeps the outcome of the prediction, or takes the likeliest one if the prediction has none.
+        metrics: Metrics whose `errors` are computed too.
+
+    Returns:
+        The errors of the items that are predicted.
 
     Raises:
         ValueError: `outcome_probability` has another number of columns than `outcomes`, or the `errors` of a metric
@@ -63,12 +68,15 @@ def score(
 def scorer(
     scenario: physics.Scenario, train: Pairs, *, metrics: Sequence[Metric] = METRICS
 ) -> Callable[[Predicted, Pairs], Scores]:
-    """`score` for the outcomes of a scenario, with their frequencies among some training trajectories.
+    """Return a function that calls `score` with the outcomes of a scenario and their frequencies in the training set.
 
     Args:
         scenario: The scenario of the trajectories.
-        train: Training trajectories.
-        metrics: See `score`.
+        train: The training trajectories.
+        metrics: Metrics whose `errors` are computed too.
+
+    Returns:
+        A function of a prediction and of the held-out items that returns their `Scores`.
     """
     return functools.partial(
         score,
@@ -99,7 +107,7 @@ def _of_point(predicted: Predicted, test: Pairs) -> Scores:
 
 
 def _with_samples(scores: Scores, predicted: Predicted, test: Pairs) -> Scores:
-    """Add the scores of the samples. A deterministic prediction has an energy score and a gradient too."""
+    """Add the errors of the samples. A prediction without samples gets an energy score and a gradient energy too."""
     samples, truth, place = predicted.samples or Predicted(), test.visual[:, 1] / 255, test.pose[:, 1, :3]
     if samples.pose is not None:
         scores = scores._replace(
@@ -121,7 +129,7 @@ def _with_samples(scores: Scores, predicted: Predicted, test: Pairs) -> Scores:
 
 
 def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> dict[str, np.ndarray] | None:
-    """The `errors` of some metrics by their names, or None if there are none."""
+    """Call the `errors` of some metrics. Return the results by the names of the metrics, or None without results."""
     found = {}
     for metric in metrics:
         values = None if metric.errors is None else metric.errors(predicted, test)
@@ -143,7 +151,7 @@ def _with_probability(
     outcomes: Sequence[enum.IntEnum],
     frequency: np.ndarray | None,
 ) -> Scores:
-    """Add the scores of the outcome probabilities."""
+    """Add the errors of the outcome probabilities."""
     if probability.shape != (len(test.outcome), len(outcomes)):
         raise ValueError(
             f"outcome_probability has shape {probability.shape}, expected {(len(test.outcome), len(outcomes))} (one "

@@ -1,4 +1,4 @@
-"""The trajectories of a dataset that train, validate and test a model."""
+"""The split of a dataset into trajectories for training, validation and test."""
 
 from collections.abc import Sequence
 
@@ -8,26 +8,30 @@ from sts_jax.dataset import Dataset
 
 
 def train_share(shares: Sequence[float], split: str) -> float:
-    """The share of the objects, or of the trajectories, that is used for training.
+    """The share of the objects or trajectories that is used for training.
 
     Args:
-        shares: The shares of training, validation and test objects that the collection states.
-        split: `object` if whole objects are held out, `trajectory` if trajectories are. The latter split has no
-            validation part, as in the paper.
+        shares: Shares of the objects for training, validation and test, `Collection.shares`.
+        split: `object` if whole objects are held out, `trajectory` if single trajectories are held out. As in the
+            paper, a split by trajectory has no validation part. Its share is added to the training part.
     """
     return shares[0] if split == "object" else 1 - shares[2]
 
 
 def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
-    """Indices of the trajectories with images that are for training, validation and test.
+    """Split the trajectories with images into parts for training, validation and test.
 
     Args:
         data: The dataset.
-        split: `object` holds out whole objects. `trajectory` holds out shuffled trajectories, so that the parts have
-            objects in common, as in the paper. Its validation part is the training part.
+        split: `object` holds out whole objects, as `Dataset.split` lists them. `trajectory` holds out random
+            trajectories as in the paper, so training and test have objects in common.
+
+    Returns:
+        Indices of the trajectories, int `(n,)`, for each of `train`, `validation` and `test`. With
+        `split="trajectory"`, the validation part equals the training part.
 
     Raises:
-        ValueError: The split is neither of these.
+        ValueError: `split` is another word.
     """
     if split == "object":
         return {name: data.members(name) for name in ("train", "validation", "test")}

@@ -1,4 +1,4 @@
-"""The metrics of several predictors with their intervals over objects, as numbers."""
+"""`summarise` computes the metrics of several predictors, with bootstrap intervals over objects."""
 
 import enum
 from collections.abc import Mapping, Sequence
@@ -22,21 +22,30 @@ def summarise(
     num: int = 2000,
     seed: int = 0,
 ) -> dict:
-    """All metrics of all predictors with 95 % intervals over objects, and their differences from the baselines.
+    """Compute all metrics of all predictors, and their differences from the baselines.
+
+    Each value has a 95 % bootstrap interval over objects.
 
     Args:
-        scores: Scores by name, including the baselines. A predictor may have scores of the first items only. Its
-            metrics are then over these.
-        test: The items that were scored.
-        metrics: The metrics. Those with `errors` must have been given to `score` too.
-        outcomes: `scenario.outcomes`, for their names.
-        num: Number of bootstrap draws.
-        seed: Seed of the draws.
+        scores: Scores of the predictors by name, including those of `evaluation.baselines`. A predictor may have scores
+            of the first items only. Its metrics are then means over these items.
+        test: The held-out trajectories (items) that were scored.
+        metrics: The metrics. `score` must have been called with those that have `errors`.
+        outcomes: The outcomes of the scenario, `scenario.outcomes`, for their names.
+        num: Number of bootstrap samples.
+        seed: Seed of the bootstrap.
 
     Returns:
-        A dictionary for JSON: `items`, `objects`, `outcomes`, `scored` (name -> number of items), `predictors`
-        (name -> metric -> value, low, high), and `differences` of the others from the baselines (name -> baseline ->
-        metric -> value, low, high). A metric that a predictor does not have is None.
+        A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value`,
+        `low` and `high`, or None if the predictor does not have it.
+
+        - `items`: Number of items.
+        - `objects`: Number of different objects among the items.
+        - `outcomes`: Number of items with each true outcome, by the name of the outcome.
+        - `scored`: Number of items that were scored, by the name of the predictor.
+        - `predictors`: The metrics, by the names of predictor and metric.
+        - `differences`: The metrics of a predictor minus those of a baseline, by the names of predictor, baseline and
+          metric. Baselines and ceilings are not among these predictors.
 
     Raises:
         ValueError: Two metrics have the same name, or `scores` lacks a baseline.
@@ -53,7 +62,7 @@ def summarise(
     statistics = {name: _statistics(scores, name, scored[name], test, metrics) for name in names}
 
     def numbers(weight: np.ndarray) -> np.ndarray:
-        """All metrics of all predictors, (predictors, metrics), nan where a predictor does not have a metric."""
+        """All metrics, `(predictors, metrics)`, for given weights of the items. A metric that does not exist is NaN."""
         rows = [
             [np.nan if statistic is None else statistic(weight[: scored[name]]) for statistic in statistics[name]]
             for name in names
@@ -82,17 +91,17 @@ def summarise(
 
 
 def gain(before: Scores, after: Scores, test: Pairs, *, num: int = 2000, seed: int = 0) -> dict | None:
-    """The share of the outcome's log loss of one predictor that another one removes, with its 95 % interval.
+    """Compute the relative reduction of the outcome's log loss from one predictor to another: 1 - after / before.
 
     Args:
-        before: Scores of a predictor, for instance from vision.
-        after: Scores of the other one, for instance from vision and touch.
-        test: The items that were scored.
-        num: Number of bootstrap draws over objects.
-        seed: Seed of the draws.
+        before: Scores of the first predictor, for instance from vision.
+        after: Scores of the second predictor, for instance from vision and touch.
+        test: The held-out trajectories that were scored.
+        num: Number of bootstrap samples over objects.
+        seed: Seed of the bootstrap.
 
     Returns:
-        `value`, `low` and `high`, or None if a predictor has no outcome probabilities.
+        `value` and the limits `low` and `high` of its 95 % interval. None if a predictor has no outcome probabilities.
     """
     if before.log_loss is None or after.log_loss is None:
         return None
@@ -105,6 +114,7 @@ def gain(before: Scores, after: Scores, test: Pairs, *, num: int = 2000, seed: i
 
 
 def _cell(number: float, sample: np.ndarray) -> dict | None:
+    """A value and its interval from bootstrap samples, or None if the value is not finite."""
     if not np.isfinite(number):
         return None
     low, high = interval(sample)
@@ -112,7 +122,7 @@ def _cell(number: float, sample: np.ndarray) -> dict | None:
 
 
 def _count(own: Scores, items: int) -> int:
-    """Number of items that a predictor was scored on."""
+    """The number of items for which a predictor has scores."""
     errors = (error.excess for error in (own.visual, own.tactile) if error is not None)
     leaves = (*errors, own.position, own.outcome, *(own.further or {}).values())
     return next((len(leaf) for leaf in leaves if leaf is not None), items)
@@ -121,6 +131,6 @@ def _count(own: Scores, items: int) -> int:
 def _statistics(
     scores: Mapping[str, Scores], name: str, count: int, test: Pairs, metrics: Sequence[Metric]
 ) -> list[Statistic | None]:
-    """The metrics of a predictor, each as a function of the weights of its items."""
+    """The metrics of a predictor, each as a function of the weights of its items, or None."""
     judged = Judged(scores[name], scores[CONSTANT].first(count), Pairs(*(leaf[:count] for leaf in test)))
     return [metric.of(judged) for metric in metrics]

@@ -1,4 +1,4 @@
-"""A summary as two Markdown tables, a short and a complete one."""
+"""Markdown tables of a summary: `table` with the main metrics and `full_table` with all metrics."""
 
 from collections.abc import Sequence
 
@@ -14,14 +14,17 @@ def table(
     notes: Sequence[str] = (),
     columns: Sequence[Column] = COLUMNS,
 ) -> str:
-    """The main metrics as a Markdown table.
+    """Format the main metrics as a Markdown table.
 
     Args:
-        summary: From `summarise`.
-        title: The heading.
-        rows: Names of the predictors, in order (default: all).
+        summary: The result of `summarise`.
+        title: Heading above the table.
+        rows: Names of the predictors, in the order of the rows (default: all).
         notes: Lines below the table.
         columns: The columns.
+
+    Returns:
+        The text, with an explanation of the metrics above the table.
 
     Raises:
         ValueError: The summary lacks the metric of a column.
@@ -37,13 +40,16 @@ def table(
 
 
 def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics: Sequence[Metric] = METRICS) -> str:
-    """All metrics of all predictors as a Markdown table, followed by the differences from the baselines.
+    """Format all metrics as a Markdown table, followed by a table of the differences from the baselines.
 
     Args:
-        summary: From `summarise`.
-        title: The heading.
+        summary: The result of `summarise`.
+        title: Heading above the tables.
         notes: Lines below the tables.
         metrics: The metrics, in the order of the columns.
+
+    Returns:
+        The text, with an explanation of the metrics above the tables.
 
     Raises:
         ValueError: The summary lacks a metric.
@@ -54,7 +60,7 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
     for name, own in summary["predictors"].items():
         lines.append(_row([name, *(_shown(own, metric, interval=metric.interval) for metric in shown)]))
     compared = [metric for metric in shown if metric.compared is not None]
-    lines += ["", _directions(compared), "", *_head(["predictor", "against", *(metric.title for metric in compared)])]
+    lines += ["", _directions(compared), "", *_head(["predictor", "baseline", *(metric.title for metric in compared)])]
     for name, against in summary["differences"].items():
         for base, own in against.items():
             cells = [_shown(own, metric, interval=True) for metric in compared]
@@ -64,6 +70,7 @@ def full_table(summary: dict, *, title: str, notes: Sequence[str] = (), metrics:
 
 
 def _check(summary: dict, metrics: Sequence[Metric]) -> None:
+    """Raise an error if the summary lacks a metric."""
     known: dict = next(iter(summary["predictors"].values()), {})
     missing = [metric.name for metric in metrics if metric.name not in known]
     if missing:
@@ -79,7 +86,7 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _shown(own: dict, metric: Metric, *, interval: bool) -> str:
-    """The cell of a metric, "-" if the predictor does not have it."""
+    """The text of a cell: the value of a metric, or "-" if the predictor does not have the metric."""
     found = own[metric.name]
     if found is None:
         return "-"
@@ -88,8 +95,8 @@ def _shown(own: dict, metric: Metric, *, interval: bool) -> str:
 
 
 def _directions(compared: Sequence[Metric]) -> str:
-    """A sentence on which differences favour a predictor."""
-    text = "Differences from the baselines."
+    """Sentences above the differences: for which metrics a positive or a negative difference is better."""
+    text = "Differences from the baselines (predictor minus baseline)."
     for sign, direction in (("positive", "higher"), ("negative", "lower")):
         titles = [
             metric.heading or metric.name.replace("_", " ") for metric in compared if metric.compared == direction
@@ -100,14 +107,16 @@ def _directions(compared: Sequence[Metric]) -> str:
 
 
 def _above(summary: dict, metrics: Sequence[Metric]) -> str:
-    """The items that were held out, and the notes on the metrics."""
+    """The text above the tables: the number of held-out trajectories, and explanations of the metrics."""
     outcomes = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in summary["outcomes"].items())
     text = (
-        f"{summary['items']} held-out trajectories of {summary['objects']} objects ({outcomes}). In brackets: 95 % "
-        "intervals, bootstrapped over objects."
+        f"{summary['items']} held-out trajectories of {summary['objects']} objects ({outcomes}). Brackets contain "
+        "95 % bootstrap intervals over objects."
     )
     fewer = [
-        f"{name}: the first {count} of them" for name, count in summary["scored"].items() if count < summary["items"]
+        f'The metrics of "{name}" are over the first {count} trajectories.'
+        for name, count in summary["scored"].items()
+        if count < summary["items"]
     ]
     explained = dict.fromkeys(metric.note for metric in metrics if metric.note)
-    return " ".join([text, *(f"{'; '.join(fewer)}." for _ in fewer[:1]), *explained])
+    return " ".join([text, *fewer, *explained])

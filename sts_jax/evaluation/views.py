@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, ScalarLike
 from sts_jax import geometry, optics
 from sts_jax.objects import Body
 
-_THICKNESS = 0.012  # m, thickness of the part of the sensor's housing that is drawn
+_THICKNESS = 0.012  # m, thickness of the box that is drawn as the housing of the sensor
 _PAD = optics.to_linear(jnp.array([178.0, 178.0, 204.0]) / 255)
 _HOUSING = jnp.array([0.05, 0.05, 0.055])
 
@@ -25,15 +25,16 @@ def outside(
     *,
     resolution: tuple[int, int] = (160, 160),
 ) -> Float[Array, "h w 3"]:
-    """Render the object and the pad from outside, in a three-quarter view.
+    """Render the object and the pad from outside, obliquely from above.
 
     Args:
         body: The object.
-        pose: Mesh frame in the sensor frame.
-        size: Size of the pad along x and y (m), `(2,)`.
-        up: The vertical in the sensor frame, of any length, which gives the tilt of the pad (default: level).
-        wall: Height of a stop wall at the pad's edge of largest y (m).
-        resolution: (height, width), pixels.
+        pose: Pose of the mesh frame in the sensor frame, position (m) and quaternion.
+        size: Size of the pad along x and y (m).
+        up: Vector of any length that points upwards, in the sensor frame. It determines the tilt of the pad (default:
+            the pad is level).
+        wall: Height of the stop wall at the pad's edge of largest y (m), 0 for none.
+        resolution: Height and width of the image (pixels).
 
     Returns:
         Image, sRGB in [0, 1].

@@ -1,4 +1,4 @@
-"""Figures of predictions, training and simulation, each written to one file."""
+"""Figures of predictions, training and simulation. Each function writes one file."""
 
 from sts_jax.evaluation.figures.comparison import comparison
 from sts_jax.evaluation.figures.curves import Trained, scaling, training_curves

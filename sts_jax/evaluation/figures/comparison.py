@@ -1,4 +1,4 @@
-"""A figure that compares images of several predictors side by side."""
+"""A figure that shows images of several predictors side by side."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,15 +12,15 @@ from sts_jax.evaluation.figures import drawing
 def comparison(
     path: Path, groups: Sequence[Mapping[str, np.ndarray]], labels: Sequence[str], *, title: str, heads: Sequence[str]
 ) -> None:
-    """Draw one row of images for each trajectory, in groups of columns with a gap between them.
+    """Draw the images of n trajectories, one trajectory per row, with the columns in groups.
 
     Args:
-        path: The PNG to write.
-        groups: In each group, the images of all trajectories by the title of their column, (n, height, width, 3) in
-            [0, 1].
-        labels: Of the rows, `n` of them.
+        path: The PNG file to write.
+        groups: Groups of columns. A group contains the images of each column by its title, in [0, 1],
+            `(n, height, width, 3)`.
+        labels: Labels of the n rows.
         title: Title of the figure.
-        heads: Of the groups.
+        heads: Titles of the groups.
     """
     rows, widths = len(labels), [len(group) for group in groups]
     figure = plt.figure(figsize=(1.5 * sum(widths) + 0.8, 1.42 * rows + 1.3))

@@ -1,4 +1,4 @@
-"""Curves over training, each figure written to one file."""
+"""Figures of training curves and of the skill over the amount of training. Each function writes one file."""
 
 import collections
 from collections.abc import Mapping, Sequence
@@ -12,27 +12,27 @@ from sts_jax.evaluation.figures import drawing
 
 
 class Trained(NamedTuple):
-    """One trained model of a scaling curve."""
+    """One trained model, which is a point of a scaling curve."""
 
-    name: str  # of the line, such as the inputs or the model
+    name: str  # name of the curve in the legend, such as the inputs of the model
     trajectories: int  # number of training trajectories
-    steps: int  # gradient steps
-    minutes: float  # training time
-    skill: float
-    low: float  # of the 95 % interval
-    high: float
+    steps: int  # number of gradient steps
+    minutes: float  # training time (minutes)
+    skill: float  # visual skill on held-out objects
+    low: float  # lower limit of the 95 % interval of the skill
+    high: float  # upper limit of the 95 % interval of the skill
 
 
 def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
-    """Draw visual skill on held-out objects against the number of training trajectories and against training time.
+    """Draw the visual skill of trained models over the number of training trajectories and over the training time.
 
-    In the left panel, a line joins the models that share a name and a number of gradient steps. In the right panel, it
-    joins those that share a name and a number of trajectories.
+    In the left panel, a line connects models with the same name and number of gradient steps. In the right panel, a
+    line connects models with the same name and number of training trajectories.
 
     Args:
-        path: The PNG to write.
+        path: The PNG file to write.
         points: The trained models.
-        ceiling: Skill of the best possible prediction, drawn as a line.
+        ceiling: Skill of the best possible prediction, drawn as a horizontal line.
         title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
@@ -47,7 +47,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
             own = [point for point in points if (point.name, getattr(point, fixed)) == group]
             own = sorted(own, key=lambda point: getattr(point, along))
             if len(own) < 2 and any(count > 1 for name, count in sizes if name == group[0]):
-                continue  # other groups show how this model scales
+                continue  # a single point shows no trend, and another line of the same name does
             skill = np.array([point.skill for point in own])
             spread = [skill - [point.low for point in own], [point.high for point in own] - skill]
             label = f"{group[0]}, {unit.format(group[1])}"
@@ -79,18 +79,21 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
 
 
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
-    """Draw loss, KL and the reconstruction of each modality against the gradient step, one line per model.
+    """Draw the terms of the training loss over the gradient steps, with one panel per term and one line per model.
+
+    The terms are `loss`, the KL divergences `kl` and `look`, and the errors `visual`, `tactile`, `state`, `outcome` and
+    `pose`. Terms that no log contains are omitted.
 
     Args:
-        path: The PNG to write.
-        logs: The log of each model: dictionaries with `step`, `loss`, `kl` and one number per modality.
+        path: The PNG file to write.
+        logs: The training log of each model by name: one dictionary with `step` and the terms for each logged step.
     """
     keys = [
         key
         for key in ("loss", "kl", "look", "visual", "tactile", "state", "outcome", "pose")
         if any(key in e for log in logs.values() for e in log)
     ]
-    # A state-space model predicts a density of the final pose. Its squared error is that of the first pose, the state.
+    # For a state-space model, `pose` is the nats of a density, and `state` is the squared error of the first pose.
     squared = "state" if any("state" in entry for log in logs.values() for entry in log) else "pose"
     units = {squared: "squared error (scaled pose)"}
     figure, axes = plt.subplots(1, len(keys), figsize=(3.6 * len(keys), 3.2), squeeze=False)
@@ -100,10 +103,10 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
             if points:
                 axis.plot(*zip(*points, strict=True), label=name, linewidth=1)
         axis.set_xlabel("gradient step")
-        axis.set_ylabel(units.get(key, "nats an item"))
+        axis.set_ylabel(units.get(key, "nats per item"))
         axis.set_title(key, fontsize=9)
         if key == "loss" and all(entry[key] > 0 for log in logs.values() for entry in log if key in entry):
-            axis.set_yscale("log")  # models with different numbers of subsets differ in scale
+            axis.set_yscale("log")  # the loss is a sum over subsets, whose number differs between models
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=7)
     drawing.save(figure, path)

@@ -1,4 +1,4 @@
-"""Drawing and saving that all figures share."""
+"""Functions that all figures use to draw images and to save files."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from sts_jax._files import write_whole
 
 
 def show(axis: Axes, image: np.ndarray) -> None:
-    """Draw an image in [0, 1] without ticks."""
+    """Draw an image in [0, 1], without ticks."""
     axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
     axis.set_xticks([])
     axis.set_yticks([])
 
 
 def save(figure: plt.Figure, path: Path) -> None:
-    """Write a figure as PNG and close it."""
+    """Write a figure as a PNG file, and close the figure."""
     figure.set_layout_engine("constrained")
     try:
         write_whole(path, lambda temporary: figure.savefig(temporary, format="png", dpi=130))

@@ -1,4 +1,4 @@
-"""Figures of predictions of held-out trajectories, each written to one file."""
+"""Figures of predictions of held-out trajectories. Each function writes one file."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,8 +16,8 @@ from sts_jax.evaluation.outcomes import OUTCOMES, named
 from sts_jax.evaluation.predictions import Predicted, in_unit
 from sts_jax.evaluation.records import Scores
 
-SAMPLES = 4  # samples shown of each prediction
-_POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of possible and of predicted ends
+SAMPLES = 4  # number of samples that are shown for each prediction
+_POSSIBLE, _PREDICTED = "tab:blue", "tab:orange"  # colours of simulated and of predicted last poses
 
 
 def predictions(
@@ -29,19 +29,20 @@ def predictions(
     title: str,
     scenario: physics.Scenario | None = None,
 ) -> None:
-    """Draw input, truth, prediction and samples of the first `num` held-out trajectories, with a row for each stream.
+    """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
 
-    A red arrow on the input shows the velocity over the pad that a freely sliding object receives (`Scenario.drift`),
-    unless it is 0. A quarter of the picture is 1 m/s.
+    Each stream of a trajectory is a row. A red arrow on the first image shows the velocity over the pad that a freely
+    sliding object receives (`Scenario.drift`). There is no arrow if this velocity is 0. An arrow over a quarter of the
+    image is 1 m/s.
 
     Args:
-        path: The PNG to write.
-        test: Held-out trajectories, in the dataset's order.
-        predicted: Predictions of these, or of the first ones. A stream that is not predicted has no rows.
-        num: Number of trajectories.
+        path: The PNG file to write.
+        test: The held-out trajectories.
+        predicted: Predictions for all of them, or for the first ones. A stream that is not predicted has no rows.
+        num: Number of trajectories to draw, from the first one on.
         title: Title of the figure.
-        scenario: The scenario of the trajectories, for the names of its outcomes and the arrows (None: no arrows, and
-            the names of `physics.Outcome`).
+        scenario: The scenario of the trajectories, which gives the names of the outcomes and the arrows. None draws no
+            arrows and uses the names of `physics.Outcome`.
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
     samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
@@ -75,17 +76,17 @@ def predictions(
             middle = np.array([width - 1, height - 1]) / 2
             tip = middle + drift[item] * width / 4
             axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
-    arrows = "\nred: the velocity over the pad that a freely sliding object receives" if drift.any() else ""
+    arrows = "\nred arrow: velocity over the pad that a freely sliding object receives" if drift.any() else ""
     figure.suptitle(title + arrows, fontsize=11)
     drawing.save(figure, path)
 
 
 def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
-    """Draw how often the likeliest outcome came true against its probability, with the number of items below.
+    """Draw the frequency of the likeliest outcome over its predicted probability, with the number of items below.
 
     Args:
-        path: The PNG to write.
-        scores: Scores by name. Each predictor with outcome probabilities gives one column.
+        path: The PNG file to write.
+        scores: Scores by name. Each predictor with outcome probabilities has a column in the figure.
         title: Title of the figure.
     """
     judged = {
@@ -115,8 +116,8 @@ def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None
         below.bar_label(bars, [f"{count:.0f}" if count else "" for count in found.items], fontsize=8)
         below.set_xlabel("predicted probability\nof the likeliest outcome")
         above.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("share in which it came true\n(dashed: calibrated)")
-    axes[1, 0].set_ylabel("number of items")
+    axes[0, 0].set_ylabel("frequency of this outcome\n(dashed: calibrated)")
+    axes[1, 0].set_ylabel("number of\ntrajectories")
     axes[0, 0].set_xlim(0, 1)
     axes[0, 0].set_ylim(0, 1.02)
     axes[1, 0].margins(y=0.2)
@@ -134,35 +135,37 @@ def ends(
     *,
     title: str,
 ) -> None:
-    """Draw the possible ends of one start beside the predicted ones, on the pad from above, oriented as the images.
+    """Draw the possible last positions of one trajectory beside the predicted ones, with the pad seen from above.
+
+    The y axis points down, as in the images.
 
     Args:
-        path: The PNG to write.
-        size: Size of the pad along x and y (m), `(2,)`.
+        path: The PNG file to write.
+        size: Size of the pad along x and y (m).
         start: First pose, `(7,)`.
-        truth: Last pose, `(7,)`.
-        rerolled: Last poses with other hidden values, `(m, 7)`.
-        sampled: Last poses that a model drew, `(k, 7)`.
+        truth: True last pose, `(7,)`.
+        rerolled: Last poses of simulations with newly drawn hidden values, `(m, 7)`.
+        sampled: Samples of the last pose from a model, `(k, 7)`.
         title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)
     half = 500 * np.asarray(size)  # mm
     panels = (
-        (f"simulator: {len(rerolled)} draws of the hidden values", "simulated end", rerolled, _POSSIBLE),
-        (f"model: {len(sampled)} samples", "predicted end", sampled, _PREDICTED),
+        (f"simulator: {len(rerolled)} draws of hidden values", "simulated last position", rerolled, _POSSIBLE),
+        (f"model: {len(sampled)} samples", "predicted last position", sampled, _PREDICTED),
     )
     for axis, (head, label, poses, colour) in zip(axes, panels, strict=True):
         axis.add_patch(Rectangle(tuple(-half), *(2 * half), facecolor="0.94", edgecolor="0.4"))
         axis.annotate("pad", -half, (4, -4), textcoords="offset points", va="top", fontsize=9, color="0.4")
-        axis.plot(*(1e3 * start[:2]), "x", color="black", markersize=10, markeredgewidth=2, label="start")
-        axis.plot(*(1e3 * truth[:2]), "*", color="tab:green", markersize=18, label="true end")
+        axis.plot(*(1e3 * start[:2]), "x", color="black", markersize=10, markeredgewidth=2, label="first position")
+        axis.plot(*(1e3 * truth[:2]), "*", color="tab:green", markersize=18, label="true last position")
         axis.plot(*(1e3 * poses[:, :2].T), "o", color=colour, markersize=6, alpha=0.65, label=label)
         axis.set_title(head, fontsize=11)
         axis.set_xlabel("x (mm)")
         axis.set_aspect("equal")
     reach = 1.08 * max(half.max(), 1e3 * np.abs(np.concatenate([rerolled, sampled])[:, :2]).max())
     axes[0].set_xlim(-reach, reach)
-    axes[0].set_ylim(reach, -reach)  # y points to the image's bottom
+    axes[0].set_ylim(reach, -reach)  # y points down, as in the images
     axes[0].set_ylabel("y (mm)")
     handles, labels = axes[0].get_legend_handles_labels()
     model, name = axes[1].get_legend_handles_labels()

@@ -1,4 +1,4 @@
-"""One trajectory over time, as a strip of pictures and as an animation."""
+"""One trajectory over time, as a row of images and as an animation."""
 
 import tempfile
 from pathlib import Path
@@ -14,12 +14,12 @@ from matplotlib.text import Annotation, Text
 from sts_jax._files import write_bytes
 from sts_jax.evaluation.figures import drawing
 
-SLOWER = 2  # factor by which an animation is slower than the motion
-_HEAD, _PANEL = 44, 104  # pixels, height of the lines above the pictures and of one panel of curves below them
+SLOWER = 2  # duration of an animation divided by the duration of the motion
+_HEAD, _PANEL = 44, 104  # pixels, height of the text above the images and of one panel of curves below them
 _MARGINS = (50, 12, 22, 10)  # pixels, of the curves in a panel: left, right, top, bottom
 _DPI = 100  # pixels per inch of an animation
-_HOLD = 1500  # ms, how long the last page is shown
-_REACH = 0.035  # s^2/m, length of gravity's arrow per unit of gravity, as a share of the picture
+_HOLD = 1500  # ms, duration of the last frame
+_REACH = 0.035  # s^2/m, length of the gravity arrow per unit of gravity, as a share of the image's side
 _VISIBLE = 0.1  # m/s^2, smallest component of gravity along the pad that has an arrow
 
 
@@ -36,16 +36,17 @@ def strip(
 ) -> None:
     """Draw one trajectory over time: a view from outside, both streams, and the wrench of the pad on the object.
 
-    The force is below the pictures, and its moment about the sensor's origin is below the force.
+    The images are above two plots, the force and its moment about the sensor's origin.
 
     Args:
-        path: The PNG to write.
-        time: Time of every frame (s), `(frames,)`.
-        view: The scene from outside, `(frames, h, w, 3)`.
-        visual: `(frames, height, width, 3)` in [0, 1].
-        tactile: `(frames, height, width, 3)` in [0, 1].
-        wrench: `(frames, 6)`, N and N m.
-        num: Number of frames that are shown, from the first to the last, denser at the beginning.
+        path: The PNG file to write.
+        time: Times of the frames (s), `(frames,)`.
+        view: Images of the scene from outside, in [0, 1], `(frames, h, w, 3)`.
+        visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
+        tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
+        wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
+        num: Number of frames whose images are drawn, from the first to the last, more densely at the beginning. There
+            are fewer if two of them coincide.
         title: Title of the figure.
     """
     last = len(time) - 1
@@ -94,22 +95,22 @@ def animation(
     outcome: str = "",
     side: int = 240,
 ) -> None:
-    """Write an animation of one trajectory: an outside view, the visual and the tactile stream, and the wrench so far.
+    """Write an animation of one trajectory: a view from outside, both streams, and the wrench up to each frame.
 
-    An arrow on the visual stream shows the component of the apparent gravity along the pad. It is not zero on a slope
-    and while the pad accelerates. The animation is SLOWER times slower than the motion.
+    A red arrow on the visual stream shows the component of the apparent gravity along the pad. It appears on a slope
+    and while the pad accelerates. The animation takes SLOWER times as long as the motion.
 
     Args:
-        path: The GIF to write.
-        time: Time of every frame (s), `(frames,)`.
-        view: The scene from outside, `(frames, h, w, 3)` in [0, 1].
-        visual: `(frames, height, width, 3)` in [0, 1].
-        tactile: `(frames, height, width, 3)` in [0, 1].
-        wrench: `(frames, 6)`, N and N m.
-        gravity: `(frames, 3)`, m/s^2, sensor frame.
-        title: Title above the pictures.
-        outcome: Text that is shown at the end.
-        side: Side of each of the three pictures (pixels).
+        path: The GIF file to write.
+        time: Times of the frames (s), `(frames,)`.
+        view: Images of the scene from outside, in [0, 1], `(frames, h, w, 3)`.
+        visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
+        tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
+        wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
+        gravity: Gravity minus the acceleration of the pad in each frame, sensor frame (m/s^2), `(frames, 3)`.
+        title: Title above the images.
+        outcome: Text above the images in the last frame, such as the outcome.
+        side: Side of each of the three images (pixels).
     """
     width, height = 3 * side, _HEAD + side + 2 * _PANEL
     figure = plt.figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
@@ -127,7 +128,7 @@ def animation(
 
     def draw_page(t: int) -> None:
         last = f": {outcome}" if t == len(time) - 1 else ""
-        clock.set_text(f"{time[t]:.2f} s, at 1/{SLOWER:g} of its speed{last}")
+        clock.set_text(f"{time[t]:.2f} s, at 1/{SLOWER:g} of the true speed{last}")
         for picture, images in zip(pictures, streams.values(), strict=True):
             picture.set_data(np.clip(images[t], 0, 1))
         arrow.xy = tuple(0.5 + _REACH * gravity[t, :2])
@@ -153,29 +154,29 @@ def animation(
 
 
 def _axes(figure: plt.Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Axes at a place that is given in pixels, from the upper left corner of the figure."""
+    """Add axes to a figure, at a position in pixels from its upper left corner."""
     across, down = figure.get_size_inches() * _DPI
     return figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
 
 
 def _picture(axis: Axes, name: str, image: np.ndarray) -> AxesImage:
-    """Draw the first page of a stream. The axes range from 0 to 1, and y points down."""
+    """Draw the first image of a stream. The axes range from 0 to 1, and y points down."""
     axis.set_axis_off()
     axis.text(0.02, 0.98, name, fontsize=8)
     return axis.imshow(np.clip(image, 0, 1), extent=(0, 1, 1, 0), interpolation="bicubic")
 
 
 def _gravity(axis: Axes) -> tuple[Annotation, Text]:
-    """An arrow from the middle of the picture, and its label."""
+    """Add an arrow that starts in the middle of the image, and its label."""
     look = {"arrowstyle": "-|>", "color": "red", "linewidth": 2, "mutation_scale": 12, "shrinkA": 0, "shrinkB": 0}
     arrow = axis.annotate("", (0.5, 0.5), (0.5, 0.5), arrowprops=look)
-    return arrow, axis.text(0.02, 0.02, "gravity's part along the pad", color="red", fontsize=8, va="top")
+    return arrow, axis.text(0.02, 0.02, "gravity along the pad", color="red", fontsize=8, va="top")
 
 
 def _panel(
     figure: plt.Figure, place: int, title: str, symbol: str, time: np.ndarray, values: np.ndarray
 ) -> list[Line2D]:
-    """The axes of three curves below the pictures, and the curves, which are empty."""
+    """Add axes below the images, with three curves that have no points yet. Return the curves."""
     across, down = figure.get_size_inches() * _DPI
     left, right, top, bottom = _MARGINS
     upper = down - (2 - place) * _PANEL

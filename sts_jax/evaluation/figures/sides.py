@@ -1,4 +1,4 @@
-"""Real and simulated images side by side."""
+"""A figure of real and simulated images side by side."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 from sts_jax.evaluation.figures import drawing
 from sts_jax.evaluation.gap import Streams
 
-_PERCENTILE = 99.5  # of the absolute differences, at which the colours end
+_PERCENTILE = 99.5  # percentile of the absolute differences at which the colour scale ends
 
 
 def side_by_side(
@@ -22,18 +22,19 @@ def side_by_side(
     title: str,
     names: tuple[str, str] = ("real", "simulated"),
 ) -> None:
-    """Draw rows of real and simulated images of both streams, with their difference if they are matched.
+    """Draw real and simulated images of both streams in rows, with their difference if they are matched.
 
-    The difference is the mean over the channels of real minus simulated values. Red is brighter in the real image.
+    The difference is the real minus the simulated image, averaged over the channels. Red pixels are brighter in the
+    real image.
 
     Args:
-        path: The PNG to write.
-        real: One image of each stream per row.
-        simulated: Likewise, of the same size.
-        labels: Of the rows.
-        matched: Whether both sides show the same object in the same pose.
+        path: The PNG file to write.
+        real: Real images, one of each stream per row.
+        simulated: Simulated images of the same size, one of each stream per row.
+        labels: Labels of the rows.
+        matched: True if the two images of a row show the same object in the same pose.
         title: Title of the figure.
-        names: Titles of the columns.
+        names: Titles of the columns of real and simulated images.
     """
     rows, kinds = len(labels), 3 if matched else 2
     figure, grid = plt.subplots(
@@ -55,7 +56,7 @@ def side_by_side(
             axis.set_title(f"{stream}:\n{name}", fontsize=10)
         if matched:
             bar = figure.colorbar(drawn, ax=axes[:, 2], location="bottom", shrink=0.95, aspect=14, pad=0.02)
-            bar.set_label("grey levels of 255", fontsize=8)
+            bar.set_label("grey levels (of 255)", fontsize=8)
             bar.ax.tick_params(labelsize=8)
     for axis, label in zip(grid[:, 0], labels, strict=True):
         axis.set_ylabel(label, fontsize=9)
