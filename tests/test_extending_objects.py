@@ -70,8 +70,8 @@ def test_families_with_different_seeds_draw_different_numbers():
         ("teapot", r"category is 'teapot', but it must be one of bottle, .*watch, or 'module:NAME'"),
         ("torus:", "category is 'torus:', but it must be one of"),
         ("no_such_module:RING", "its module cannot be imported .*No module named 'no_such_module'.*install it"),
-        (f"{__name__}:NUMBER", r"NUMBER of test_extending_objects must be an objects\.Family, got int"),
-        (f"{__name__}:ROUND", r"ROUND of test_extending_objects must be an objects\.Family, got NoneType"),
+        (f"{__name__}:NUMBER", r"no variable NUMBER with an objects\.Family, it is of type int"),
+        (f"{__name__}:ROUND", r"test_extending_objects has no variable ROUND with an objects\.Family"),
     ],
 )
 def test_an_unknown_category_is_refused_before_anything_is_collected(tmp_path, category, message):

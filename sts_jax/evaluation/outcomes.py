@@ -13,8 +13,12 @@ OUTCOMES: tuple[enum.IntEnum, ...] = tuple(physics.Outcome)
 
 
 def named(outcome: int, outcomes: Sequence[enum.IntEnum] = OUTCOMES) -> str:
-    """The name of the outcome with a number, such as `fell_off`, given the outcomes of the scenario."""
-    return next(one.name.lower() for one in outcomes if int(one) == outcome)
+    """Return the name of the outcome with a number, such as `fell_off`, given the outcomes of the scenario.
+
+    Raises:
+        KeyError: The scenario has no such outcome.
+    """
+    return {int(one): one.name.lower() for one in outcomes}[outcome]
 
 
 def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndarray) -> np.ndarray:

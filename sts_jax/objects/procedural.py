@@ -88,8 +88,8 @@ def find_family(category: str) -> Family:
         ) from error
     if not isinstance(found, Family):
         raise ValueError(
-            f"category is {category!r}, but {name} of {module} must be an objects.Family, got {type(found).__name__}: "
-            f"assign a Family to {name}"
+            f"category is {category!r}, but {module} has no variable {name} with an objects.Family"
+            f"{'' if found is None else f', it is of type {type(found).__name__}'}: assign a Family to {name}"
         )
     return found
 

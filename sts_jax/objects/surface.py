@@ -50,7 +50,7 @@ def proper(path: Path, surface: Surface) -> Surface:
     faces = surface.faces
     kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not kept.any():
-        raise ValueError(f"{path}: no face has any area: give a mesh with triangles")
+        raise ValueError(f"{path}: each face uses a vertex twice, so none has any area: give a mesh with triangles")
     used, faces = np.unique(faces[kept], return_inverse=True)
     return surface._replace(
         vertices=surface.vertices[used],
