@@ -36,13 +36,13 @@ V4L2_UNIT = 1e-4  # unit of the exposure of a Video4Linux device (s)
 class Config:
     """The devices, the folder, and the source of the lens."""
 
-    camera: str | None = None  # path of the camera such as /dev/v4l/by-id/..., or its URL (default: list cameras, stop)
-    leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0 (default: list ports, stop)
+    camera: str | None = None  # path of the camera such as /dev/v4l/by-id/..., or its URL. None: list cameras and stop
+    leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop
     out: Folder = Path("bench")  # folder for the sensor file
     width: int = 1640  # width of the camera's images (pixels)
     height: int = 1232  # height of the camera's images (pixels)
-    fps: float | None = None  # frames per second (default: the camera's own rate)
-    fourcc: str | None = None  # pixel format of the camera, such as MJPG (default: the driver's)
+    fps: float | None = None  # frames per second. None: the camera's own rate
+    fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the driver
     levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # duty cycles of the LEDs in the tactile stream, 0 to 255
     # folder with PNG pictures of the board, instead of live pictures. In the first one by name, the board lies on the
     # pad
@@ -51,7 +51,7 @@ class Config:
     # diagonal (degrees)
     ideal_lens: float | None = None
     pictures: int = 15  # number of live pictures of the board
-    every: float | None = None  # wait this long at each step instead of for the Enter key (s)
+    every: float | None = None  # time to wait at each step (s). None: wait for the Enter key
     ruler: float = 100.0  # measured length of the ruler on the print (mm). It is 100 if the scale is right
     print_board: Path | None = None  # write the board to this PDF or PNG file and stop
 

@@ -35,13 +35,13 @@ class Config:
 
     real: Folder  # folder of the real images: a session of `experiments.real collect`
     simulated: Folder  # folder of the simulated images: a session, or the dataset of an experiment
-    sensor: Path | None = None  # sensor file of the real images (default: the images are rectified already)
-    simulated_sensor: Path | None = None  # sensor file of a simulated session (default: its images are rectified)
+    sensor: Path | None = None  # sensor file of the real images. None: the images are rectified already
+    simulated_sensor: Path | None = None  # sensor file of a simulated session. None: its images are rectified already
     # number: trajectories of equal number show the same object in the same poses, and other trajectories are ignored.
     # none: both folders show the same object and scenario, but no single images correspond
     match: Literal["number", "none"] = "number"
-    # height and width to which images are reduced before the comparison (pixels). The default is that of the dataset,
-    # or 240 x 320
+    # height and width to which images are reduced before the comparison (pixels). None: those of the dataset, or 240 x
+    # 320
     resolution: tuple[int, int] | None = None
     names: tuple[str, str] = ("real", "simulated")  # titles of the real and the simulated images in the figure
     rows: int = 4  # number of trajectories in the figure. Each has two rows

@@ -50,8 +50,8 @@ class Config:
     """The source of the images, the model, and the outputs."""
 
     sensor: Path | None = None  # sensor file of experiments.commission, or its folder
-    camera: str | None = None  # path or URL of the camera (default: the camera of the sensor file)
-    leds: str | None = None  # serial port of the LED controller (default: found by the sensor file's serial number)
+    camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
+    leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
     replay: tuple[Path, ...] = ()  # play back the folder of a recording, or a visual and a tactile video
     twin: bool = False  # start a digital twin. This is the default if no other source is given
 
@@ -59,7 +59,7 @@ class Config:
     model: str = "released"
     # scenario of a model that is given by its folder. It determines the names of the outcomes
     scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None
-    condition: tuple[float, ...] = ()  # condition of the scenario that the model receives, SI units (default: zeros)
+    condition: tuple[float, ...] = ()  # condition of the scenario that the model receives, SI units. Empty: zeros
     flat: bool = True  # remove vignetting: divide the images by the images of the empty pad in the sensor file
 
     # number of successive images of one stream before the lights switch. A larger number gives more images per second,
@@ -68,7 +68,7 @@ class Config:
     speed: float = 1.0  # speed of a replay. 2 is twice as fast as the recording
     loop: bool = False  # start a replay again when it has ended
     seed: int = 0  # seed of the twin's object and motion
-    seconds: float | None = None  # stop after this time (s) (default: at the end of a replay, otherwise never)
+    seconds: float | None = None  # stop after this time (s). None: stop at the end of a replay, or on Ctrl-C
 
     record: Path | None = None  # record both streams into this new folder
     encoding: Literal["png", "jpeg"] = "png"  # format of recorded images. PNG is lossless, JPEG is faster and smaller

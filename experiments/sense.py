@@ -42,10 +42,10 @@ class Config:
 
     mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, name of an object class, or `classes` for all
     out: Path = Path("sense.png")  # path of the picture
-    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save (default: the paper's sensor)
+    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
     resolution: tuple[int, int] = (480, 640)  # height and width of the images (pixels)
     crop: bool = False  # show only a window around the object, in the image's aspect ratio
-    light: float = 0.5  # share of the LEDs' full power in the third image, 0 to 1
+    light: float = 0.5  # share of the LEDs' full power in the image between visual and tactile, 0 to 1
 
     rest: int = 0  # index of the face on which the object rests. 0 is the most likely one
     position: tuple[float, float] = (0.0, 0.0)  # x and y of the centre of the object's bounding box (m)
@@ -53,13 +53,13 @@ class Config:
     turn: float = 0.0  # turn of the object about the vertical (degrees)
     tilt: tuple[float, float] = (0.0, 0.0)  # tilt of the object away from rest, about x and about y (degrees)
 
-    mass: float | None = None  # mass of the object (kg) (default: that of a shell half full of water)
-    # force of the pad on the object (N), upwards through its centre of mass (default: its weight, or 0 in the air)
+    mass: float | None = None  # mass of the object (kg). None: that of a shell half full of water
+    # force of the pad on the object, upwards through its centre of mass (N). None: its weight, or 0 in the air
     force: float | None = None
 
     longest_side: float | None = None  # scale a mesh file so that its longest side has this length (m)
     scale: float | None = None  # length of one unit of a mesh file (m), such as 0.001 for millimetres
-    up: Literal["x", "y", "z"] | None = None  # axis of a mesh file that points up (default: y for glTF, otherwise z)
+    up: Literal["x", "y", "z"] | None = None  # axis of a mesh file that points up. None: y for glTF, otherwise z
     faces: int | None = None  # reduce a mesh file with more faces to this number
     texture: Path | None = None  # image file to use as the texture of a mesh file
     seed: int = 0  # seed that selects the object of a class

@@ -31,7 +31,7 @@ class Args:
     """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
-    name: str | None = None  # name of the model in the library (default: the name of the work directory)
+    name: str | None = None  # name of the model in the library. None: the name of the work directory
 
 
 def ship(workdir: Path, name: str) -> str:

@@ -33,18 +33,20 @@ class Config:
     # field of view of the fisheye lens across the image's diagonal (degrees). The paper's device has 160. None: frames
     # without lens distortion
     field_of_view: float | None = 160.0
+    # deviations of the camera and the lights from ideal ones
     imperfections: twin.Imperfections = dataclasses.field(default_factory=twin.Imperfections)
 
-    object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"  # one of sts_jax.objects.CATEGORIES
-    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save (default: the paper's sensor)
+    # class of the object, one of sts_jax.objects.CATEGORIES
+    object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"
+    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
     seed: int = 0  # seed of the object, the trajectories and the noise
-    # hold and release the object at random. The value is the mean time of holding plus that of resting (s). Default:
-    # the object moves by command only
+    # hold and release the object at random. The value is the mean time of holding plus that of resting (s). None: the
+    # object moves by command only
     release_every: float | None = None
-    # rendered poses per second of a moving object (default: 10 up to 640 x 480 pixels, fewer for larger frames)
+    # rendered poses per second of a moving object. None: 10 up to 640 x 480 pixels, fewer for larger frames
     motion_rate: float | None = None
 
-    port: Path | None = None  # symbolic link to the serial port, whose own name changes with each start
+    port: Path | None = None  # make this symbolic link to the serial port, whose own name changes with each start
     host: str = "127.0.0.1"  # address on which the HTTP server listens. There is no password
     http_port: int = 0  # TCP port of the HTTP server. 0 selects a free one
     log: Path | None = None  # write the ground truth of each frame to this file, as JSON lines

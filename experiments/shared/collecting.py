@@ -19,20 +19,20 @@ class Collect:
     """Guide a person through trajectories, and save the initial and the final pair of images of each."""
 
     workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
-    camera: str | None = None  # path, URL or video file of the camera (default: the camera of the sensor file)
-    leds: str | None = None  # serial port of the LED controller (default: found by the sensor file's serial number)
+    camera: str | None = None  # path or URL of the camera, or a video file. None: the camera of the sensor file
+    leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
     twin: bool = False  # use the digital twin instead of devices. Nobody needs to act, and there is no page
     seed: int = 0  # seed of the twin's object and trajectories
     sensor: Path | None = None  # sensor file of experiments.commission, or its folder
-    # width and height of the images (pixels). The default is that of the sensor file, 640 x 480 with --twin, or
-    # otherwise 1640 x 1232
+    # width and height of the images (pixels). None: those of the sensor file, 640 x 480 with --twin, otherwise 1640 x
+    # 1232
     size: tuple[int, int] | None = None
-    fourcc: str | None = None  # pixel format of the camera, such as MJPG (default: that of the sensor file or driver)
+    fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the sensor file or the driver
     lock: bool = True  # lock the exposure and the white balance of the camera
-    # duty cycles of the four LED channels in the tactile stream, 0 to 255 (default: those of the sensor file, or 255)
+    # duty cycles of the four LED channels in the tactile stream, 0 to 255. None: those of the sensor file, or 255
     levels: tuple[int, int, int, int] | None = None
-    # stop when the session has this number of confirmed trajectories, earlier ones included (default: never, or 100
-    # with --twin)
+    # stop when the session has this number of confirmed trajectories, earlier ones included. None: never stop, or with
+    # --twin stop at 100
     count: int | None = None
     note: str = ""  # text that is stored with each trajectory, such as the object's name
     headless: bool = False  # show instructions in this terminal instead of on a page
@@ -40,7 +40,7 @@ class Collect:
     # address of the page. With 0.0.0.0, every computer of the network can watch and press the buttons
     host: str = "127.0.0.1"
     port: int = 8765  # TCP port of the page. 0 selects a free one
-    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)
+    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)  # thresholds and times of the guide
     debug: bool = False  # show the traceback of every error
 
 

@@ -54,13 +54,13 @@ class Args:
     # of friction (wide-friction), or contents that lie on any side of the object (off-centre)
     hidden: sts.physics.Variant = "default"
     objects: Folder | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
-    # classes of the objects (default: those of the experiment, or all classes of --objects if it has none of these)
+    # classes of the objects. Empty: those of the experiment, or all classes of --objects if it has none of these
     classes: tuple[str, ...] = ()
-    # length of one unit of the files in --objects (m), such as 0.001 for millimetres (default: that of ShapeNetSem's
-    # table, or 1 m)
+    # length of one unit of the files in --objects (m), such as 0.001 for millimetres. None: that of ShapeNetSem's
+    # table, or 1 m
     scale: float | None = None
-    # axis of the files in --objects that points up (default: that of ShapeNetSem's table, or y for glTF and z for other
-    # files)
+    # axis of the files in --objects that points up. None: that of ShapeNetSem's table, or y for glTF and z for other
+    # files
     up: Literal["x", "y", "z"] | None = None
     parts: bool = False  # decompose objects whose collision hull fits badly into convex parts
     debug: bool = False  # show the traceback of every error

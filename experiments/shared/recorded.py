@@ -23,14 +23,14 @@ LEAST = 5  # smallest number of trajectories, so that one of them can be held ou
 class Config:
     """How the models of Table 2 are trained and evaluated."""
 
-    training: TrainConfig
+    training: TrainConfig  # options of the training
     # number of trajectories that the digital twin collects if the work directory has none of a device
     count: int = 100
     size: tuple[int, int] = (640, 480)  # width and height of the twin's images (pixels)
     # number of gradient steps of each of the three models. None: training.epochs determines the numbers
     steps: tuple[int, int, int] | None = None
-    # modalities that the models learn to predict from a subset of the modalities: all, or only those of the subset
-    # (own, as in the paper)
+    # modalities that the models learn to predict from a subset of the modalities: all, or only those of the
+    # subset (own, as in the paper)
     targets: Literal["all", "own"] = "all"
     # also train with the final pair as an input, so that the models learn that an object at rest stays at rest
     rest: bool = True
