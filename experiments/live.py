@@ -181,7 +181,7 @@ def views(config: Config, source: Source, first: hardware.Shot) -> Views:
 
 
 def images(config: Config, source: Source) -> Iterator[hardware.Shot]:
-    """Read the images of the connected source, visual and tactile ones in turn."""
+    """Read the images of both streams from the connected source, until it ends."""
     if isinstance(source.sensor, hardware.Replay):
         return source.sensor.stream()
     return source.sensor.stream(0.5, dwell=config.dwell)

@@ -164,7 +164,7 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
 
 
 def identity(workdir: Path, recordings: hardware.Recordings) -> str:
-    """The checksum of the trajectories and the sensor file. The latter contains the checksums of its backgrounds."""
+    """The checksum of the trajectories and the sensor file, which contains the checksums of its backgrounds."""
     return _files.digest({"dataset": recordings.identity, "sensor": _files.sha256(workdir / "sensor.json")})
 
 

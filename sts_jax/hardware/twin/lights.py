@@ -28,13 +28,13 @@ class _Change(NamedTuple):
 class LightHistory:
     """The brightness of the LEDs over time, as a share of their full power.
 
-    The share s approaches the share a of new levels exponentially. After a change at time t0, at which the share was
-    s0,
+    After a change of the levels at time t0, the share approaches its new value exponentially:
 
         s(t) = a + (s0 - a) exp(-(t - t0) / tau)
 
-    where a is the mean of the four levels divided by 255, and tau is `rise_s`. LEDs are dimmed by pulses at 31 kHz.
-    These pulses are far shorter than an exposure, so only their mean matters. The object is not thread-safe.
+    The share is s0 at t0. Its new value a is the mean of the four levels divided by 255, and tau is `rise_s`. LEDs are
+    dimmed by pulses at 31 kHz. These pulses are far shorter than an exposure, so only their mean matters. The object
+    is not thread-safe.
     """
 
     def __init__(self, rise_s: float = 0.0):
