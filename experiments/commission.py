@@ -1,12 +1,13 @@
-"""Commission a real sensor: from its camera and LED controller to the sensor file.
+"""Commission a real sensor: measure its camera, lights and lens, and write the sensor file.
 
     python -m experiments.commission                                    # list cameras and serial ports
     python -m experiments.commission --print-board board.pdf            # the board to print
     python -m experiments.commission --camera /dev/video0 --leds /dev/ttyACM0 --out bench
 
-Finds the exposure of each stream, measures the switching latency, records backgrounds, and calibrates the lens from
-pictures of the board. Writes OUT/sensor.json, which `Sensor.load` and `hardware.STS.from_file` read. The pictures in
-OUT/board are kept, so the same command continues after an interruption.
+The command finds the exposure of each stream, measures how long a switch of the lights takes, records images of the
+empty pad, and calibrates the lens from pictures of the board. It writes OUT/sensor.json, which `Sensor.load` and
+`hardware.STS.from_file` read. Pictures of the board are kept in OUT/board, so the same command continues after an
+interruption.
 """
 
 import contextlib
@@ -26,33 +27,37 @@ from experiments.shared import backgrounds, boards, errors, output
 from experiments.shared.command import Folder
 from sts_jax import _files, hardware
 
-FRAME_SHARE = 0.9  # of the time between two frames, the longest exposure
-DARK = (0, 0, 0, 0)  # levels of the visual stream
-V4L2_UNIT = 1e-4  # s, unit of a device's exposure
+FRAME_SHARE = 0.9  # longest exposure as a share of the time between two frames
+DARK = (0, 0, 0, 0)  # LED levels of the visual stream
+V4L2_UNIT = 1e-4  # unit of the exposure of a Video4Linux device (s)
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """The devices, the folder, and the source of the lens."""
 
-    camera: str | None = None  # path such as /dev/v4l/by-id/..., or URL. Default: list the cameras
-    leds: str | None = None  # port such as /dev/ttyACM0. Default: list the ports
+    camera: str | None = None  # path of the camera such as /dev/v4l/by-id/..., or its URL. None: list cameras and stop
+    leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop
     out: Folder = Path("bench")  # folder for the sensor file
-    width: int = 1640  # pixels
-    height: int = 1232  # pixels
-    fps: float | None = None  # frames per second (default: the camera's)
-    fourcc: str | None = None  # pixel format of the camera, such as MJPG (default: the driver's)
-    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # of the LED channels in the tactile stream, 0 to 255
-    board_images: Path | None = None  # a folder of PNG files instead of live pictures. First by name: board on the pad
-    ideal_lens: float | None = None  # degrees, field of view of an assumed lens, instead of pictures
-    pictures: int = 15  # live pictures of the board
-    every: float | None = None  # s, waits instead of the Enter key
-    ruler: float = 100.0  # mm, measured length of the printed ruler, which is 100 mm at the right scale
+    width: int = 1640  # width of the camera's images (pixels)
+    height: int = 1232  # height of the camera's images (pixels)
+    fps: float | None = None  # frames per second. None: the camera's own rate
+    fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the driver
+    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # duty cycles of the LEDs in the tactile stream, 0 to 255
+    # folder with PNG pictures of the board, instead of live pictures. In the first one by name, the board lies on the
+    # pad
+    board_images: Path | None = None
+    # assume a lens without error, and take no pictures of the board. The value is the field of view across the
+    # diagonal (degrees)
+    ideal_lens: float | None = None
+    pictures: int = 15  # number of live pictures of the board
+    every: float | None = None  # time to wait at each step (s). None: wait for the Enter key
+    ruler: float = 100.0  # measured length of the ruler on the print (mm). It is 100 if the scale is right
     print_board: Path | None = None  # write the board to this PDF or PNG file and stop
 
     @property
     def board(self) -> hardware.Board:
-        """The board as it was printed."""
+        """The board in the size in which it was printed, from `ruler`."""
         scale, nominal = self.ruler / 100, hardware.Board()
         return dataclasses.replace(nominal, square=scale * nominal.square, marker=scale * nominal.marker)
 
@@ -67,9 +72,9 @@ def check(config: Config) -> None:
     hardware.CameraConfig(config.camera or 0, config.width, config.height, fps=config.fps, fourcc=config.fourcc)
     hardware.sts.checked_levels(config.levels)
     if config.board_images is not None and config.ideal_lens is not None:
-        raise ValueError("--board-images and --ideal-lens contradict each other: give one of them")
+        raise ValueError("--board-images and --ideal-lens contradict each other: leave out one of them")
     if config.ideal_lens is not None and not 0 < config.ideal_lens <= 360:
-        raise ValueError(f"ideal-lens is {config.ideal_lens:g}, but it must be an angle from 0 to 360 degrees")
+        raise ValueError(f"ideal-lens is {config.ideal_lens:g}, but it must be an angle above 0 and up to 360 degrees")
     if config.every is not None and not 0 <= config.every < math.inf:
         raise ValueError(f"every is {config.every}, but it must be >= 0 seconds")
     if config.pictures < hardware.calibration.FEWEST_IMAGES:
@@ -84,10 +89,13 @@ def check(config: Config) -> None:
 
 
 def find(config: Config) -> str:
-    """The cameras and ports of this machine, and the command to run next.
+    """Find the devices that the options do not name.
+
+    Returns:
+        A text that lists the cameras and serial ports, and ends with the command to run next.
 
     Raises:
-        ValueError: A device that is not given was not found.
+        ValueError: There is no camera or no USB serial port, and the option does not name one.
     """
     found, lines, words = hardware.find_sensors(), [], ["python", "-m", "experiments.commission"]
     ports = [port for port in found.ports if port.vendor is not None]
@@ -115,7 +123,7 @@ def find(config: Config) -> str:
 
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[tuple[hardware.Camera, hardware.Leds]]:
-    """Open both devices. The lights are off."""
+    """Open the camera and the LED controller, and close them afterwards. The lights are off at first."""
     assert config.camera is not None
     assert config.leds is not None
     source = hardware.CameraConfig(
@@ -131,7 +139,17 @@ def opened(config: Config) -> Iterator[tuple[hardware.Camera, hardware.Leds]]:
 
 
 def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tuple[float, float] | None:
-    """Choose the exposure of each stream, or None if it is not set from here."""
+    """Choose the exposure of each stream. The lights are off afterwards.
+
+    Args:
+        config: Options of the command line.
+        camera: Open camera.
+        leds: Open LED controller.
+
+    Returns:
+        The exposures of the visual and the tactile stream in the driver's unit, or None if this program cannot set the
+        camera's exposure.
+    """
     now, rate = camera.locked.get("exposure"), camera.statistics.rate
     assert rate is not None
     settable = now is not None and now > 0 and camera.set_exposure(now) is not None
@@ -147,7 +165,7 @@ def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tupl
             seen = hardware.brightness(camera.read().image)
             words = "left to the server" if camera.config.kind == "stream" else "the driver does not let it be set"
         if seen >= hardware.exposure.SATURATED:
-            words += f". SATURATED: {'lower --levels' if stream == 'tactile' else 'darken the room'}"
+            words += f". The image is SATURATED: {'lower --levels' if stream == 'tactile' else 'darken the room'}"
             words += "" if settable else ", or lower the exposure at the camera"
         say(f"exposure of the {stream} stream: brightness {seen:.0f} of 255, {words}")
     leds.set(DARK)
@@ -155,10 +173,10 @@ def expose(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> tupl
 
 
 def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
-    """The lens that is assumed.
+    """Make the lens of `--ideal-lens`, which is assumed to be without error.
 
     Raises:
-        CalibrationError: The raw image would not show the whole view.
+        CalibrationError: The raw image of this lens does not contain the whole view of the sensor.
     """
     assert config.ideal_lens is not None
     lens = hardware.Lens.ideal(
@@ -172,7 +190,11 @@ def ideal(config: Config, pinhole: hardware.Pinhole) -> hardware.Lens:
 
 
 def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
-    """The lens from pictures of the board. Prints the error of each picture."""
+    """Calibrate the lens from pictures of the board, and print the error of each picture.
+
+    Raises:
+        CalibrationError: The pictures do not determine the lens, or the lens does not cover the view of the sensor.
+    """
     say(f"board: {len(pictures.names)} pictures in {pictures.folder}, {pictures.describe()}")
     calibration = pictures.fit(pinhole)
     for name, corners, error in zip(pictures.names, calibration.corners, calibration.errors, strict=True):
@@ -189,11 +211,16 @@ def fit(pictures: boards.Pictures, pinhole: hardware.Pinhole) -> hardware.Lens:
 
 
 def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> hardware.Lens:
-    """The lens from pictures that are taken now, and those of an interrupted run."""
+    """Take the missing pictures of the board, and calibrate the lens from all pictures in OUT/board.
+
+    Raises:
+        CalibrationError: As in `fit`. The message explains how to replace or add pictures.
+        ValueError: A picture of an earlier run has another size or cannot be read, or there is no keyboard.
+    """
     folder, size = config.out / "board", (config.width, config.height)
     pictures = boards.Pictures.read(folder, config.board, size)
     if pictures.names:
-        say(f"board: {len(pictures.names)} pictures of an earlier run are kept. To start anew, delete {folder}")
+        say(f"board: {len(pictures.names)} pictures of an earlier run are kept. To start again, delete {folder}")
     pictures = boards.take(pictures, sensor, config.pictures, config.every, say)
     try:
         return fit(pictures, pinhole)
@@ -205,27 +232,28 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
 
 
 def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -> None:
-    """Check that the folder belongs to this sensor or to none.
+    """Check that the folder does not contain the sensor file of other devices.
 
     Raises:
-        ValueError: It has the sensor file of other devices.
+        ValueError: The sensor file in the folder names another camera or another LED controller.
     """
     try:
         there = hardware.Device.load(config.out)
     except (OSError, hardware.SensorFileError):
-        return  # there is none, or a damaged one, which is replaced
+        return  # a missing or damaged file is written anew
     if (there.camera, there.leds) != (camera.source, leds.serial_number):
         raise ValueError(
-            f"{config.out} has the file of another sensor, of camera {there.camera} and LED controller {there.leds}: "
-            "give another --out, or delete the file"
+            f"{config.out} contains the file of another sensor, of camera {there.camera} and LED controller "
+            f"{there.leds}, but the open devices are {camera.source} and {leds.serial_number}: give another --out, or "
+            "delete the file"
         )
 
 
 def claim_pictures(config: Config, camera: hardware.Camera) -> None:
-    """Reserve the folder of live pictures for one camera, size and board.
+    """Reserve the folder of live pictures for one camera, image size and print of the board.
 
     Raises:
-        ValueError: It has pictures of others.
+        ValueError: The folder contains pictures of another camera, size or print.
     """
     made = {"camera": camera.source, "width": config.width, "height": config.height, "ruler": config.ruler}
     _files.claim(config.out / "board" / "camera.json", made)
@@ -299,7 +327,7 @@ def main(config: Config) -> None:
 
 
 def say(text: str) -> None:
-    """Print one line at once."""
+    """Print one line without buffering."""
     print(text, flush=True)
 
 

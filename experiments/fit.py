@@ -1,14 +1,16 @@
-"""Fit the pose of an object on the sensor to a tactile image, through the derivatives of the renderer.
+"""Fit the pose of an object on the sensor to a tactile image, with the derivatives of the renderer.
 
     python -m experiments.fit scissors --out fit.png     # a minute or two
     python -m experiments.fit mug.obj --longest-side 0.1 --mass 0.3 --sensor soft.json
 
-Takes any class or mesh file, as experiments.sense does. The target is one tactile image of the object at rest under its
-weight, in eight bits. The object, the face it rests on and its weight are known. x, y and yaw are fitted from ten
-starts, each 3 mm and 10 degrees off. Prints a line per start and the number of starts that end within 0.2 mm and 1
-degree: all ten for scissors, fork and mouse, and eight for scissors with `--seed 1`. Draws the target, the first start
-and its end, and the path of every start. To fit an image of your own, use it as the target of `slope` in the function
-that `descend` minimises.
+The first argument is an object class or a mesh file, as in experiments.sense. The target is one tactile image, in eight
+bits, of the object at rest under its weight. The object, the face on which it rests and its weight are known. The
+command fits x, y and yaw ten times. Each fit starts 3 mm and 10 degrees away from the true pose.
+
+A line is printed for each fit, and then the number of fits that end within 0.2 mm and 1 degree of the true pose. These
+are all ten for scissors, fork and mouse, and eight for scissors with `--seed 1`. The picture shows the target, the
+images at the start and at the end of the first fit, and the path of every fit. To fit an image of your own, use it as
+`target` of `slope` in the function that `descend` minimises.
 """
 
 import dataclasses
@@ -30,53 +32,66 @@ from experiments import sense
 from experiments.shared.errors import on_one_line
 from sts_jax import tactile
 
-# m, standard deviations of the Gaussian blur under which images are compared. The first is about the distance by which
-# the tips of a 12 cm long object move in a turn of 10 degrees.
+# Standard deviations of the Gaussian blur that is applied to images before they are compared (m). The first one is
+# about the distance by which the tips of a 12 cm long object move in a turn of 10 degrees.
 BLURS = (0.012, 0.006, 0.003, 0.0015)
 STEPS = 10  # largest number of steps with each blur
-SETTLED = (1e-5, 1e-5, 1e-3)  # m, m, rad: a shorter step is the last one with a blur
-OFF = (0.003, 10.0)  # m, degrees: error of a start
-GOAL = (0.0002, 1.0)  # m, degrees: largest error of a successful fit
+SETTLED = (1e-5, 1e-5, 1e-3)  # step in x (m), y (m) and yaw (rad) below which the fit continues with the next blur
+OFF = (0.003, 10.0)  # error of the initial pose of a fit: distance (m) and yaw (degrees)
+GOAL = (0.0002, 1.0)  # largest error of a successful fit: distance (m) and yaw (degrees)
 SEEN = 0.02  # smallest change of a pixel's value by touch that counts as an imprint
-FAINT = 0.25  # smallest image change by 10 degrees, relative to that by 3 mm, at which the yaw can be determined
+# A turn of 10 degrees and a shift by 3 mm both change the image. If the turn changes it by less than this share of the
+# change by the shift, the object is nearly round, and its yaw cannot be determined.
+FAINT = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
 class Config(sense.Config):
-    """The object, its pose, and the number of starts."""
+    """The object, its true pose, and the number of fits."""
 
-    mesh: Annotated[str, tyro.conf.Positional]  # a mesh file or the name of a class
-    out: Path = Path("fit.png")  # the picture
-    resolution: tuple[int, int] = (240, 240)  # height and width, pixels
-    position: tuple[float, float] = (0.0073, -0.0041)  # m, of the middle of its bounding box, to be found
-    turn: float = 23.7  # degrees, about the vertical, to be found
-    starts: int = 10
+    mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, or name of an object class
+    out: Path = Path("fit.png")  # path of the picture
+    resolution: tuple[int, int] = (240, 240)  # height and width of the image (pixels)
+    position: tuple[float, float] = (0.0073, -0.0041)  # true x and y of the centre of the object's bounding box (m)
+    turn: float = 23.7  # true turn of the object about the vertical (degrees)
+    starts: int = 10  # number of fits, each from another initial pose
 
-    # options of experiments.sense only
+    # These options of experiments.sense have no meaning here.
     crop: Annotated[bool, tyro.conf.Suppress] = False
     light: Annotated[float, tyro.conf.Suppress] = 1.0
     height: Annotated[float, tyro.conf.Suppress] = 0.0
 
 
 class Slope(NamedTuple):
-    """The difference of an image from the target, and its derivatives by (x, y, yaw)."""
+    """The difference r of an image from the target, and its derivatives J by (x, y, yaw).
 
-    image: jax.Array  # (h, w, 3)
-    loss: jax.Array  # (), mean squared difference r
-    gradient: jax.Array  # (3,), J^T r / n
-    curvature: jax.Array  # (3, 3), Gauss-Newton matrix J^T J / n
+    r is the vector of the n pixel values of the blurred difference, and J = dr / d(x, y, yaw) has the shape (n, 3).
+    """
+
+    image: jax.Array  # tactile image, shape (h, w, 3)
+    loss: jax.Array  # mean of the squares of r, shape ()
+    gradient: jax.Array  # J^T r / n, shape (3,)
+    curvature: jax.Array  # Gauss-Newton matrix J^T J / n, shape (3, 3)
 
 
 @functools.partial(jax.jit, static_argnames="resolution")
 def touch(
     sensor: sts.Sensor, body: sts.objects.Body, pose: jax.Array, wrench: jax.Array, *, resolution: tuple[int, int]
 ) -> jax.Array:
-    """The tactile image, rounded to eight bits as by a camera."""
+    """Render the tactile image, shape (height, width, 3) in [0, 1], rounded to eight bits as a camera does."""
     return jnp.round(255 * sts.sense(sensor, body, pose, wrench, resolution=resolution).tactile) / 255
 
 
 def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
-    """A pose shifted by `at[:2]` (m) and turned by `at[2]` (rad) about the vertical through its own origin."""
+    """Shift a pose, and turn it about the vertical through its own origin.
+
+    Args:
+        pose: Pose of the object in the sensor frame, shape (7,).
+        at: Shift in x and y (m) and turn (rad), shape (3,).
+
+    Returns:
+        New pose, shape (7,).
+    """
     cos, sin = jnp.cos(at[2] / 2), jnp.sin(at[2] / 2)
     w, x, y, z = pose[3:]
     turn = jnp.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
@@ -84,7 +99,16 @@ def moved(pose: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def carried(wrench: jax.Array, pose: jax.Array, at: jax.Array) -> jax.Array:
-    """The wrench of a vertical force whose line of action moves with the object, see `moved`."""
+    """Move the wrench of a vertical force with the object.
+
+    Args:
+        wrench: Force and moment of the pad on the object in `pose`, shape (6,).
+        pose: Pose of the object before the move, shape (7,).
+        at: Shift in x and y (m) and turn (rad) of the object, as in `moved`, shape (3,).
+
+    Returns:
+        Wrench of the same force at the same place of the object, shape (6,).
+    """
     force = wrench[2]
     x, y = -wrench[4] / force - pose[0], wrench[3] / force - pose[1]
     cos, sin = jnp.cos(at[2]), jnp.sin(at[2])
@@ -104,10 +128,20 @@ def slope(
     *,
     resolution: tuple[int, int],
 ) -> Slope:
-    """Compare the image of the object moved by `at` with the target, both under a blur (m).
+    """Compare the blurred image of the moved object with the blurred target, and differentiate by the move.
 
-    The depth and the tilt of the object are solved for at each place. The derivative takes them as constant, because
-    the pad is the same everywhere.
+    The balance of the gel determines the depth and the tilt of the object. It is solved anew for each move. The
+    derivative treats depth and tilt as constant, because the pad is the same everywhere.
+
+    Args:
+        sensor: Constants of the sensor.
+        body: The object.
+        pose: Pose of the object before the move, shape (7,).
+        wrench: Force and moment of the pad on the object in `pose`, shape (6,).
+        at: Shift in x and y (m) and turn (rad), shape (3,).
+        target: Image to which the pose is fitted, shape (height, width, 3).
+        blur: Standard deviation of the Gaussian blur (m).
+        resolution: (height, width) of the image (pixels).
     """
     frame = sts.sense(sensor, body, moved(pose, at), carried(wrench, pose, at), resolution=resolution)
     pitch = frame.window[2:] / jnp.array([resolution[1], resolution[0]])
@@ -123,14 +157,15 @@ def slope(
 
 
 def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> list[tuple[np.ndarray, Slope]]:
-    """Minimise the loss by Levenberg-Marquardt steps, with less and less blur.
+    """Minimise the loss by Levenberg-Marquardt steps, first with the strongest blur and last with the weakest.
 
     Args:
-        look: Function that returns the slope at (x, y, yaw) under a blur (m).
-        start: (x, y, yaw), m and rad.
+        look: Function of (x, y, yaw) and the blur (m) that returns the difference from the target and its derivatives.
+        start: Initial x (m), y (m) and yaw (rad).
 
     Returns:
-        The accepted (x, y, yaw) and their slopes, beginning with the start. Each blur begins with the last ones again.
+        The accepted points (x, y, yaw) and the result of `look` at each, from `start` on. The last point of one blur
+        occurs again as the first point of the next blur.
     """
     path, at = [], start
     for blur in BLURS:
@@ -152,12 +187,12 @@ def descend(look: Callable[[np.ndarray, float], Slope], start: np.ndarray) -> li
 
 
 def errors(at: np.ndarray) -> tuple[float, float]:
-    """Errors of (x, y, yaw): distance (mm) and angle (degrees)."""
+    """Convert the errors of x (m), y (m) and yaw (rad) to a distance (mm) and an angle (degrees)."""
     return 1e3 * float(np.hypot(at[0], at[1])), float((np.rad2deg(at[2]) + 180) % 360 - 180)
 
 
 def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, Slope]]]) -> None:
-    """Draw the target, the first start and its end, their differences from the target, and all paths in x and y."""
+    """Draw the target, the start and the end of the first fit, their differences from the target, and all paths."""
     (_, first), (_, last) = paths[0][0], paths[0][-1]
     flat = np.median(target, axis=(0, 1))
     touched = np.abs(np.stack([target, first.image]) - flat).max(axis=(0, -1)) > SEEN
@@ -191,10 +226,10 @@ def draw(config: Config, target: np.ndarray, paths: list[list[tuple[np.ndarray, 
 
 
 def main(config: Config) -> None:
-    """Place the object on the pad, render the target, fit it from every start, and draw the result.
+    """Place the object on the pad, render the target, fit the pose from every start, and draw the result.
 
     Raises:
-        ValueError: An option is out of range, there is no start, or the object leaves no imprint.
+        ValueError: An option is out of range, or the object leaves no imprint.
     """
     sense.check(config)
     if config.starts < 1:
@@ -208,7 +243,7 @@ def main(config: Config) -> None:
     target = touch(sensor, body, *given, resolution=config.resolution)
     empty = touch(sensor, body, given[0].at[2].set(-1), given[1], resolution=config.resolution)
     if np.abs(target - empty).max() < SEEN:
-        raise ValueError(f"{config.mesh} leaves no imprint in view: increase force or change position")
+        raise ValueError(f"{config.mesh} leaves no imprint in view: increase --force, or change --position")
     print(f"{config.mesh} on {words}", flush=True)
 
     def look(at: np.ndarray, blur: float) -> Slope:
@@ -220,8 +255,8 @@ def main(config: Config) -> None:
     )
     if by_turn < FAINT * by_shift:
         print(
-            f"note: {OFF[1]:g} degrees change the image {by_turn / by_shift:.2f} times as much as {1e3 * OFF[0]:g} mm: "
-            "the footprint is nearly round, and its yaw cannot be determined"
+            f"note: a turn by {OFF[1]:g} degrees changes the image {by_turn / by_shift:.2f} times as much as a shift "
+            f"by {1e3 * OFF[0]:g} mm: the footprint is nearly round, and its yaw cannot be determined"
         )
     random = np.random.default_rng(config.seed)
     paths, found = [], 0

@@ -1,11 +1,11 @@
-"""Objects dropped on the pad: from the first moment, still in the air, to the images and the pose at rest.
+"""Predict the images and the pose at rest of objects that fall on the pad, from a first frame in the air.
 
     python -m experiments.freefall                    # about 15 minutes on two CPU cores
     python -m experiments.freefall --preset long      # about 75 minutes, can be stopped and started again
     python -m experiments.freefall --model paper      # the paper's four models instead of the state-space model
     python -m experiments.freefall --preset smoke     # about two minutes, for tests
     python -m experiments.freefall --preset paper     # the paper's counts and schedule: hours, a GPU helps
-    python -m experiments.freefall --plan             # seconds per stage, measured on a little of each
+    python -m experiments.freefall --plan             # prints the expected seconds of each stage
 
 Results go to `runs/freefall/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
 run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs

@@ -1,14 +1,15 @@
-"""The gap between real and simulated images of the same object, as numbers and as a figure.
+"""Measure how much real and simulated images of the same object differ, and draw both.
 
     python -m experiments.gap --real runs/real/dataset --sensor bench --match none \\
         --simulated runs/twin/dataset --simulated-sensor runs/twin
     python -m experiments.gap --real runs/real/dataset --sensor bench --simulated runs/released/dataset --match none
 
-A side is a session of `experiments.real collect`. The simulated side may also be the dataset of an experiment that was
-run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file. Prints differences per
-pixel, a distance of both distributions in a feature space, and the accuracy of a classifier that tells the two sides
-apart. Writes the same text and a figure of both sides to `--out`. Takes about a minute for 40 trajectories. The
-classifier needs scikit-learn (`pip install -e '.[bench]'`).
+`--real` and `--simulated` are sessions of `experiments.real collect`. The simulated images may also be the dataset of
+an experiment that was run with `--collection.no-crop`. Raw images are rectified with the lens of the sensor file.
+
+The command prints differences per pixel, a distance between both distributions in a feature space, and the accuracy of
+a classifier that tries to distinguish real from simulated images. The same text and a figure are written to `--out`.
+This takes about a minute for 40 trajectories. The classifier needs scikit-learn (`pip install -e '.[bench]'`).
 """
 
 import dataclasses
@@ -30,43 +31,49 @@ STREAMS = ("visual", "tactile")
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Two sides and the way to compare them."""
+    """The real and the simulated images, and how they are compared."""
 
-    real: Folder  # a session of `experiments.real collect`
-    simulated: Folder  # a session, such as that of a digital twin, or the dataset of an experiment
-    sensor: Path | None = None  # sensor file of the real images (default: they are rectified already)
-    simulated_sensor: Path | None = None  # sensor file of a simulated session (default: it is rectified already)
-    # number: trajectories of equal number show the same object in the same poses, and others are left out.
-    # none: both sides are draws of the same object and scenario, without a correspondence of single images
+    real: Folder  # folder of the real images: a session of `experiments.real collect`
+    simulated: Folder  # folder of the simulated images: a session, or the dataset of an experiment
+    sensor: Path | None = None  # sensor file of the real images. None: the images are rectified already
+    simulated_sensor: Path | None = None  # sensor file of a simulated session. None: its images are rectified already
+    # number: trajectories of equal number show the same object in the same poses, and other trajectories are ignored.
+    # none: both folders show the same object and scenario, but no single images correspond
     match: Literal["number", "none"] = "number"
-    # height and width at which images are compared, pixels (default: those of the dataset, or 240 x 320)
+    # height and width to which images are reduced before the comparison (pixels). None: those of the dataset, or 240 x
+    # 320
     resolution: tuple[int, int] | None = None
-    names: tuple[str, str] = ("real", "simulated")  # of the two sides in the figure
-    rows: int = 4  # trajectories in the figure, two rows each
+    names: tuple[str, str] = ("real", "simulated")  # titles of the real and the simulated images in the figure
+    rows: int = 4  # number of trajectories in the figure. Each has two rows
     out: Folder = Path("runs/gap")  # folder for gap.txt and gap.png
     debug: bool = False  # show the traceback of every error
 
 
 @dataclasses.dataclass(frozen=True)
 class Side:
-    """The images of one side: the two ends of each trajectory, in this order."""
+    """The real or the simulated images: the initial and the final pair of each trajectory, in this order."""
 
-    images: gap.Streams
-    described: str  # the source, in words
+    images: gap.Streams  # images of both streams, with the number of their trajectory
+    described: str  # description of the source
 
     def of(self, numbers: np.ndarray) -> "Side":
-        """The images of some trajectories."""
+        """Select the images of the trajectories with these numbers."""
         chosen = np.isin(self.images.group, numbers)
         return dataclasses.replace(self, images=gap.Streams(*(leaf[chosen] for leaf in self.images)))
 
 
 def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> Side:
-    """The images of a session, rectified with the lens of a sensor file.
+    """Read the images of a session, and rectify them with the lens of a sensor file.
+
+    Args:
+        folder: Folder of the session.
+        sensor: Path of the sensor file. None: the images are rectified already.
+        resolution: (height, width) of the result (pixels).
 
     Raises:
         FileNotFoundError: There is no session or no sensor file.
         SensorFileError: The sensor file is damaged or describes no device.
-        ValueError: There is no confirmed trajectory, or the images are not of the size of the lens.
+        ValueError: There is no confirmed trajectory, or the images differ in size from those of the lens.
     """
     recordings = hardware.load_recordings(folder)
     size = f"{resolution[0]} x {resolution[1]}"
@@ -94,31 +101,43 @@ def session(folder: Path, sensor: Path | None, resolution: tuple[int, int]) -> S
 
 
 def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
-    """The first and last frames of a dataset.
+    """Read the first and the last frame of each rendered trajectory of a dataset.
+
+    Args:
+        folder: Folder of the dataset.
+        resolution: (height, width) of the images (pixels), or None for any.
 
     Raises:
-        ValueError: The images have another size than the one asked for, or show only the object.
+        ValueError: The images have another size than `resolution`, or are cropped to the object.
     """
     data = dataset.load(folder)
     if data.collection["crop"]:
         raise ValueError(
-            f"{folder} has crop=True, but real images show the whole pad: collect with --collection.no-crop"
+            f"the images of {folder} are cropped to the object (crop=True), but real images show the whole pad: "
+            "collect the dataset with --collection.no-crop"
         )
     own = tuple(data.collection["resolution"])
     if resolution is not None and resolution != own:
-        raise ValueError(f"resolution is {resolution}, but the images of {folder} have {own}: leave it out")
+        raise ValueError(f"resolution is {resolution}, but the images of {folder} have {own}: leave out --resolution")
     pairs = data.pairs(data.rendered())
     return side(pairs.visual, pairs.tactile, pairs.trajectory, f"{folder}, a dataset of {own[0]} x {own[1]}")
 
 
 def side(visual: np.ndarray, tactile: np.ndarray, numbers: np.ndarray, described: str) -> Side:
-    """A side from images `(n, 2, height, width, 3)` of both ends."""
+    """Make a `Side`.
+
+    Args:
+        visual: Initial and final visual images, shape (n, 2, height, width, 3).
+        tactile: Initial and final tactile images, of the same shape.
+        numbers: Numbers of the n trajectories.
+        described: Description of the source.
+    """
     visual, tactile = (leaf.reshape(-1, *leaf.shape[2:]) for leaf in (visual, tactile))
     return Side(gap.Streams(visual, tactile, np.repeat(numbers, 2)), f"{described}, {len(numbers)} trajectories")
 
 
 def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """The largest centred part of a rectified image with the resolution's aspect ratio, averaged to the resolution."""
+    """Crop a rectified image at its centre to the aspect ratio of `resolution`, and average it to `resolution`."""
     (height, width), (rows, columns) = image.shape[:2], resolution
     scale = min(height / rows, width / columns)
     tall, wide = round(rows * scale), round(columns * scale)
@@ -128,19 +147,27 @@ def centred(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
 
 
 def load(config: Config) -> tuple[Side, Side]:
-    """Both sides, with the trajectories that are compared. The groups of both are equal if they are matched.
+    """Read the images that are compared.
+
+    Returns:
+        The real and the simulated images. With `--match number`, both contain the same trajectories. With
+        `--match none`, no trajectory number occurs in both.
 
     Raises:
-        FileNotFoundError: A folder holds no session or dataset.
-        ValueError: The options do not fit each other, or there is nothing to compare.
+        FileNotFoundError: A folder contains no session or dataset.
+        ValueError: Two options contradict each other, or there is nothing to compare.
     """
     is_dataset = (config.simulated / "collection.json").exists()
     if is_dataset and config.match == "number":
         raise ValueError(
-            f"{config.simulated} is a dataset, whose numbers are not those of a session: give --match none"
+            f"{config.simulated} is a dataset, whose trajectory numbers do not correspond to those of a session: give "
+            "--match none"
         )
     if is_dataset and config.simulated_sensor is not None:
-        raise ValueError("simulated-sensor is given, but the images of a dataset are rectified: leave it out")
+        raise ValueError(
+            f"simulated-sensor is {config.simulated_sensor}, but {config.simulated} is a dataset, whose images are "
+            "rectified: leave out --simulated-sensor"
+        )
     if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
         raise ValueError(f"resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {config.resolution}")
     if is_dataset:
@@ -155,14 +182,14 @@ def load(config: Config) -> tuple[Side, Side]:
     common = np.intersect1d(real.images.group, simulated.images.group)
     if not len(common):
         raise ValueError(
-            f"no trajectory of {config.real} has the number of one of {config.simulated}: give --match none if they "
-            "show the same object in other poses"
+            f"{config.real} and {config.simulated} have no trajectory number in common: give --match none if they show "
+            "the same object in other poses"
         )
     return real.of(common), simulated.of(common)
 
 
 def report(real: Side, simulated: Side, *, matched: bool) -> str:
-    """The table of distances."""
+    """The text that is printed: the sources and the table of distances."""
     number = len(np.unique(real.images.group))
     head = f"matched by number: {number} trajectories" if matched else "not matched"
     lines = [f"real:      {real.described}", f"simulated: {simulated.described}", head, ""]
@@ -177,7 +204,7 @@ def report(real: Side, simulated: Side, *, matched: bool) -> str:
 
 
 def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched: bool) -> dict[str, str]:
-    """The distances of one stream, as words by name."""
+    """The distances between the real and the simulated images of one stream, as texts by name."""
     first, second = getattr(real, stream), getattr(simulated, stream)
     rows = {}
     if matched:
@@ -186,7 +213,7 @@ def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched:
         rows["root mean squared error (of 255)"] = written(found.rmse, 2)
         rows["PSNR (dB)"] = written(found.psnr, 1)
         rows["SSIM"] = written(found.ssim, 3)
-        # Two images on: the same end of the next trajectory
+        # A shift by two images pairs each image with the same end of another trajectory.
         other = gap.pixel_errors(first, np.roll(second, 2, axis=0), real.group)
         rows["  same, for another trajectory: MAE"] = written(other.mae, 2)
         rows["  same, for another trajectory: SSIM"] = written(other.ssim, 3)
@@ -198,12 +225,12 @@ def measured(real: gap.Streams, simulated: gap.Streams, stream: str, *, matched:
 
 
 def written(estimate: gap.Estimate, digits: int) -> str:
-    """An estimate in words."""
+    """An estimate and its interval as text."""
     return f"{estimate.value:.{digits}f} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
 
 
 def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
-    """Draw the first trajectories."""
+    """Draw the first trajectories into `gap.png`."""
     rows = config.rows
     numbers = np.unique(real.images.group)[:rows]
     others = numbers if matched else np.unique(simulated.images.group)[:rows]
@@ -220,10 +247,10 @@ def draw(config: Config, real: Side, simulated: Side, *, matched: bool) -> None:
 
 
 def main(config: Config) -> None:
-    """Load, measure, print, draw.
+    """Read the images, measure and print the distances, and draw the figure.
 
     Raises:
-        ValueError: An option is out of range, or there is nothing to compare.
+        ValueError: An option is out of range, two options contradict each other, or there is nothing to compare.
         OSError: A file cannot be read or written.
     """
     if config.rows < 1:

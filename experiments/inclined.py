@@ -1,11 +1,11 @@
-"""Objects laid on the tilted pad, or let go just above: from the first moment to the images and the pose at rest.
+"""Predict the images and the pose at rest of objects released on a tilted pad or just above it, from the first frame.
 
     python -m experiments.inclined                    # 15 to 20 minutes on two CPU cores
     python -m experiments.inclined --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
     python -m experiments.inclined --preset paper     # the paper's counts and schedule: hours, a GPU helps
-    python -m experiments.inclined --plan             # seconds per stage, measured on a little of each
+    python -m experiments.inclined --plan             # prints the expected seconds of each stage
 
 Results go to `runs/inclined/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
 run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs

@@ -1,4 +1,4 @@
-"""Show the predicted resting state beside the live images, about ten times a second.
+"""Predict the resting state from live images about ten times a second, and show it beside them.
 
     python -m experiments.live                                            # starts a digital twin and opens a page
     python -m experiments.live --sensor bench                             # the sensor of a sensor file
@@ -8,9 +8,10 @@
     python -m experiments.live --replay visual.mp4 tactile.mp4 --sensor bench
     python -m experiments.live --headless --seconds 20 --save live.png    # without a page
 
-The page shows both streams in the view of the sensor, the predicted images at rest, the probabilities of the outcomes,
-contact, and the rate and the latency of the predictions. The default model was trained on simulated cameras that are
-held and released. At its first start, a twin compiles for about two minutes and the model for half a minute.
+The page shows the newest visual and tactile image, the predicted images at rest, and the probabilities of the outcomes.
+It also shows if the object touches the pad, and the rate and the latency of the predictions. The default model was
+trained on simulated cameras that are held and released. At the first start, a twin compiles for about two minutes and
+the model for half a minute.
 """
 
 import collections
@@ -41,49 +42,52 @@ SCENARIOS: dict[str, type[sts.physics.Scenario]] = {
     "perturbed": sts.physics.Perturbed,
     "released": sts.physics.Released,
 }
-PRINT_S = 1.0  # s, between two lines in the terminal
+PRINT_S = 1.0  # time between two lines in the terminal (s)
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """The source of the images, the model, and the outputs."""
 
-    sensor: Path | None = None  # sensor file of the commissioning, or its folder
-    camera: str | None = None  # device or URL (default: that of the sensor file)
-    leds: str | None = None  # serial port of the LED controller (default: found by the sensor file's serial number)
-    replay: tuple[Path, ...] = ()  # folder of a recording, or two videos: visual and tactile
-    twin: bool = False  # start a digital twin. Default if no other source is given
+    sensor: Path | None = None  # sensor file of experiments.commission, or its folder
+    camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
+    leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
+    replay: tuple[Path, ...] = ()  # play back the folder of a recording, or a visual and a tactile video
+    twin: bool = False  # start a digital twin. This is the default if no other source is given
 
-    # released, inclined, freefall or perturbed, which come with the library, or a model's folder
+    # name of a model of the library (released, inclined, freefall or perturbed), or the folder of another model
     model: str = "released"
-    scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None  # of a model's folder, for names
-    condition: tuple[float, ...] = ()  # of the model, SI units (default: zeros)
-    flat: bool = True  # divide out the backgrounds of the sensor file, such as vignetting
+    # scenario of a model that is given by its folder. It determines the names of the outcomes
+    scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None
+    condition: tuple[float, ...] = ()  # condition of the scenario that the model receives, SI units. Empty: zeros
+    flat: bool = True  # remove vignetting: divide the images by the images of the empty pad in the sensor file
 
-    dwell: int = 3  # images of one stream before the lights switch. More give a higher rate and older images
-    speed: float = 1.0  # recorded seconds in a second
-    loop: bool = False  # start a recording again at its end
-    seed: int = 0  # of the twin
-    seconds: float | None = None  # stop after this time (default: at the end of a recording, or never)
+    # number of successive images of one stream before the lights switch. A larger number gives more images per second,
+    # but the newest image of the other stream is older
+    dwell: int = 3
+    speed: float = 1.0  # speed of a replay. 2 is twice as fast as the recording
+    loop: bool = False  # start a replay again when it has ended
+    seed: int = 0  # seed of the twin's object and motion
+    seconds: float | None = None  # stop after this time (s). None: stop at the end of a replay, or on Ctrl-C
 
     record: Path | None = None  # record both streams into this new folder
-    encoding: Literal["png", "jpeg"] = "png"  # of the recorded images. PNG is lossless, JPEG faster and smaller
-    save: Path | None = None  # write a picture (.png) or a video (.mp4) of the view
-    headless: bool = False  # print in this terminal instead of showing a page
-    host: str = "127.0.0.1"  # address of the page. 0.0.0.0: every computer of the network can watch
-    port: int = 8766  # of the page, 0: a free one
+    encoding: Literal["png", "jpeg"] = "png"  # format of recorded images. PNG is lossless, JPEG is faster and smaller
+    save: Path | None = None  # write the live view and the predictions to a picture (.png) or a video (.mp4)
+    headless: bool = False  # print the predictions in this terminal instead of serving a page
+    host: str = "127.0.0.1"  # address of the page. With 0.0.0.0, every computer of the network can watch
+    port: int = 8766  # TCP port of the page. 0 selects a free one
     debug: bool = False  # show the traceback of every error
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """Where the images come from. The sensor is not connected yet."""
+    """The source of the live images. Its sensor is not connected yet."""
 
-    name: str
-    sensor: hardware.STS | hardware.Replay
-    file: Path | None  # the sensor file
-    connected: Callable[[], None] = lambda: None  # called after the connection
-    note: Callable[[], str] = lambda: ""
+    name: str  # description for the title of the page
+    sensor: hardware.STS | hardware.Replay  # device or recording
+    file: Path | None  # path of the sensor file, or None without one
+    connected: Callable[[], None] = lambda: None  # function that is called when the sensor is connected
+    note: Callable[[], str] = lambda: ""  # function that returns a remark on the present state of the source
 
 
 def check(config: Config) -> None:
@@ -108,7 +112,8 @@ def check(config: Config) -> None:
             f"replay has {len(config.replay)} paths, but it takes a folder, or a visual and a tactile video"
         )
     if config.sensor is None and (config.camera is None) != (config.leds is None):
-        raise ValueError("without a sensor file, both --camera and --leds are needed")
+        missing = "--camera" if config.camera is None else "--leds"
+        raise ValueError(f"{missing} is missing: without a sensor file, both --camera and --leds are needed")
     if config.sensor is not None and not hardware.sensor_file.sensor_file(config.sensor).exists():
         raise ValueError(
             f"sensor is {config.sensor}, but there is no sensor file: give another one, or write it with `python -m "
@@ -124,7 +129,7 @@ def check(config: Config) -> None:
 
 @contextlib.contextmanager
 def opened(config: Config) -> Iterator[Source]:
-    """The source of the options. A twin is started, and ended afterwards."""
+    """Make the source that the options select. A twin is started now and stopped afterwards."""
     if config.replay:
         yield replayed(config)
     elif config.camera is not None and config.leds is not None and config.sensor is None:
@@ -141,7 +146,7 @@ def opened(config: Config) -> Iterator[Source]:
 
 
 def replayed(config: Config) -> Source:
-    """A recording. Its copy of the sensor file is used unless another one is given."""
+    """Make the source of `--replay`. Without `--sensor`, the sensor file in the recording is used if there is one."""
     first, file = config.replay[0], config.sensor
     path = first if len(config.replay) == 1 else (first, config.replay[1])
     sensor = hardware.Replay(path, speed=config.speed, loop=config.loop)
@@ -151,18 +156,18 @@ def replayed(config: Config) -> Source:
 
 
 def views(config: Config, source: Source, first: hardware.Shot) -> Views:
-    """How raw images become those of the sensor's view.
+    """Make the conversion from raw images to the view of the sensor.
 
     Args:
-        config: The options.
-        source: The source.
-        first: An image of the source. A lens that is assumed for lack of a sensor file has its size.
+        config: Options of the command line.
+        source: Source of the images.
+        first: Any image of the source. Its size determines the lens that is assumed without a sensor file.
     """
     if source.file is None:
         height, width = first.image.shape[:2]
         say(
-            "there is no sensor file, so a lens of 160 degrees without error is assumed, contact is unknown, and "
-            "vignetting stays. Give --sensor"
+            "note: without a sensor file, an ideal lens of 160 degrees is assumed, contact is unknown, and vignetting "
+            "is not removed. Give --sensor"
         )
         return Views(hardware.Lens.ideal(width, height), sts.Sensor().camera, None)
     device = hardware.Device.load(source.file)
@@ -176,21 +181,32 @@ def views(config: Config, source: Source, first: hardware.Shot) -> Views:
 
 
 def images(config: Config, source: Source) -> Iterator[hardware.Shot]:
-    """The images of the connected source."""
+    """Read the images of both streams from the connected source, until it ends."""
     if isinstance(source.sensor, hardware.Replay):
         return source.sensor.stream()
     return source.sensor.stream(0.5, dwell=config.dwell)
 
 
 class Screen:
-    """What is shown: the newest images and predictions. The page, the terminal and the file show it."""
+    """Shows the newest images and predictions on the page or in the terminal, and writes them to the `--save` file."""
 
     def __init__(self, config: Config, source: Source, views: Views, page: LivePage | None):
-        """Check the file's path."""
+        """Prepare the outputs.
+
+        Args:
+            config: Options of the command line.
+            source: Source of the images.
+            views: Conversion from raw images to the view of the sensor.
+            page: Page in the browser. None: the terminal is used instead.
+
+        Raises:
+            ValueError: The suffix of `--save` is neither that of a picture nor that of a video.
+            OSError: The file of `--save` cannot be written.
+        """
         self._source, self._views, self._page = source, views, page
         self._file = None if config.save is None else PanelFile(config.save)
         self._path = config.save
-        self._shown: dict[str, tuple[Image, float]] = {}  # by stream, with the time of its arrival (s)
+        self._shown: dict[str, tuple[Image, float]] = {}  # newest image of each stream and the time of its arrival (s)
         self._arrived_s: collections.deque[float] = collections.deque(maxlen=100)
         self._printed_s = time.monotonic()
         self._recorded = 0 if config.record is not None else None
@@ -214,13 +230,13 @@ class Screen:
             print(", ".join([*lines(seen), *chances]), flush=True)
 
     def update(self) -> None:
-        """Update the page, also from the thread of the predictions."""
+        """Update the page. The thread of the predictions calls this method, too."""
         seen = self.seen()
         if self._page is not None and seen is not None:
             self._page.show(seen)
 
     def seen(self) -> Seen | None:
-        """The current state, or None before the first pair."""
+        """The newest images and prediction, or None before both streams have an image."""
         shown, live, arrived_s = self._shown, self.live, list(self._arrived_s)
         if len(shown) < 2 or live is None:
             return None
@@ -239,13 +255,13 @@ class Screen:
         )
 
     def close(self) -> None:
-        """Write the file."""
+        """Complete the file of `--save`, and print its path."""
         if self._file is not None and self._file.close():
             print(self._path)
 
 
 def follow(config: Config, source: Source, predictor: sts.Predictor, page: LivePage | None) -> None:
-    """Show, predict and record until the end."""
+    """Connect the source, then show, predict and record its images until it ends or the user stops the command."""
     name = config.scenario or (config.model if config.model in SCENARIOS else None)
     outcomes = () if name is None else tuple(str(outcome) for outcome in SCENARIOS[name].outcomes)
     with source.sensor as sensor, contextlib.ExitStack() as stack:
@@ -286,11 +302,11 @@ def follow(config: Config, source: Source, predictor: sts.Predictor, page: LiveP
 
 
 def summarise(live: Live, sensor: hardware.STS | hardware.Replay, duration_s: float) -> None:
-    """Print rate and latency of the whole run."""
+    """Print the number, the rate and the latency of the predictions."""
     if live.latency_s is None:
-        say("there was no prediction, because the images ended before both streams had come")
+        say("no prediction was made, because the command ended before both streams had an image")
         return
-    missed = f", {sensor.skipped} images of the recording came too late" if isinstance(sensor, hardware.Replay) else ""
+    missed = f", {sensor.skipped} images of the recording skipped" if isinstance(sensor, hardware.Replay) else ""
     say(
         f"{live.made} predictions in {duration_s:.1f} s: {live.made / duration_s:.1f} per second, median latency "
         f"{1000 * live.latency_s:.0f} ms, {live.offered - live.made} images without a prediction of their own{missed}"
@@ -298,7 +314,7 @@ def summarise(live: Live, sensor: hardware.STS | hardware.Replay, duration_s: fl
 
 
 def main(config: Config) -> None:
-    """Open source, model and page."""
+    """Open the model, the source and the page, and run until the end."""
     with errors.on_one_line(debug=config.debug):
         try:
             check(config)

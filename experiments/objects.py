@@ -1,12 +1,15 @@
-"""Draw a contact sheet of procedural objects, one row per class, and print how well their collision hulls fit.
+"""Draw a picture of procedural objects, one row per class, and print how well their collision hulls fit.
 
     python -m experiments.objects --out sheet.png --seed 0 --num 10
 
-About half a minute on two CPU cores for 8 x 10 objects. `--view side` is the view of a person, `--view below` that of
-the sensor. `--shuffle` draws the objects in random order without names, so that others can try to recognise them.
-Prints a line per object: size, faces, collision hull, and how far the surface sticks out of the hull at most / how far
-the hull stands off the surface. `--parts` first decomposes objects whose hull fits badly into convex parts (some ten
-seconds each).
+The command takes about half a minute on two CPU cores for 8 x 10 objects. `--view side` is the view of a person,
+`--view below` that of the sensor. `--shuffle` draws the objects in random order without names, so that other people can
+try to recognise them.
+
+A line is printed for each object: its size, its faces, its collision hull, and two gaps between hull and surface. The
+first gap is the largest distance by which the surface reaches out of the hull, the second one the largest distance from
+the hull down to the surface. `--parts` first decomposes objects whose hull fits badly into convex parts, which takes
+about ten seconds each.
 """
 
 import dataclasses
@@ -23,9 +26,9 @@ import sts_jax as sts
 from experiments.shared import errors, output
 from sts_jax import optics
 
-DISTANCE = 0.42  # m, from the camera to the object
-FIELD = 0.36  # rad, so that 150 mm fill the frame
-EYES = {  # direction to the camera: x right, y back, z up
+DISTANCE = 0.42  # distance from the camera to the object (m)
+FIELD = 0.36  # field of view (rad). At this distance, 150 mm fill the picture
+EYES = {  # direction from the object to the camera: x right, y back, z up
     "quarter": (-0.45, -0.75, 0.5),
     "side": (-0.45, -0.85, 0.2),
     "above": (0.0, -0.05, 1.0),
@@ -35,21 +38,30 @@ EYES = {  # direction to the camera: x right, y back, z up
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """A contact sheet of procedural objects."""
+    """A picture of procedural objects, one row per class."""
 
-    out: Path = Path("objects.png")  # the picture
-    seed: int = 0
-    num: int = 10  # objects per class
-    categories: tuple[str, ...] = sts.objects.CATEGORIES
-    view: Literal["quarter", "side", "above", "below"] = "quarter"
-    size: int = 160  # pixels, side of one object's picture
-    parts: bool = False  # convex parts for objects whose hull fits badly
-    shuffle: bool = False  # random order, numbers instead of names (the answers go to OUT with suffix .txt)
+    out: Path = Path("objects.png")  # path of the picture
+    seed: int = 0  # seed of the objects
+    num: int = 10  # number of objects per class
+    categories: tuple[str, ...] = sts.objects.CATEGORIES  # object classes
+    view: Literal["quarter", "side", "above", "below"] = "quarter"  # direction from which the objects are seen
+    size: int = 160  # side of one object's picture (pixels)
+    parts: bool = False  # decompose objects whose hull fits badly into convex parts
+    shuffle: bool = False  # random order, with numbers instead of names. The names are written to OUT with suffix .txt
 
 
 @jax.jit(static_argnames=("size",))
 def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.Array:
-    """One body on white, (size, size, 3). Flat objects are shown from higher up."""
+    """Render a body in front of white. Flat objects are seen from higher up.
+
+    Args:
+        body: The object.
+        direction: Direction from the object to the camera, shape (3,).
+        size: Side of the picture (pixels).
+
+    Returns:
+        Picture of shape (size, size, 3).
+    """
     extent = jnp.max(body.vertices, 0) - jnp.min(body.vertices, 0)
     flat = (extent[2] < 0.3 * jnp.maximum(extent[0], extent[1])) & (direction[2] > 0) & (direction[2] < 0.9)
     direction = direction + jnp.where(flat, jnp.array([0.0, 0.0, 0.5]), jnp.zeros(3))
@@ -69,7 +81,15 @@ def portrait(body: sts.objects.Body, direction: jax.Array, *, size: int) -> jax.
 
 
 def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool) -> str:
-    """The line of one object, as in `sts.objects.describe`, with `parts` decomposed as in `dataset.make_bodies`."""
+    """Describe one object in a line, as `sts.objects.describe` does.
+
+    Args:
+        category: Class of the object.
+        number: Number of the object.
+        body: The object.
+        parts: If True, an object whose hull fits badly is first decomposed into convex parts, as
+            `dataset.make_bodies` does.
+    """
     found = sts.objects.facts(body, apart := sts.objects.gaps(body))
     if parts and apart[1] > sts.objects.HOLLOW:
         body = sts.objects.decompose(body)
@@ -78,7 +98,12 @@ def describe(category: str, number: int, body: sts.objects.Body, *, parts: bool)
 
 
 def main(config: Config) -> None:
-    """Make the objects, print their descriptions, render them, and compose the sheet."""
+    """Make the objects, print their descriptions, and draw them in one picture.
+
+    Raises:
+        ValueError: `num` is less than 1, a class is unknown, or the suffix of `out` is not that of a picture.
+        OSError: The picture cannot be written.
+    """
     if config.num < 1:
         raise ValueError(f"num is {config.num}, but it must be at least 1 object per class")
     families = {category: sts.objects.find_family(category) for category in config.categories}

@@ -1,11 +1,11 @@
-"""A bottle stands on the pad, the pad is jerked: from the first moment and the jerk to the images and the pose at rest.
+"""Predict the images and the pose at rest of a bottle on a pad that is jerked, from the first frame and the jerk.
 
     python -m experiments.perturbed                    # 15 to 20 minutes on two CPU cores
     python -m experiments.perturbed --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
     python -m experiments.perturbed --preset paper     # the paper's counts and schedule: hours, a GPU helps
-    python -m experiments.perturbed --plan             # seconds per stage, measured on a little of each
+    python -m experiments.perturbed --plan             # prints the expected seconds of each stage
 
 Results go to `runs/perturbed/`: config.json, dataset/, models/NAME/, metrics.json, table.md and figures/*.png. A second
 run with the same `--workdir` resumes after an interruption, and leaves finished results unchanged. `--only train` runs

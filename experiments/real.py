@@ -1,26 +1,28 @@
-"""Learn from trajectories of the real sensor, or of its digital twin: the paper's Table 2. Collect and review them.
+"""Collect and review trajectories of the real sensor or its digital twin, and learn from them (the paper's Table 2).
 
-    python -m experiments.real                    # 100 trajectories of the twin, if there are none: about 15 minutes
+    python -m experiments.real                    # about 15 minutes, collects 100 trajectories of the twin if needed
     python -m experiments.real --preset paper     # 500 at 1640x1232 and the paper's schedule. Prints its time first
-    python -m experiments.real --preset smoke     # a little of everything, for tests
-    python -m experiments.real --plan             # seconds per stage, measured on a little of each
+    python -m experiments.real --preset smoke     # a short run of every stage, for tests
+    python -m experiments.real --plan             # prints the expected seconds of each stage
 
     python -m experiments.real collect --sensor bench --count 500   # opens a page for the browser
-    python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # not yet for training
+    python -m experiments.real collect --camera /dev/v4l/by-id/... --leds /dev/ttyACM0    # without a sensor file
     python -m experiments.real collect --twin --workdir runs/twin   # the digital twin, on a virtual clock
     python -m experiments.real review                       # lists the trajectories
     python -m experiments.real review --sheet review.png    # draws the last 20
     python -m experiments.real review --discard 3 17
 
-Without a sub-command, it is `train`: VAE visual, VAE tactile and MVAE without pose learn to predict the resting images
-from those of the held object, on the trajectories in `WORKDIR/dataset`. Results go to `WORKDIR/table2`. Trajectories of
-a device are never mixed with those of the twin, so give the twin a `--workdir` of its own.
+The default sub-command is `train`. It trains VAE visual, VAE tactile and MVAE without pose on the trajectories in
+`WORKDIR/dataset`. The models learn to predict the images of the object at rest from the images of the held object.
+Results go to `WORKDIR/table2`. A work directory cannot contain trajectories of a device and of the twin, so give the
+twin a `--workdir` of its own.
 
-`--sensor` is the file of `experiments.commission`. Training needs its lens and its images of the empty pad.
+`--sensor` is the sensor file of `experiments.commission`. It contains the lens and images of the empty pad, which
+training needs.
 
 `collect` guides a person through trajectories: place the object in an unstable pose, hold it, release it, wait until it
-rests. The initial and the final pair of images are saved as they happen, raw and uncropped, into `WORKDIR/dataset`. An
-interruption loses nothing that was confirmed. The same command continues with the next number.
+rests. The initial and the final pair of images are saved at once, raw and uncropped, into `WORKDIR/dataset`. Confirmed
+trajectories survive an interruption. The same command then continues with the next number.
 """
 
 import argparse
@@ -58,7 +60,7 @@ PRESETS = {"smoke": SMOKE, "default": DEFAULT, "paper": PAPER}
 
 
 def parse(words: Sequence[str]) -> Train | Collect | Review:
-    """Read the options. Without a sub-command, they are those of `train`."""
+    """Read the options of the command line. Without a sub-command, `train` is used."""
     if not words or (words[0].startswith("-") and words[0] not in ("-h", "--help")):
         words = ["train", *words]
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -74,7 +76,7 @@ def parse(words: Sequence[str]) -> Train | Collect | Review:
 
 
 def main(config: Train | Collect | Review) -> None:
-    """Run a sub-command, with errors on one line."""
+    """Run a sub-command, and print an error that the user can correct on one line."""
     with errors.on_one_line(debug=config.debug):
         try:
             match config:
@@ -89,7 +91,7 @@ def main(config: Train | Collect | Review) -> None:
 
 
 def _terminated(*_: object) -> None:
-    raise KeyboardInterrupt  # so that pending images are written, as after Ctrl+C
+    raise KeyboardInterrupt  # pending images are then written, as after Ctrl+C
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""A small camera, held in an unstable pose and let go: from the first moment to the images and the pose at rest.
+"""Predict the images and the pose at rest of a small camera that a hand releases, from a frame in which it is held.
 
     python -m experiments.released                    # 26 minutes on one CPU core beside other work
-    python -m experiments.released --preset long      # not run to its end yet, can be stopped and started again
+    python -m experiments.released --preset long      # has not been run to the end yet, resumes after an interruption
     python -m experiments.released --model paper      # the paper's four models instead of the state-space model
     python -m experiments.released --preset smoke     # a few minutes, for tests
     python -m experiments.released --preset paper     # the paper's counts and schedule: hours, a GPU helps
-    python -m experiments.released --plan             # seconds per stage, measured on a little of each
+    python -m experiments.released --plan             # prints the expected seconds of each stage
 
 This is the simulated counterpart of the paper's real dataset. Results go to `runs/released/`: config.json, dataset/,
 models/NAME/, metrics.json, table.md and figures/*.png. A second run with the same `--workdir` resumes after an

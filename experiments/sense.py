@@ -1,12 +1,12 @@
-"""Render one object on the sensor, with all outputs in one picture. Try this first.
+"""Render an object on the sensor, and draw all outputs in one picture. Try this command first.
 
-    python -m experiments.sense bottle --out bottle.png     # one of the eight classes, 20 s (5 s the next time)
+    python -m experiments.sense bottle --out bottle.png     # one of the eight classes: 20 s, 5 s the next time
     python -m experiments.sense mug.obj --longest-side 0.1 --mass 0.3 --resolution 1232 1640
     python -m experiments.sense classes --out classes.png --resolution 1232 1640    # all eight, about a minute
 
-The object is at rest under its own weight unless options change this. The picture shows both streams, the image halfway
-between them, depth, segmentation and pressure, pixel for pixel. Prints the size of the object, how it rests and how
-deep it sinks in.
+The object is at rest under its own weight unless options change this. The picture shows the visual and the tactile
+image, the image with the LEDs at half of their power, depth, segmentation and pressure, pixel for pixel. The command
+prints the size of the object, the face on which it rests, and how deep it sinks into the gel.
 """
 
 import dataclasses
@@ -29,39 +29,40 @@ import sts_jax as sts
 from experiments.shared import errors, output
 from sts_jax import tactile
 
-G = 9.81  # m/s^2
+G = 9.81  # gravity (m/s^2)
 FILL = 0.5  # share of a container's interior that is filled
-HEAD = 22  # pixels, height of the caption above a panel
-SHEET = (234, 312)  # pixels, size of one picture on the sheet of all classes
-NARROWEST = 160  # pixels, width of a panel, to which smaller images are magnified
+HEAD = 22  # height of the caption above a panel (pixels)
+SHEET = (234, 312)  # (height, width) of one image in the picture of all classes (pixels)
+NARROWEST = 160  # smallest width of a panel (pixels). Smaller images are magnified
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """The object, its pose and load, and the picture."""
 
-    mesh: Annotated[str, tyro.conf.Positional]  # a mesh file, the name of a class, or `classes` for all eight
-    out: Path = Path("sense.png")  # the picture
-    sensor: Path | None = None  # a file written by Sensor.save (default: the paper's sensor)
-    resolution: tuple[int, int] = (480, 640)  # height and width, pixels
+    mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, name of an object class, or `classes` for all
+    out: Path = Path("sense.png")  # path of the picture
+    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
+    resolution: tuple[int, int] = (480, 640)  # height and width of the images (pixels)
     crop: bool = False  # show only a window around the object, in the image's aspect ratio
-    light: float = 0.5  # share of the LEDs' power in the picture between the streams
+    light: float = 0.5  # share of the LEDs' full power in the image between visual and tactile, 0 to 1
 
-    rest: int = 0  # index of the face that it rests on, the likeliest first
-    position: tuple[float, float] = (0.0, 0.0)  # m, of the middle of its bounding box
-    height: float = 0.0  # m, of its lowest point above the gel
-    turn: float = 0.0  # degrees, about the vertical
-    tilt: tuple[float, float] = (0.0, 0.0)  # degrees, from rest, about x and about y
+    rest: int = 0  # index of the face on which the object rests. 0 is the most likely one
+    position: tuple[float, float] = (0.0, 0.0)  # x and y of the centre of the object's bounding box (m)
+    height: float = 0.0  # height of the object's lowest point above the gel (m)
+    turn: float = 0.0  # turn of the object about the vertical (degrees)
+    tilt: tuple[float, float] = (0.0, 0.0)  # tilt of the object away from rest, about x and about y (degrees)
 
-    mass: float | None = None  # kg (default: that of a shell half full of water)
-    force: float | None = None  # N, upwards on its centre of mass (default: its weight, or 0 in the air)
+    mass: float | None = None  # mass of the object (kg). None: that of a shell half full of water
+    # force of the pad on the object, upwards through its centre of mass (N). None: its weight, or 0 in the air
+    force: float | None = None
 
-    longest_side: float | None = None  # m, longest side to which a mesh file is scaled
-    scale: float | None = None  # m, length of one unit of a mesh file: 0.001 for millimetres
-    up: Literal["x", "y", "z"] | None = None  # the axis of a mesh file that points up (default: y for glTF, else z)
-    faces: int | None = None  # decimate a mesh file that has more faces
-    texture: Path | None = None  # an image to use as the texture of a mesh file
-    seed: int = 0  # selects the object of a class
+    longest_side: float | None = None  # scale a mesh file so that its longest side has this length (m)
+    scale: float | None = None  # length of one unit of a mesh file (m), such as 0.001 for millimetres
+    up: Literal["x", "y", "z"] | None = None  # axis of a mesh file that points up. None: y for glTF, otherwise z
+    faces: int | None = None  # reduce a mesh file with more faces to this number
+    texture: Path | None = None  # image file to use as the texture of a mesh file
+    seed: int = 0  # seed that selects the object of a class
 
 
 def check(config: Config) -> None:
@@ -91,11 +92,15 @@ def check(config: Config) -> None:
 
 
 def read(config: Config, name: str) -> sts.objects.Body:
-    """Load the object from a file, or make one of a class.
+    """Load the object from a mesh file, or make an object of a class.
+
+    Args:
+        config: Options of the command line.
+        name: Path of a mesh file, or name of a class.
 
     Raises:
         FileNotFoundError: The name is neither a file nor a class.
-        ValueError: An option for files is given for a class, or `objects.load` refuses the file.
+        ValueError: An option for mesh files is given for a class, or `objects.load` refuses the file.
     """
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
@@ -112,7 +117,9 @@ def read(config: Config, name: str) -> sts.objects.Body:
         )
     for option in ("longest_side", "scale", "up", "faces", "texture"):
         if getattr(config, option) is not None:
-            raise ValueError(f"{option} is for mesh files, but {name} is a class: leave it out")
+            raise ValueError(
+                f"{option} is for mesh files, but {name} is a class: leave out --{option.replace('_', '-')}"
+            )
     index = sts.objects.CATEGORIES.index(name)
     body = sts.objects.make(jax.random.fold_in(jax.random.key(config.seed), index), name)
     if config.mass is None:
@@ -123,17 +130,19 @@ def read(config: Config, name: str) -> sts.objects.Body:
 
 
 def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.ndarray, np.ndarray, str]:
-    """The pose of the object, the wrench that supports it, and a description of how it rests.
+    """Place the object at rest (`physics.place`), then tilt, turn and move it as the options require.
 
-    The object is placed at rest by `physics.place`, then tilted, turned and moved as configured.
+    Returns:
+        The pose of the object in the sensor frame, shape (7,), the force and moment of the pad on it, shape (6,), and a
+        description of how it rests.
 
     Raises:
-        ValueError: The object has no such face to rest on.
+        ValueError: The object has no face with the index `rest`.
     """
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
         raise ValueError(
-            f"rest is {config.rest}, but the object rests on {len(shares)} faces: give 0 to {len(shares) - 1}"
+            f"rest is {config.rest}, but the object can rest on {len(shares)} faces: give --rest 0 to {len(shares) - 1}"
         )
     rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
     turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)
@@ -165,13 +174,17 @@ def see(
     crop: bool,
     light: float,
 ) -> tuple[sts.Frame, jax.Array]:
-    """Render the frame, and the image between its streams."""
+    """Render the frame, and the image with the LEDs at the share `light` of their power."""
     frame = sts.sense(sensor, body, pose, wrench, resolution=resolution, crop=crop)
     return frame, sts.expose(sensor, frame, light)
 
 
 def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[sts.Frame, np.ndarray, str]:
-    """Render the object at rest. Returns the frame, the image between its streams, and a description."""
+    """Place and render the object.
+
+    Returns:
+        The frame, the image with the LEDs at `config.light` of their power, and a description of three lines.
+    """
     pose, wrench, words = lay(config, sensor, body)
     given = sensor, body, jnp.asarray(pose, jnp.float32), jnp.asarray(wrench, jnp.float32)
     seconds = []
@@ -192,7 +205,7 @@ def look(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[st
 
 
 def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[str, np.ndarray]]:
-    """All outputs as captioned images in [0, 1]: depth from bright (near) to dark, and pressure on its own grid."""
+    """All outputs as captions and images in [0, 1]. Near depths are bright, and pressure is on the gel's grid."""
     seen = np.asarray(frame.segmentation)
     depth = np.where(seen, np.asarray(frame.depth), np.nan)
     near, far = (np.nanmin(depth), np.nanmax(depth)) if seen.any() else (0.0, 1.0)
@@ -211,7 +224,12 @@ def panels(frame: sts.Frame, between: np.ndarray, light: float) -> list[tuple[st
 
 
 def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image:
-    """Panels in rows, pixel for pixel, each below its caption. A panel of another size is fitted in."""
+    """Arrange images in rows, pixel for pixel, each with a caption above.
+
+    Args:
+        pictures: Captions and images. An image of another size than the first one is scaled to fit.
+        columns: Number of images in a row.
+    """
     height, width = pictures[0][1].shape[:2]
     times = -(-NARROWEST // width)
     height, width = height * times, width * times
@@ -229,7 +247,12 @@ def compose(pictures: list[tuple[str, np.ndarray]], columns: int) -> Image.Image
 
 
 def main(config: Config) -> None:
-    """Make the object, place it on the pad, render it, print a description, and draw."""
+    """Make the object, place it on the pad, render it, print a description, and draw the outputs.
+
+    Raises:
+        ValueError: An option is out of range, or the mesh file is refused.
+        OSError: A file cannot be read or written.
+    """
     check(config)
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     names = sts.objects.CATEGORIES if config.mesh == "classes" else (config.mesh,)

@@ -1,11 +1,11 @@
-"""Copy the trained model of a work directory into the library, so that `sts.Predictor.load` finds it by its name.
+"""Copy the trained model of a work directory into the library, so that `sts.Predictor.load(NAME)` loads it.
 
     python -m experiments.ship runs/freefall                    # writes sts_jax/models/freefall
     python -m experiments.ship runs/long --name freefall
 
-Takes `models/statespace`, rounds its weights and leaves out the optimiser's state. Prints the size and the largest
-differences between predictions of the original and of the rounded model. Refuses a model of more than 12 MB. An earlier
-model of the same name is replaced when the new one is complete.
+The command copies `models/statespace` with rounded weights and without the optimiser's state. It prints the size of the
+copy, and the largest differences between predictions of the original and of the copy. A model of more than 12 MB is
+refused. An earlier model of the same name is replaced when the new one is complete.
 """
 
 import dataclasses
@@ -21,28 +21,39 @@ import sts_jax as sts
 from experiments.shared import command, errors
 from sts_jax.predict import MODELS
 
-LIMIT = 12e6  # bytes, of a model's folder
-NUM = 16  # bottles whose ends are predicted to compare the models
-LIFT = 0.04  # m, of every second bottle: models of freefall predict from objects in the air
+LIMIT = 12e6  # largest size of a model's folder (bytes)
+NUM = 16  # number of bottles from whose images both models predict
+LIFT = 0.04  # height of every second bottle above the pad (m), because models of freefall see objects in the air
 
 
 @dataclasses.dataclass(frozen=True)
 class Args:
     """Options of the command line."""
 
-    workdir: Annotated[command.Folder, tyro.conf.Positional]  # of an experiment
-    name: str | None = None  # of the model (default: the name of the work directory)
+    workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
+    name: str | None = None  # name of the model in the library. None: the name of the work directory
 
 
 def ship(workdir: Path, name: str) -> str:
-    """Write the model to `sts_jax/models/NAME` and return a line with its size and the differences of its predictions.
+    """Write the rounded model to `sts_jax/models/NAME`.
+
+    Args:
+        workdir: Work directory with a trained state-space model.
+        name: Name of the model in the library.
+
+    Returns:
+        A line with the size and the differences of the predictions.
 
     Raises:
-        ValueError: The model is too large, or the name has other characters than letters, digits and underscores.
-        OSError: A file of the model is damaged or missing, or the library is not writable.
+        ValueError: The model is too large, or the name is not made of letters, digits and underscores, or begins with a
+            digit.
+        OSError: A file of the model is damaged or missing, or the library's folder cannot be written to.
     """
     if not name.isidentifier():
-        raise ValueError(f"name is {name!r}, but it takes only letters, digits and underscores: give --name freefall")
+        raise ValueError(
+            f"name is {name!r}, but it takes only letters, digits and underscores and must not begin with a digit: "
+            "give another name, such as --name freefall"
+        )
     original = sts.Predictor.load(workdir / "models" / "statespace")
     MODELS.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=MODELS, prefix=".") as temporary:
@@ -51,8 +62,8 @@ def ship(workdir: Path, name: str) -> str:
         size = sum(path.stat().st_size for path in new.rglob("*") if path.is_file())
         if size > LIMIT:
             raise ValueError(
-                f"the model of {workdir} takes {size / 1e6:.1f} MB, the limit is {LIMIT / 1e6:g} MB: train a smaller "
-                "model"
+                f"the rounded model of {workdir} has {size / 1e6:.1f} MB, but the limit is {LIMIT / 1e6:g} MB: train a "
+                "smaller model"
             )
         line = f"{name}: {size / 1e6:.1f} MB of at most {LIMIT / 1e6:g}; {compare(original, sts.Predictor.load(new))}"
         if (MODELS / name).exists():
@@ -62,7 +73,7 @@ def ship(workdir: Path, name: str) -> str:
 
 
 def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
-    """A line with the differences between the predictions of two models from vision."""
+    """Compare the predictions of two models from visual images, and return a line with the differences."""
     visual = bottles(original.preprocessing)
     half = np.array(original.preprocessing.condition_scale, np.float32) / 2
     condition = np.tile(half, (len(visual), 1)) if half.size else None
@@ -76,7 +87,14 @@ def compare(original: sts.Predictor, rounded: sts.Predictor) -> str:
 
 
 def bottles(view: sts.training.Preprocessing) -> np.ndarray:
-    """Visual images of bottles at rest on the pad and in the air, `(NUM, height, width, 3)`."""
+    """Render visual images of bottles, alternately at rest on the pad and in the air.
+
+    Args:
+        view: Preprocessing of the model, which determines the resolution and the crop.
+
+    Returns:
+        Images of shape (NUM, height, width, 3) in [0, 1].
+    """
     sensor, images = sts.Sensor(), []
     for number in range(NUM):
         body = sts.objects.make(jax.random.key(number), "bottle")

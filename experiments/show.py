@@ -1,8 +1,9 @@
-"""Draw a few trajectories, each as a strip of pictures and as an animation, from outside and through the sensor.
+"""Draw a few trajectories, from outside and through the sensor, as a strip of pictures and as an animation.
 
     python -m experiments.show perturbed --num 4 --out show    # about a minute on two CPU cores
 
-Writes OUT/SCENARIO-NUMBER.png and .gif. The objects are the first ones of the default experiment with another seed.
+The files are OUT/SCENARIO-NUMBER.png and OUT/SCENARIO-NUMBER.gif. The objects are drawn from the same classes as in the
+default experiment of the scenario, with the seed of `--seed`.
 """
 
 import dataclasses
@@ -29,17 +30,22 @@ SCENARIOS = {
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Scenario, number and size of the pictures."""
+    """Scenario, number of trajectories, and size of the pictures."""
 
     scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined, perturbed or released
-    num: int = 4  # trajectories, each of another object
-    seed: int = 0
-    out: Path = Path("show")  # the folder
-    size: int = 128  # pixels, side of the sensor's images
+    num: int = 4  # number of trajectories, each with another object
+    seed: int = 0  # seed of the objects and the trajectories
+    out: Path = Path("show")  # folder for the pictures
+    size: int = 128  # side of the sensor's images (pixels)
 
 
 def main(config: Config) -> None:
-    """Simulate, render from outside and through the sensor, and draw."""
+    """Simulate the trajectories, render them from outside and through the sensor, and draw them.
+
+    Raises:
+        ValueError: The scenario is unknown, or `num` is less than 1.
+        OSError: The folder cannot be written to.
+    """
     if config.scenario not in SCENARIOS:
         raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")
     if config.num < 1:

@@ -1,10 +1,11 @@
-"""Start a digital twin of the sensor: an LED controller on a serial port, and a camera over HTTP.
+"""Start a digital twin of the sensor, with its LED controller on a serial port and its camera on an HTTP server.
 
     python -m experiments.twin                                          # a small camera, held and released by command
     python -m experiments.twin --release-every 6 --port twin-leds       # released at random, port with a fixed name
-    python -m experiments.twin --resolution 1232 1640 --rate 5          # size of the paper's camera
+    python -m experiments.twin --resolution 1232 1640 --rate 5          # images of the size of the paper's camera
 
-Prints how to connect and runs until Ctrl-C. The first start compiles for about two minutes, later ones take about 20 s.
+The command prints the addresses of the twin and runs until Ctrl-C. The first start compiles for about two minutes.
+Later starts take about 20 s.
 """
 
 import dataclasses
@@ -25,33 +26,40 @@ from sts_jax.hardware import Lens, twin
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Camera, object and connections."""
+    """The camera, the object and the connections of the twin."""
 
-    resolution: tuple[int, int] = (480, 640)  # height and width of the frames, pixels
+    resolution: tuple[int, int] = (480, 640)  # height and width of the frames (pixels)
     rate: float = 30.0  # frames per second
-    # degrees across the diagonal of the fisheye lens (the paper's device: 160), or None for the rectified view
+    # field of view of the fisheye lens across the image's diagonal (degrees). The paper's device has 160. None: frames
+    # without lens distortion
     field_of_view: float | None = 160.0
+    # deviations of the camera and the lights from ideal ones
     imperfections: twin.Imperfections = dataclasses.field(default_factory=twin.Imperfections)
 
-    object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"  # one of sts_jax.objects.CATEGORIES
-    sensor: Path | None = None  # a file written by Sensor.save (default: the paper's sensor)
-    seed: int = 0  # of the object, the trajectories, and the noise
-    release_every: float | None = None  # s, mean time of holding and resting. Default: by command only
-    motion_rate: float | None = None  # drawn poses per second of a moving object (default: by the resolution)
+    # class of the object, one of sts_jax.objects.CATEGORIES
+    object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"
+    sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
+    seed: int = 0  # seed of the object, the trajectories and the noise
+    # hold and release the object at random. The value is the mean time of holding plus that of resting (s). None: the
+    # object moves by command only
+    release_every: float | None = None
+    # rendered poses per second of a moving object. None: 10 up to 640 x 480 pixels, fewer for larger frames
+    motion_rate: float | None = None
 
-    port: Path | None = None  # name of a symbolic link to the serial port (default: its changing name is printed)
-    host: str = "127.0.0.1"  # interface on which HTTP listens. There is no password
-    http_port: int = 0  # 0: a free one
-    log: Path | None = None  # file for the truth about each frame, as JSON lines
-    record: Path | None = None  # file for all frames, as motion JPEG
-    attached: bool = False  # end with the standard input, and so with a program that holds its other end
+    port: Path | None = None  # make this symbolic link to the serial port, whose own name changes with each start
+    host: str = "127.0.0.1"  # address on which the HTTP server listens. There is no password
+    http_port: int = 0  # TCP port of the HTTP server. 0 selects a free one
+    log: Path | None = None  # write the ground truth of each frame to this file, as JSON lines
+    record: Path | None = None  # write all frames to this file, as motion JPEG
+    attached: bool = False  # stop when the standard input ends, for a program that starts the twin through a pipe
 
 
 def make(config: Config) -> twin.Twin:
-    """Make the twin, and render its first images.
+    """Make the twin, and render the empty pad and the first held pose.
 
     Raises:
         ValueError: An option is out of range.
+        OSError: The sensor file cannot be read, or a file cannot be written.
     """
     if config.object_class not in sts.objects.CATEGORIES:
         raise ValueError(f"class is {config.object_class!r}, but it must be one of {', '.join(sts.objects.CATEGORIES)}")
@@ -102,6 +110,7 @@ def main(config: Config) -> None:
 
 
 def _until_end_of_input(stop: threading.Event) -> None:
+    """Wait for the end of the standard input, then stop the twin."""
     sys.stdin.read()
     stop.set()
 

@@ -202,7 +202,7 @@ def test_the_classes_of_the_experiment_or_the_requested_ones_are_taken_from_a_fo
     assert one.num_per_object == round(32 / one.num_objects)
     assert one.meshes.cache == str(tmp_path / "cache" / "sts_jax" / "objects")
     said = capsys.readouterr().err
-    assert ("classes taken: box, bottle\n" if asked else "classes taken: bottle; left out: box\n") in said
+    assert ("classes used: box, bottle\n" if asked else "classes used: bottle. Left out: box\n") in said
     listing = tmp_path / "run" / "objects.txt"
     assert "bottle/3.stl" in listing.read_text()
     assert ("classes left out: box" in listing.read_text()) != bool(asked)
@@ -233,7 +233,7 @@ def test_unknown_classes_and_too_few_objects_are_refused(folder, tmp_path):
         command.configure(args)
     with pytest.raises(ValueError, match=r"teapot.*bottle, box"):
         command.configure(dataclasses.replace(args, objects=folder))
-    with pytest.raises(ValueError, match="a split needs at least 4 usable objects, got 3: add objects"):
+    with pytest.raises(ValueError, match=r"has 3 usable objects, but the split .* needs at least 4: add objects"):
         command.configure(dataclasses.replace(args, objects=folder, classes=("box",)))
 
 

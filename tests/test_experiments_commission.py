@@ -281,8 +281,8 @@ def test_pictures_without_or_with_a_moving_board_are_not_kept(tmp_path, pictures
         boards.Pictures(tmp_path, hardware.Board(), (WIDTH, HEIGHT)), sensor, 1, every=0.0, say=lines.append
     )
     assert [line.split(",")[0] for line in lines] == [
-        "  not kept: 0 corners of the board were found",
-        "  not kept: the board moved",
+        "  picture not kept: 0 corners of the board were found",
+        "  picture not kept: the board moved while the picture was taken: hold it still",
         "  000.png: 64 corners",
     ]
     assert taken.names == ("000.png",)

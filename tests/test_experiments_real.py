@@ -102,7 +102,7 @@ def test_collecting_is_resumed_after_a_kill(peer, tmp_path):
     with running(peer, tmp_path, *common, "--sensor", str(file), "--note", "box") as (process, lines):
         seen = follow(lines, player)
         assert process.wait(WAIT_S) == 0, seen
-    assert any("1 trajectories in" in line for line in seen)
+    assert any("has 1 confirmed trajectories" in line for line in seen)
     read = hardware.load_recordings(dataset)
     assert len(read) == 3
     for trajectory in read:

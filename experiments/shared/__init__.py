@@ -1,1 +1,1 @@
-"""The parts that experiments and commands share: configuration, stages, command line, progress and output."""
+"""Code that the experiments and commands share: configuration, stages, command line, progress and output."""

@@ -1,4 +1,4 @@
-"""The mean of many pairs of images without an object, which is the background of a sensor file."""
+"""Background images of a sensor file: means of many images of the empty pad."""
 
 import dataclasses
 import math
@@ -10,28 +10,32 @@ from jaxtyping import UInt8
 
 from sts_jax.hardware import PairReader
 
-PAIRS = 20  # of a background
+PAIRS = 20  # number of pairs whose mean is a background
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Backgrounds:
-    """The mean images of both streams with nothing on the pad."""
+    """The mean images of both streams of the empty pad."""
 
-    visual: UInt8[np.ndarray, "height width 3"]
-    tactile: UInt8[np.ndarray, "height width 3"]
-    noise: tuple[float, float]  # standard deviation of one pixel over time in each stream, of 255
-    rate: float  # pairs per second of the computer's clock
+    visual: UInt8[np.ndarray, "height width 3"]  # mean image without light, RGB
+    tactile: UInt8[np.ndarray, "height width 3"]  # mean image with light, RGB
+    noise: tuple[float, float]  # standard deviation of one pixel over time in the visual and the tactile stream, of 255
+    rate: float  # pairs per second, measured with `time.monotonic`
 
 
 class _Mean(NamedTuple):
-    """The mean of some images, and their noise."""
+    """The mean of the images of one stream, and the noise of a single image."""
 
     image: UInt8[np.ndarray, "height width 3"]
-    noise: float
+    noise: float  # standard deviation of one pixel over time, of 255
 
 
 def record(sensor: PairReader) -> Backgrounds:
-    """Take pairs of images of the empty pad at rest."""
+    """Take pairs of images of the empty pad, and average them.
+
+    Args:
+        sensor: Connected sensor. Its pad must be empty, and nothing may move.
+    """
     sums: dict[str, np.ndarray] = {}
     squares: dict[str, np.ndarray] = {}
     taken_s = 0.0
@@ -49,6 +53,7 @@ def record(sensor: PairReader) -> Backgrounds:
 
 
 def _mean(total: np.ndarray, squares: np.ndarray) -> _Mean:
+    """The mean and the noise of `PAIRS` images, from their sum and the sum of their squares."""
     mean = total / PAIRS
     variance = (squares / PAIRS - mean**2) * PAIRS / (PAIRS - 1)
     return _Mean(np.round(mean).astype(np.uint8), math.sqrt(max(float(variance.mean()), 0.0)))

@@ -1,4 +1,4 @@
-"""Pictures of the calibration board: taken with a live sensor, kept in a folder, and fitted."""
+"""Pictures of the calibration board: take them with a sensor, keep them in a folder, and calibrate the lens."""
 
 import dataclasses
 import io
@@ -14,18 +14,22 @@ from sts_jax import _files, hardware
 from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES
 from sts_jax.hardware.coverage import PARTS
 
-STILL = 1.0  # pixels, median movement of the corners between two frames while the board is held still
+STILL = 1.0  # largest median movement of the corners between two frames of a board that is held still (pixels)
 _LAY = "Lay the board on the pad, print to the camera, edges on edges."
-_HOLD = "Hold the board above the pad, tilted by 20 to 40 degrees, each time elsewhere."
+_HOLD = "Hold the board above the pad, tilted by 20 to 40 degrees, each time at another place."
 
 Say = Callable[[str], None]
 
 
 def wait(text: str, every: float | None) -> str:
-    """Show what to do, then wait for Enter, or for a number of seconds.
+    """Show an instruction, then wait for the Enter key or for a number of seconds.
+
+    Args:
+        text: Instruction for the person.
+        every: Time to wait (s). None: wait for the Enter key.
 
     Returns:
-        What was typed before Enter.
+        The text that was typed before Enter, in lower case. It is empty if `every` is given.
 
     Raises:
         ValueError: There is no keyboard.
@@ -38,8 +42,8 @@ def wait(text: str, every: float | None) -> str:
         return input(f"{text} Then press Enter. ").strip().lower()
     except EOFError:
         raise ValueError(
-            "there is no keyboard to press Enter on: give --every SECONDS to continue by time, and --board-images "
-            "FOLDER or --ideal-lens DEGREES for the lens"
+            "the Enter key cannot be read, because the standard input has ended: give --every SECONDS to continue by "
+            "time, and --board-images FOLDER or --ideal-lens DEGREES for the lens"
         ) from None
 
 
@@ -47,15 +51,20 @@ def wait(text: str, every: float | None) -> str:
 class Pictures:
     """The pictures of a folder in the order of their names. In the first one, the board lies on the pad."""
 
-    folder: Path
-    board: hardware.Board
-    size: tuple[int, int]  # width and height, pixels
-    names: tuple[str, ...] = ()
-    found: tuple[hardware.FoundCorners, ...] = ()
+    folder: Path  # folder of the PNG files
+    board: hardware.Board  # geometry of the printed board
+    size: tuple[int, int]  # width and height of the pictures (pixels)
+    names: tuple[str, ...] = ()  # file names
+    found: tuple[hardware.FoundCorners, ...] = ()  # corners of the board in each picture
 
     @classmethod
     def read(cls, folder: Path, board: hardware.Board, size: tuple[int, int]) -> "Pictures":
-        """Find the board in all PNG files of a folder.
+        """Read all PNG files of a folder, and find the board in each.
+
+        Args:
+            folder: Folder of the PNG files.
+            board: Geometry of the printed board.
+            size: Width and height that the pictures must have (pixels).
 
         Raises:
             ValueError: A picture has another size or cannot be read.
@@ -76,11 +85,16 @@ class Pictures:
         return pictures
 
     def with_one(self, name: str, found: hardware.FoundCorners) -> "Pictures":
-        """These pictures and one more."""
+        """Return these pictures and one more.
+
+        Args:
+            name: File name of the new picture.
+            found: Corners of the board in the new picture.
+        """
         return dataclasses.replace(self, names=(*self.names, name), found=(*self.found, found))
 
     def describe(self) -> str:
-        """The parts of the image that contain corners."""
+        """A text with the parts of the image in which corners of the board were found, and those without."""
         there = hardware.covered(self.found, self.size)
         missing = [part for part in PARTS if part not in there]
         return f"{len(there)} of {len(PARTS)} parts of the image covered" + (
@@ -88,16 +102,19 @@ class Pictures:
         )
 
     def fit(self, pinhole: hardware.Pinhole) -> hardware.Calibration:
-        """Calibrate the lens, and check that it covers the sensor's view.
+        """Calibrate the lens, and check that it covers the view of the sensor.
+
+        Args:
+            pinhole: View of the sensor.
 
         Raises:
-            CalibrationError: See `hardware.fit_lens` and `hardware.check_view`.
+            CalibrationError: The pictures do not determine the lens, or the lens does not cover the view.
         """
         try:
             calibration = hardware.fit_lens(self.found, self.size, self.board)
             hardware.check_view(calibration.lens, pinhole, calibration.largest_angle)
         except hardware.CalibrationError as error:
-            numbers = "" if not self.names else f" Image 0 is {self.names[0]}, the others follow in the order of names."
+            numbers = "" if not self.names else f" Image 0 is {self.names[0]}. Images are numbered in order of names."
             raise hardware.CalibrationError(
                 f"the pictures in {self.folder} do not determine the lens: {error}{numbers}"
             ) from error
@@ -105,30 +122,34 @@ class Pictures:
 
 
 def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | None, say: Say = print) -> Pictures:
-    """Take pictures of the board until there are enough. Each is written at once.
+    """Take pictures of the board until there are enough. Each picture is written to the folder at once.
 
     Args:
-        pictures: The pictures of an earlier run, which are kept.
-        sensor: The connected sensor.
-        number: Pictures in which the board is found.
-        every: Time between two pictures (s). None: the keyboard.
-        say: Receives one line for each picture.
+        pictures: Pictures of an earlier run, which count too.
+        sensor: Connected sensor.
+        number: Number of pictures in which the board must be found.
+        every: Time to wait before each picture (s). None: wait for the Enter key.
+        say: Function that receives one line for each picture.
+
+    Returns:
+        All pictures. There are fewer than `number` if the person typed `done`.
 
     Raises:
         OSError: A picture cannot be written.
+        ValueError: `every` is None, and there is no keyboard.
     """
     while len(pictures.names) < number:
         enough = len(pictures.names) >= FEWEST_IMAGES
         if not pictures.names:
             text = _LAY
         else:
-            text = f"{_HOLD} {'Type `done` if these are enough.' if enough and every is None else ''}".rstrip()
+            text = f"{_HOLD} {'Type `done` if there are enough pictures.' if enough and every is None else ''}".rstrip()
         typed = wait(text, every)
         if typed == "done" and enough:
             break
         image, found, problem = _picture(sensor, pictures.board)
         if problem:
-            say(f"  not kept: {problem}")
+            say(f"  picture not kept: {problem}")
             continue
         name = f"{1 + max((int(Path(n).stem) for n in pictures.names if Path(n).stem.isdecimal()), default=-1):03d}.png"
         _write(pictures.folder / name, image)
@@ -140,8 +161,8 @@ def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | N
 def _picture(
     sensor: hardware.STS, board: hardware.Board
 ) -> tuple[UInt8[np.ndarray, "height width 3"], hardware.FoundCorners, str]:
-    """A picture with the lights off, its corners, and the reason why it cannot be used, or nothing."""
-    next(sensor.stream(0.0))  # the lights are off
+    """Take a picture with the lights off. Returns it, its corners, and why it cannot be used (or an empty text)."""
+    next(sensor.stream(0.0))  # turns the lights off
     first = hardware.find_board(sensor.camera.read().image, board)
     image = sensor.camera.read().image
     found = hardware.find_board(image, board)
@@ -150,7 +171,7 @@ def _picture(
     _, before, after = np.intersect1d(first.numbers, found.numbers, return_indices=True)
     moved = np.hypot(*(found.pixels[after] - first.pixels[before]).T) if len(before) else np.array([np.inf])
     if np.median(moved) > STILL:
-        return image, found, "the board moved, hold it still"
+        return image, found, "the board moved while the picture was taken: hold it still"
     return image, found, ""
 
 

@@ -1,4 +1,4 @@
-"""`collect`: from the options of the command line to guided trajectories in a work directory."""
+"""`collect` of `experiments.real`: guide a person through trajectories, and save them in a work directory."""
 
 import contextlib
 import dataclasses
@@ -16,35 +16,44 @@ from sts_jax.hardware import AutomaticPerson, EmptyPad, GuideConfig, Person, Vie
 
 @dataclasses.dataclass(frozen=True)
 class Collect:
-    """Guide a person through trajectories, and save their initial and final pairs."""
+    """Guide a person through trajectories, and save the initial and the final pair of images of each."""
 
-    workdir: Folder = Path("runs/real")  # the trajectories go to its folder `dataset`
-    camera: str | None = None  # device, URL or video file (default: that of the sensor file)
-    leds: str | None = None  # its serial port (default: found by the sensor file)
-    twin: bool = False  # the digital twin on a virtual clock instead of devices, without a page or a person
-    seed: int = 0  # of the twin's object and trajectories
-    sensor: Path | None = None  # sensor file of the commissioning, with its camera, levels, settling and backgrounds
-    # width and height, pixels (default: of the sensor file, 640 x 480 of the twin, or 1640 x 1232)
+    workdir: Folder = Path("runs/real")  # work directory. The trajectories go to its folder `dataset`
+    camera: str | None = None  # path or URL of the camera, or a video file. None: the camera of the sensor file
+    leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
+    twin: bool = False  # use the digital twin instead of devices. Nobody needs to act, and there is no page
+    seed: int = 0  # seed of the twin's object and trajectories
+    sensor: Path | None = None  # sensor file of experiments.commission, or its folder
+    # width and height of the images (pixels). None: those of the sensor file, 640 x 480 with --twin, otherwise 1640 x
+    # 1232
     size: tuple[int, int] | None = None
-    fourcc: str | None = None  # pixel format of a device, such as MJPG
-    lock: bool = True  # lock exposure and white balance
-    levels: tuple[int, int, int, int] | None = None  # of the LED channels (default: of the sensor file, or 255)
-    count: int | None = None  # stop when the session has as many confirmed trajectories (default: never, twin: 100)
-    note: str = ""  # stored with each trajectory, such as the object's name
-    headless: bool = False  # in this terminal, without a page
-    automatic: bool = False  # confirm every trajectory, and take the pad to be empty at the start
-    host: str = "127.0.0.1"  # address of the page. 0.0.0.0: every computer of the network can watch and press buttons
-    port: int = 8765  # of the page, 0: a free one
-    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)
+    fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the sensor file or the driver
+    lock: bool = True  # lock the exposure and the white balance of the camera
+    # duty cycles of the four LED channels in the tactile stream, 0 to 255. None: those of the sensor file, or 255
+    levels: tuple[int, int, int, int] | None = None
+    # stop when the session has this number of confirmed trajectories, earlier ones included. None: never stop, or with
+    # --twin stop at 100
+    count: int | None = None
+    note: str = ""  # text that is stored with each trajectory, such as the object's name
+    headless: bool = False  # show instructions in this terminal instead of on a page
+    automatic: bool = False  # confirm every trajectory, and assume that the pad is empty at the start
+    # address of the page. With 0.0.0.0, every computer of the network can watch and press the buttons
+    host: str = "127.0.0.1"
+    port: int = 8765  # TCP port of the page. 0 selects a free one
+    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)  # thresholds and times of the guide
     debug: bool = False  # show the traceback of every error
 
 
 def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
-    """The sensor of the options, not connected yet, and the empty pad of the sensor file.
+    """Make the sensor that the options describe.
+
+    Returns:
+        The sensor, which is not connected yet, and the empty pad from the backgrounds of the sensor file, or None
+        without backgrounds.
 
     Raises:
         ValueError: An option is missing or out of range, or contradicts the sensor file.
-        SensorFileError: The sensor file is damaged, or of another camera.
+        SensorFileError: The sensor file is damaged, or belongs to another camera.
         OSError: The sensor file cannot be read.
     """
     if config.count is not None and config.count < 1:
@@ -56,7 +65,7 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
         raise ValueError(
             f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
             f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
-            f"{', '.join(port.device for port in ports) or 'none'}"
+            f"{', '.join(port.device for port in ports) or 'none'}. Name both, or give a sensor file with --sensor"
         )
     width, height = config.size or (1640, 1232)
     camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
@@ -64,11 +73,11 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
 
 
 def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | None]:
-    """The sensor of a file, with the empty pad of its backgrounds. See `device`."""
+    """Make the sensor of a sensor file. `device` describes the results and errors."""
     for name, value in (("size", config.size), ("levels", config.levels)):
         if value is not None:
             raise ValueError(
-                f"--{name} is {value}, but the sensor file {file} determines it: leave out --{name} or --sensor"
+                f"--{name} is {value}, but the sensor file {file} determines this value: leave out --{name} or --sensor"
             )
     device = hardware.Device.load(file)
     camera = device.camera_config(config.camera)
@@ -80,19 +89,26 @@ def commissioned(config: Collect, file: Path) -> tuple[hardware.STS, EmptyPad | 
 
 
 def collect(config: Collect) -> None:
-    """Connect, guide, save. See `device` and `simulated.collect` for the errors."""
+    """Connect the sensor, and guide and save trajectories until there are enough or the user stops the command.
+
+    Raises:
+        ValueError: An option is missing or out of range, or contradicts a file in the work directory.
+        LockedError: Another process collects into the work directory.
+        OSError: A file cannot be read or written, or is damaged.
+        LedError, CameraError, LightError, NoContrastError: The sensor cannot be connected or read.
+    """
     if config.twin:
         simulated.collect(of_twin(config))
         return
     sensor, empty = device(config)
     with person(config) as someone:
-        say("connecting. Keep the pad empty and still")
+        say("connecting. Keep the pad empty, and do not move anything in view")
         with sensor:
             origin = hardware.Origin.of(sensor)
             with hardware.Session.open(config.workdir / "dataset", origin, settling=sensor.settling) as session:
                 if config.sensor is not None:
                     keep(config.sensor, config.workdir)
-                say(f"{session.confirmed} trajectories in {session.folder}, which is continued")
+                say(f"{session.folder} has {session.confirmed} confirmed trajectories. New ones are added")
                 try:
                     hardware.collect(
                         sensor,
@@ -110,15 +126,16 @@ def collect(config: Collect) -> None:
                 say(f"{session.confirmed} confirmed trajectories in {session.folder}")
             counts = sensor.camera.statistics
             say(
-                f"{counts.frames} frames, of which the computer missed {counts.skipped} and the camera {counts.dropped}"
+                f"{counts.frames} frames arrived. {counts.skipped} of them were not read in time, and the camera lost "
+                f"{counts.dropped} others"
             )
 
 
 def of_twin(config: Collect) -> simulated.Simulated:
-    """The options that concern the twin.
+    """Convert the options to those of a collection with the twin.
 
     Raises:
-        ValueError: An option is out of range, or concerns devices.
+        ValueError: An option is out of range, or names a device.
     """
     devices = {"camera": config.camera, "leds": config.leds, "sensor": config.sensor, "fourcc": config.fourcc}
     for name, value in devices.items():
@@ -137,10 +154,16 @@ def of_twin(config: Collect) -> simulated.Simulated:
 
 
 def keep(file: Path, workdir: Path) -> None:
-    """Copy a sensor file and its backgrounds into a work directory, or check that those there are the same.
+    """Copy a sensor file and its backgrounds into a work directory.
+
+    If the work directory contains a sensor file already, only check that both describe the same device.
+
+    Args:
+        file: Path of the sensor file or of its folder.
+        workdir: Work directory.
 
     Raises:
-        ValueError: The work directory has another sensor file.
+        ValueError: The sensor file in the work directory differs.
         SensorFileError: A sensor file is damaged.
         OSError: A file cannot be read or written.
     """
@@ -161,7 +184,12 @@ def keep(file: Path, workdir: Path) -> None:
 
 @contextlib.contextmanager
 def person(config: Collect) -> Iterator[Person]:
-    """The one who sees and acts: a page, a terminal, or nobody."""
+    """Make the page or the terminal on which a person sees the instructions and acts, and close it afterwards.
+
+    Raises:
+        OSError: The address of the page cannot be used.
+        ValueError: The terminal cannot be read key by key.
+    """
     if config.headless:
         with single_keys():
             yield AutomaticTerminal(config.count) if config.automatic else Terminal(config.count)
@@ -178,7 +206,7 @@ def person(config: Collect) -> Iterator[Person]:
 
 
 class AutomaticTerminal(AutomaticPerson):
-    """Confirms every trajectory, and prints the instructions."""
+    """Confirms every trajectory automatically, and prints the instructions."""
 
     def __init__(self, count: int | None):
         super().__init__()
@@ -191,7 +219,7 @@ class AutomaticTerminal(AutomaticPerson):
 
 
 class AutomaticPage(AutomaticPerson):
-    """Confirms every trajectory, and shows the page, whose buttons work too."""
+    """Confirms every trajectory automatically, and shows a page whose buttons can also be pressed."""
 
     def __init__(self, page: Page):
         super().__init__()
@@ -203,5 +231,5 @@ class AutomaticPage(AutomaticPerson):
         self._page.show(view)
 
     def action(self) -> hardware.Action | None:
-        """The action of a button, or else the automatic one."""
+        """The action of a button that was pressed, or otherwise the automatic action."""
         return self._page.action() or super().action()

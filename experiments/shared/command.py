@@ -1,4 +1,4 @@
-"""The command line of an experiment."""
+"""The command line of the experiments: its options, and the configuration that they describe."""
 
 import argparse
 import dataclasses
@@ -16,16 +16,18 @@ from experiments.shared.progress import say
 from sts_jax import _files, dataset
 from sts_jax.compilation import cache_folder
 
-LEAST_OBJECTS = 10  # smallest number of objects in a folder, so that some can be held out for validation and test
+LEAST_OBJECTS = 10  # smallest number of usable objects in a folder, so that some can be used for validation and test
 
 
 def _folder(words: list[str]) -> Path:
+    """Convert the argument of an option to a path."""
     if not words[0].strip():
         raise ValueError("the name of the folder is empty: give a path, or '.' for the current directory")
     return Path(words[0])
 
 
-# An empty name, often from an unset shell variable, would be the current directory.
+# An option that is the path of a folder. An empty path is refused, because it would be the current directory. It often
+# comes from an unset variable of the shell.
 Folder = Annotated[
     Path,
     tyro.constructors.PrimitiveConstructorSpec(
@@ -42,25 +44,36 @@ Folder = Annotated[
 class Args:
     """Options of the command line of an experiment."""
 
-    workdir: Folder  # for results
-    # the configuration of the preset, every field of which can be changed
+    workdir: Folder  # folder for the results
+    # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]
-    preset: Literal["smoke", "default", "long", "paper"] = "default"  # the configuration that other options change
-    only: stages.Stage | None = None  # run this stage only
-    plan: bool = False  # print the expected seconds of each stage, from a short measurement, and stop
-    hidden: sts.physics.Variant = "default"  # other hidden values, see physics.variant
-    objects: Folder | None = None  # a folder of meshes, or of ShapeNetSem, instead of procedural objects
-    # objects of these classes only, of the eight or of the folder (default: the experiment's classes, or all classes of
-    # a folder that has none of them)
+    preset: Literal["smoke", "default", "long", "paper"] = "default"  # configuration from which the options start
+    only: stages.Stage | None = None  # run only this stage
+    plan: bool = False  # measure each stage for a short time, print its expected duration, and stop
+    # ranges of the hidden properties: the scenario's own (default), the middle of each range only (off), a wider range
+    # of friction (wide-friction), or contents that lie on any side of the object (off-centre)
+    hidden: sts.physics.Variant = "default"
+    objects: Folder | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
+    # classes of the objects. Empty: those of the experiment, or all classes of --objects if it has none of these
     classes: tuple[str, ...] = ()
-    scale: float | None = None  # m, length of one unit of the folder's files: 0.001 for millimetres
-    up: Literal["x", "y", "z"] | None = None  # the axis of the folder's files that points up
-    parts: bool = False  # convex parts for objects whose hull fits badly
+    # length of one unit of the files in --objects (m), such as 0.001 for millimetres. None: that of ShapeNetSem's
+    # table, or 1 m
+    scale: float | None = None
+    # axis of the files in --objects that points up. None: that of ShapeNetSem's table, or y for glTF and z for other
+    # files
+    up: Literal["x", "y", "z"] | None = None
+    parts: bool = False  # decompose objects whose collision hull fits badly into convex parts
     debug: bool = False  # show the traceback of every error
 
 
 def run(presets: Mapping[str, Config], workdir: str, description: str | None) -> None:
-    """Run an experiment from the command line."""
+    """Run an experiment from the command line.
+
+    Args:
+        presets: Configurations by name. The name `default` must be among them.
+        workdir: Default of `--workdir`.
+        description: Text for `--help`.
+    """
     args = parse(presets, workdir, description)
     with errors.on_one_line(debug=args.debug):
         sts.enable_compilation_cache()
@@ -72,7 +85,13 @@ def run(presets: Mapping[str, Config], workdir: str, description: str | None) ->
 
 
 def parse(presets: Mapping[str, Config], workdir: str, description: str | None) -> Args:
-    """Read the options. A field of the configuration that is not given keeps the value of the preset."""
+    """Read the options of the command line. A field without an option keeps the value of the preset.
+
+    Args:
+        presets: Configurations by name. The name `default` must be among them.
+        workdir: Default of `--workdir`.
+        description: Text for `--help`.
+    """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", nargs="?")
     name = first.parse_known_args()[0].preset
@@ -88,7 +107,7 @@ def parse(presets: Mapping[str, Config], workdir: str, description: str | None) 
 
 
 def _concrete() -> tyro.constructors.ConstructorRegistry:
-    """A rule of tyro: a field whose type is a Protocol has the options of the dataclass that is its default."""
+    """A rule for tyro: if a field's type is a Protocol, its options are the fields of its default, a dataclass."""
     registry = tyro.constructors.ConstructorRegistry()
 
     @registry.struct_rule
@@ -103,19 +122,22 @@ def _concrete() -> tyro.constructors.ConstructorRegistry:
 
 
 def configure(args: Args) -> Config:
-    """Apply the options to the configuration. The objects of a folder are read, and listed in the work directory.
+    """Apply the options to the configuration of the preset.
+
+    With `--objects`, the objects of the folder are read and listed in `objects.txt` in the work directory.
 
     Raises:
         FileNotFoundError: The folder of objects does not exist.
         ValueError: A class is unknown, a field of the configuration is out of range, two options contradict each other,
             or the folder has too few usable objects.
+        LockedError: Another process works in the work directory.
     """
     check(args.config)
     collection = args.config.collection
     scenario = sts.physics.variant(collection.scenario, args.hidden)
     collection = dataclasses.replace(collection, scenario=scenario, parts=args.parts or collection.parts)
     if args.objects is None and (args.scale is not None or args.up is not None):
-        raise ValueError("--scale and --up are for the files of a folder: give it with --objects")
+        raise ValueError("--scale and --up are for the files of a folder: give the folder with --objects")
     if args.objects is not None:
         collection = with_meshes(collection, args.objects, args.workdir, args.classes, scale=args.scale, up=args.up)
     elif args.classes:
@@ -135,22 +157,29 @@ def with_meshes(
     scale: float | None = None,
     up: Literal["x", "y", "z"] | None = None,
 ) -> dataset.Collection:
-    """A collection of the objects of a folder, with about as many trajectories. Lists the objects in `objects.txt`.
+    """Replace the objects of a collection by those of a folder, and keep about the same number of trajectories.
+
+    The objects are listed in `objects.txt` in the work directory.
 
     Args:
-        collection: The collection of procedural objects.
-        folder: See `objects.library`.
-        workdir: Folder for the listing.
-        classes: The classes to use. Empty means the classes of the collection that the folder has, or all classes of
-            the folder if it has none of them.
-        scale: See `objects.library`.
-        up: See `objects.library`.
+        collection: Collection of procedural objects.
+        folder: Folder of mesh files, or of ShapeNetSem.
+        workdir: Work directory for the listing.
+        classes: Classes to use. If empty, the classes that the collection and the folder share are used, or all classes
+            of the folder if they share none.
+        scale: Length of one unit of the files (m). Default: as in `objects.library`.
+        up: Axis of the files that points up. Default: as in `objects.library`.
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: A class is unknown, or the folder has too few usable objects.
+        LockedError: Another process works in the work directory.
     """
     there = dataset.mesh_classes(folder)
     taken = classes or tuple(name for name in there if name in collection.categories) or there
     others = [name for name in there if name not in taken]
     path = workdir / "objects.txt"
-    with _files.lock(workdir):  # another run in the folder keeps its listing
+    with _files.lock(workdir):  # so that another run in this folder does not lose its listing
         meshes, listing = dataset.survey_meshes(
             folder,
             collection.scenario,
@@ -163,14 +192,15 @@ def with_meshes(
         )
         if others:
             listing += f"classes left out: {', '.join(others)}; --classes takes others\n"
-        # Collecting appends the objects that it left out to the listing.
+        # The stage `collect` appends the objects that it left out, so the file may be longer than this listing.
         if not (path.exists() and path.read_text(errors="replace").startswith(listing)):
             _files.write_bytes(path, listing.encode())
-    say(f"classes taken: {', '.join(taken)}" + (f"; left out: {', '.join(others)}" if others else ""))
-    say(f"{len(meshes.names)} objects can be used. {path} lists them and the objects left out")
+    say(f"classes used: {', '.join(taken)}" + (f". Left out: {', '.join(others)}" if others else ""))
+    say(f"{len(meshes.names)} objects can be used. {path} lists these and the objects left out")
     if len(meshes.names) < LEAST_OBJECTS:
         raise ValueError(
-            f"{folder}: a split needs at least {LEAST_OBJECTS} usable objects, got {len(meshes.names)}: add objects"
+            f"objects is {folder}, which has {len(meshes.names)} usable objects, but the split into training, "
+            f"validation and test needs at least {LEAST_OBJECTS}: add objects. {path} lists why others are left out"
         )
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))

@@ -7,7 +7,8 @@ from typing import Literal
 from sts_jax import dataset, statespace, training
 from sts_jax.training import TrainConfig
 
-# The models of an experiment by the modalities they have, the main one first. The paper's are the rows of its Table 1.
+# The models of each kind and their modalities. The first model of a kind is the main one, which the tables and figures
+# show. The paper's models are the rows of its Table 1.
 MODELS: dict[str, dict[str, tuple[str, ...]]] = {
     "statespace": {"statespace": ("visual", "tactile", "pose")},
     "paper": {
@@ -24,32 +25,38 @@ TITLES = {
     "vae-visual": "VAE visual only",
     "vae-tactile": "VAE tactile only",
 }
-SMALLEST = 16  # pixels, side of the smallest images in which the outline of an object can be judged
+SMALLEST = 16  # side of the smallest images in which the outline of an object can be judged (pixels)
 SPLITS = ("object", "trajectory")
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """One experiment: its dataset, its models, and how they are trained and evaluated."""
+    """The configuration of an experiment: its dataset, its models, their training and their evaluation."""
 
     collection: dataset.Collection  # the dataset
-    training: TrainConfig  # of the paper's models
-    state_training: TrainConfig  # of the state-space model
-    model: Literal["statespace", "paper"] = "statespace"  # the state-space model, or the paper's four models
-    # gradient steps of each of the paper's models (None: training.epochs decides)
+    training: TrainConfig  # training of the paper's models
+    state_training: TrainConfig  # training of the state-space model
+    model: Literal["statespace", "paper"] = "statespace"  # train the state-space model, or the paper's four models
+    # number of gradient steps of each of the paper's models. None: training.epochs determines the numbers
     steps: tuple[int, ...] | None = None
-    # of the paper's models: a subset of modalities is trained to predict all targets, or its own (paper)
+    # modalities that the paper's models learn to predict from a subset of the modalities: all, or only those of the
+    # subset (own, as in the paper)
     targets: Literal["all", "own"] = "all"
-    rotation: Literal["matrix", "quaternion"] = "matrix"  # as the networks see it
-    mask_blank_touch: bool = True  # a touch without contact is no input (False: the blank image is, as in the paper)
-    # Held out: whole objects, or shuffled trajectories, so that each object is in both parts (paper). With several
-    # splits, each has its own models and table.
+    rotation: Literal["matrix", "quaternion"] = "matrix"  # representation of rotations in the networks
+    # do not use a tactile image without contact as an input. False: use the blank image, as in the paper
+    mask_blank_touch: bool = True
+    # data that is held out for validation and test: whole objects (object), or a random share of all trajectories, so
+    # that each object is also in the training data (trajectory, as in the paper). Each split has its own models and
+    # table
     splits: tuple[Literal["object", "trajectory"], ...] = ("object",)
-    num_shown: int = 8  # held-out trajectories in the figures
-    image_size: int = 64  # pixels, side of the images that are predicted and judged
-    num_samples: int = 16  # of each prediction of the state-space model (the paper's are judged by their mean)
-    rerolls: int = 16  # of each start, for the ceilings
-    num_rerolled: int = 256  # held-out starts, the first ones, that the ceilings are computed on
+    num_shown: int = 8  # number of held-out trajectories in the figures
+    image_size: int = 64  # side of the images that are predicted and evaluated (pixels)
+    # number of samples of each prediction of the state-space model. The paper's models are evaluated by their mean
+    num_samples: int = 16
+    # number of simulations of each held-out start with newly drawn hidden properties (re-rolls). The mean of their
+    # results is the ceiling in the tables
+    rerolls: int = 16
+    num_rerolled: int = 256  # number of held-out starts with re-rolls, from the first one on
 
 
 # The same for all scenarios. The presets set `steps`.
@@ -65,7 +72,7 @@ STATE_TRAINING = TrainConfig(
 
 
 def smoke(default: Config) -> Config:
-    """An experiment for tests: every stage, a little of each."""
+    """Reduce a configuration to a short experiment for tests, which runs every stage."""
     collection = dataclasses.replace(
         default.collection,
         num_objects=16,
@@ -93,13 +100,19 @@ def smoke(default: Config) -> Config:
 
 
 def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: int) -> Config:
-    """The paper's schedule and choices, on all frames of so many trajectories."""
+    """Make the configuration of the paper: its models, its schedule and its choices, with all frames rendered.
+
+    Args:
+        collection: Collection of the default experiment, with the scenario and the object classes.
+        num_objects: Number of objects.
+        num_per_object: Number of trajectories of each object.
+    """
     return Config(
         collection=dataclasses.replace(
             collection,
             num_objects=num_objects,
             num_per_object=num_per_object,
-            num_full=num_objects * num_per_object,  # of about 60 frames of both streams
+            num_full=num_objects * num_per_object,  # all trajectories, with about 60 frames each
             num_rendered=None,
             num_views=0,
             symmetries=False,
@@ -119,7 +132,7 @@ def paper(collection: dataset.Collection, *, num_objects: int, num_per_object: i
 
 
 def check(config: Config) -> None:
-    """Check the fields that the stages after the collection depend on, so that nothing is collected in vain.
+    """Check the fields that later stages need, so that a mistake is found before the collection.
 
     Raises:
         ValueError: A field is out of range, or two fields contradict each other. The message names the remedy.
@@ -139,8 +152,8 @@ def check(config: Config) -> None:
     allowed = image_sizes(config)
     if not allowed:
         raise ValueError(
-            f"collection.resolution must be a size from which the model can predict images, got {height} x {width}: "
-            "give --collection.resolution 64 64 or 128 128"
+            f"collection.resolution must be a size from which model {config.model!r} can predict images, got {height} "
+            f"x {width}: give --collection.resolution 64 64 or 128 128"
         )
     if config.image_size not in allowed:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
@@ -160,13 +173,13 @@ def check(config: Config) -> None:
 
 
 def image_sizes(config: Config) -> tuple[int, ...]:
-    """The values of `image_size` that the model and the resolution of the collection allow."""
+    """The values of `image_size` that the model and the resolution of the collection allow, in pixels."""
     side = config.collection.resolution[0]
     return tuple(size for size in range(SMALLEST, side + 1) if side % size == 0 and _fits(config.model, side, size))
 
 
 def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
-    """Whether the networks exist that predict images of `size` from images of `side` pixels."""
+    """Return whether the model can predict images with a side of `size` from images with a side of `side` pixels."""
     try:
         if model == "statespace":
             statespace.Config(input_size=side, image_size=size)
@@ -178,7 +191,7 @@ def _fits(model: Literal["statespace", "paper"], side: int, size: int) -> bool:
 
 
 def model_folder(workdir: Path, name: str, config: Config, split: str) -> Path:
-    """The folder of a model: `models/NAME`, followed by the split if that is not the experiment's first one."""
+    """The folder of a model: `models/NAME` for the first split of the experiment, else `models/NAME-by-SPLIT`."""
     return workdir / "models" / (name if split == config.splits[0] else f"{name}-by-{split}")
 
 
@@ -188,5 +201,5 @@ def main_model(config: Config) -> str:
 
 
 def schedule(config: Config) -> TrainConfig:
-    """The options of the training of its models."""
+    """The training options of the models that the experiment trains."""
     return config.state_training if config.model == "statespace" else config.training

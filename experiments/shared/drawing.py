@@ -1,4 +1,4 @@
-"""The figures of an evaluation."""
+"""Draws the figures of an evaluation."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +10,7 @@ from experiments.shared.config import TITLES, Config, main_model
 from experiments.shared.rerolls import Ceilings
 from sts_jax import dataset, evaluation
 
-JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # whose outcome probabilities are drawn
+JUDGED_SUBSETS = ("visual", "visual and tactile", "all inputs")  # inputs for which outcome probabilities are drawn
 
 
 def draw(
@@ -23,20 +23,22 @@ def draw(
     shown: Mapping[str, evaluation.Predicted],
     possible: Ceilings,
 ) -> list[Path]:
-    """Draw the predictions of two queries, and the calibration and some ends of predicted distributions.
+    """Draw the predictions of the main model from vision and from all inputs, and how well they are calibrated.
+
+    A further figure shows predicted and re-rolled positions at rest, if the model predicts samples of the pose.
 
     Args:
-        config: The experiment.
-        workdir: Its work directory, for titles.
-        figures: The folder for the figures.
-        sensor: The sensor of the collection.
-        test: The held-out moments.
-        scores: Scores by title.
-        shown: The first predictions of each query, by title.
-        possible: The re-rolls of the first held-out starts.
+        config: Configuration of the experiment.
+        workdir: Work directory. Its name is part of the titles.
+        figures: Folder for the figures.
+        sensor: Sensor of the collection.
+        test: Held-out trajectories.
+        scores: Scores by title of the row in the tables.
+        shown: Predictions of the first held-out trajectories, by title of the row.
+        possible: Re-rolls of the first held-out starts.
 
     Returns:
-        The files.
+        Paths of the figures.
     """
     drawn, model, scenario = [], TITLES[main_model(config)], config.collection.scenario
     for given, name in (("visual", "predictions"), ("all inputs", "predictions-all")):
@@ -62,7 +64,16 @@ def draw(
 def _ends(
     path: Path, head: str, sensor: sts.Sensor, test: dataset.Pairs, sampled: np.ndarray, rerolled: np.ndarray
 ) -> None:
-    """Draw the ends of the start whose re-rolls spread most widely."""
+    """Draw the positions at rest for the start whose re-rolls have the widest spread.
+
+    Args:
+        path: Path of the figure.
+        head: Begin of the title.
+        sensor: Sensor of the collection.
+        test: Held-out trajectories.
+        sampled: Sampled poses at rest, shape (samples, n, 7).
+        rerolled: Poses at rest of the re-rolls, shape (times, n, 7).
+    """
     spread = np.linalg.norm(rerolled[..., :2] - rerolled[..., :2].mean(0), axis=-1).mean(0)
     item = int(spread.argmax())
     evaluation.figures.ends(

@@ -1,4 +1,4 @@
-"""The expected duration of an experiment, from a short measurement."""
+"""Estimates the duration of an experiment from a short measurement of each stage."""
 
 import dataclasses
 import tempfile
@@ -16,37 +16,40 @@ from experiments.shared.judging import evaluate
 from experiments.shared.progress import Bar
 from sts_jax import dataset, evaluation
 
-MANY = 8  # objects that are measured
+MANY = 8  # number of objects in the measurement
 
 
 class Line(NamedTuple):
     """The expected duration of one part of an experiment."""
 
-    part: str
-    seconds: float
-    note: str
+    part: str  # name of the part
+    seconds: float  # expected duration (s)
+    note: str  # remark in brackets, such as the measured rate
 
 
 class Rate(NamedTuple):
-    """A measured rate."""
+    """The measured duration of one item, and of the compilation."""
 
-    each: float  # s per item
-    compiling: float  # s, once
+    each: float  # duration of one item (s)
+    compiling: float  # duration of the compilation, which happens once (s)
 
     def of(self, total: int) -> float:
-        """Seconds for some items."""
+        """The expected duration of `total` items, including the compilation (s)."""
         return max(self.compiling, 0) + total * self.each
 
 
 def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
-    """Measure a little of each stage, and return a line with the expected seconds for each.
+    """Run a small part of each stage, and estimate the duration of the whole experiment.
 
-    Everything is measured twice, so that compilation counts once.
+    Each part runs twice, because the first run includes the compilation.
 
     Args:
-        config: The experiment.
-        num: Trajectories to simulate. Each has its first and last frame rendered in all symmetries.
-        steps: Gradient steps of each model.
+        config: Configuration of the experiment.
+        num: Number of simulated trajectories. The first and the last frame of each are rendered in all symmetries.
+        steps: Number of gradient steps of each model.
+
+    Returns:
+        A text with one line for each part of the experiment, and a line for their sum.
 
     Raises:
         ValueError: A field of the configuration is out of range.
@@ -67,12 +70,22 @@ def plan(config: Config, *, num: int = 64, steps: int = 4) -> str:
 
 
 def shown(lines: Sequence[Line]) -> str:
-    """Parts of an experiment with their seconds, as text."""
+    """Format the durations as text, with one line for each part."""
     return "\n".join(f"{line.part:<36}{line.seconds:>9.0f} s   ({line.note})" for line in lines)
 
 
 def _rates(collection: dataset.Collection, sensor: sts.Sensor, folder: Path, num: int, bar: Bar) -> tuple[Rate, Rate]:
-    """Seconds per trajectory and per frame, from collecting `num` trajectories twice, into `0` and `1`."""
+    """Measure the rates of trajectories and of frames. Two datasets of `num` trajectories are collected.
+
+    The second one shows the duration without compilation.
+
+    Args:
+        collection: Collection of the experiment.
+        sensor: Sensor of the collection.
+        folder: Folder for the datasets, which are named `0` and `1`.
+        num: Number of trajectories of each dataset.
+        bar: Progress bar.
+    """
     spent: dict[str, list[float]] = {"trajectories": [], "frames": []}
     for seed in (0, 1):
         little = dataclasses.replace(
@@ -99,6 +112,7 @@ def _rates(collection: dataset.Collection, sensor: sts.Sensor, folder: Path, num
 
 
 def _collecting(config: Config, trajectories: Rate, frames: Rate) -> list[Line]:
+    """The expected duration of the simulation and the rendering of the whole dataset."""
     collection = config.collection
     rendered = collection.num_objects * collection.rendered_per_object
     total = rendered * 2 * len(dataset.symmetries_of(collection))
@@ -118,6 +132,7 @@ def _collecting(config: Config, trajectories: Rate, frames: Rate) -> list[Line]:
 
 
 def _ceilings(config: Config, trajectories: Rate, frames: Rate) -> Line:
+    """The expected duration of the re-rolls for the ceiling."""
     collection = config.collection
     held_out = round(collection.shares[2] * collection.num_objects * collection.rendered_per_object)
     total = min(config.num_rerolled, held_out) * config.rerolls
@@ -128,7 +143,7 @@ def _ceilings(config: Config, trajectories: Rate, frames: Rate) -> Line:
 def _training(
     config: Config, sensor: sts.Sensor, data: dataset.Dataset, folder: Path, steps: int, bar: Bar
 ) -> list[Line]:
-    """Train each model for some steps, in the folder of a small experiment."""
+    """Measure the training of each model for a few steps, in the folder of the small experiment."""
     collection, lines = config.collection, []
     rendered = collection.num_objects * collection.rendered_per_object
     share = evaluation.train_share(collection.shares, config.splits[0])
@@ -152,6 +167,7 @@ def _training(
 
 
 def _evaluating(config: Config, sensor: sts.Sensor, data: dataset.Dataset, folder: Path) -> Line:
+    """Measure the evaluation of the small experiment."""
     held_out = len(evaluation.rows_of(data, "trajectory")["test"])
     start = time.perf_counter()
     evaluate(_small(config), data, folder, sensor, "trajectory")
@@ -159,6 +175,6 @@ def _evaluating(config: Config, sensor: sts.Sensor, data: dataset.Dataset, folde
 
 
 def _small(config: Config) -> Config:
-    """The experiment that is measured."""
+    """The configuration of the small experiment that is measured."""
     collection = dataset.head(config.collection, MANY)
     return dataclasses.replace(config, collection=collection, splits=("trajectory",), rerolls=2)

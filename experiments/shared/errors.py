@@ -1,4 +1,4 @@
-"""Errors on the command line."""
+"""How the commands report errors."""
 
 import contextlib
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from sts_jax import hardware
 from sts_jax.dataset import LockedError
 
-# The types of errors that the library raises for input that the user can correct
+# Types of the errors that the library raises for mistakes that the user can correct
 CORRECTABLE = (
     OSError,
     ValueError,
@@ -21,10 +21,10 @@ CORRECTABLE = (
 
 @contextlib.contextmanager
 def on_one_line(*, debug: bool = False) -> Iterator[None]:
-    """Show an error that the user can correct as `error: ...` without a traceback, and exit with code 1.
+    """Report an error that the user can correct as one line, `error: ...`, and exit with code 1.
 
     Args:
-        debug: Keep every traceback.
+        debug: If True, raise all errors unchanged, so that Python prints their tracebacks.
 
     Raises:
         SystemExit: An error of one of the types in CORRECTABLE occurred.

@@ -1,4 +1,4 @@
-"""The evaluation of an experiment: every model with every subset of its inputs, as tables and figures."""
+"""Evaluates every model of an experiment with every subset of its inputs, and writes tables and figures."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from experiments.shared.progress import Bar, say
 from experiments.shared.rerolls import ceilings
 from sts_jax import _files, dataset, evaluation, training
 
-# The main table shows the main model from the first five of these inputs that it can be given.
+# The main table has rows for the main model with the first five of these inputs that the model supports.
 MAIN_SUBSETS = (
     *("visual", "tactile", "visual and tactile", "visual and pose", "all inputs", "pose"),
     evaluation.TRUE_STATE,
@@ -21,19 +21,34 @@ MAIN_SUBSETS = (
 
 
 class Moments(NamedTuple):
-    """The moments of a split. The models' inputs have the resolution of the collection, or are as small as the rest."""
+    """The first and last frames of a split.
 
-    train: dataset.Pairs
-    validation: dataset.Pairs  # as inputs
-    given: dataset.Pairs  # held out, as inputs
-    test: dataset.Pairs  # the same with images of `image_size`
+    `validation` and `given` have the resolution that the models require as inputs. `train` and `test` have images of
+    `image_size`.
+    """
+
+    train: dataset.Pairs  # training trajectories
+    validation: dataset.Pairs  # validation trajectories
+    given: dataset.Pairs  # held-out trajectories, as inputs
+    test: dataset.Pairs  # the same held-out trajectories, as targets
 
 
 def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> str:
-    """Score every model on held-out trajectories and return the main table.
+    """Score every model on held-out trajectories, and write and return the results.
 
-    Writes `metrics.json`, `table.md`, `table-full.md` and `figures/`. `metrics.json` records the checksums of
-    everything that was evaluated and written. Nothing is done again while they hold.
+    The results are `metrics.json`, `table.md`, `table-full.md` and `figures/` in the work directory. `metrics.json`
+    records the checksums of all inputs and results. While all checksums match, nothing is evaluated again. Names of the
+    files of a further split contain its name.
+
+    Args:
+        config: Configuration of the experiment.
+        data: Dataset of the experiment.
+        workdir: Work directory with the trained models.
+        sensor: Sensor of the collection.
+        split: Split, one of `config.splits`.
+
+    Returns:
+        The main table in Markdown.
     """
     suffix = "" if split == config.splits[0] else f"-by-{split}"
     done, figures = workdir / f"metrics{suffix}.json", workdir / f"figures{suffix}"
@@ -77,7 +92,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
 
 
 def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str) -> dict[str, str]:
-    """The checksums of everything that is evaluated."""
+    """The checksums of the configuration, the dataset and the models, by name."""
     inputs = {"config.json": _files.digest(dataclasses.asdict(config)), "dataset": data.identity}
     for folder in (model_folder(workdir, name, config, split) for name in MODELS[config.model]):
         inputs[folder.relative_to(workdir).as_posix()] = results.identity(folder)
@@ -85,6 +100,7 @@ def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str) ->
 
 
 def _moments(config: Config, data: dataset.Dataset, split: str) -> Moments:
+    """Load the first and last frames of a split, in the resolutions that `Moments` describes."""
     rows = evaluation.rows_of(data, split)
     train = dataset.reduced(data.pairs(rows["train"], symmetries=True), config.image_size)
     validation, given = data.pairs(rows["validation"]), data.pairs(rows["test"])
@@ -95,7 +111,11 @@ def _moments(config: Config, data: dataset.Dataset, split: str) -> Moments:
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
-    """Every model with every subset of the inputs that it can be given, as title, model and subset."""
+    """Combine every model with every subset of the inputs that it supports.
+
+    Yields:
+        The title of the row in the tables, the model, and the names of its inputs.
+    """
     for name in MODELS[config.model]:
         predictor = sts.Predictor.load(model_folder(workdir, name, config, split))
         subsets = evaluation.subsets(predictor.modalities, state=config.model == "statespace")
@@ -111,7 +131,11 @@ def _scored(
     judge: Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores],
     bar: Bar,
 ) -> tuple[dict[str, evaluation.Scores], dict[str, evaluation.Predicted]]:
-    """The scores of each query, and its first predictions for the figures."""
+    """Predict with each combination of `queries`.
+
+    Returns:
+        The scores, and the first predictions for the figures, both by title.
+    """
     blank = training.load_blank(model_folder(workdir, main_model(config), config, split))[0] / 255
     num_samples = config.num_samples if config.model == "statespace" else 0
     scores, shown = {}, {}
@@ -133,17 +157,18 @@ def _scored(
 
 
 def main_rows(model: str, titles: Sequence[str]) -> list[str]:
-    """The rows of the main table, ten at most: the ceiling, the baselines, and the main model from five subsets.
+    """The titles of the rows of the main table: the ceiling, the baselines, and the main model with five inputs.
 
     Args:
         model: Title of the main model.
-        titles: Of the models' rows, in the order of `queries`.
+        titles: Titles of all rows of models.
     """
     wanted = [f"{model}, from {given}" for given in MAIN_SUBSETS]
     return [evaluation.CEILING, *evaluation.BASELINES, *[title for title in wanted if title in titles][:5]]
 
 
 def _notes(config: Config, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> list[str]:
+    """The notes below a table: the schedule of the training, and an explanation of the ceiling."""
     steps = ", ".join(f"{name} {log[-1]['step'] if log else 0}" for name, log in logs.items())
     return [
         f"Gradient steps: {steps}, batch {schedule(config).batch_size}.",
@@ -153,7 +178,10 @@ def _notes(config: Config, logs: Mapping[str, Sequence[Mapping[str, float]]]) ->
 
 
 def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pairs) -> list[str]:
-    """A line on the share of the outcome's log loss from vision that touch removes, if both were predicted."""
+    """A note on the share by which touch lowers the log loss of the outcome, compared with vision alone.
+
+    The list is empty if the main model did not predict outcomes from vision and from vision and touch.
+    """
     before, after = (f"{model}, from {given}" for given in ("visual", "visual and tactile"))
     if before not in scores or after not in scores:
         return []
@@ -165,7 +193,11 @@ def _gains(model: str, scores: Mapping[str, evaluation.Scores], test: dataset.Pa
 
 
 def read_log(folder: Path) -> list[dict[str, float]]:
-    """The training log of a model, empty if it has none."""
+    """Read the training log of a model. Without a log, the list is empty.
+
+    Raises:
+        TornFileError: The log is damaged.
+    """
     path = folder / "metrics.jsonl"
     try:
         return [json.loads(line) for line in path.read_bytes().splitlines()]

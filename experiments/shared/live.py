@@ -1,4 +1,4 @@
-"""Predictions of the resting state from live images, in a thread that leaves out images rather than falling behind."""
+"""Predicts the resting state from live images in a thread. A model that is slower than the sensor skips images."""
 
 import collections
 import dataclasses
@@ -18,73 +18,77 @@ import sts_jax as sts
 from sts_jax import hardware
 from sts_jax.hardware import guide
 
-SIDE = 384  # pixels, of the images that are shown
-_RECENT_S = 3.0  # s, over which the rate is measured
-_KEPT = 4096  # latencies that are kept for the median
-_OCCUPIED = 8.0  # of 255, change of a block of the visual image that shows an object
-_BLOCKS = 3  # such blocks
+SIDE = 384  # side of the images that are shown (pixels)
+_RECENT_S = 3.0  # time over which the rate is measured (s)
+_KEPT = 4096  # number of latencies from which the median is computed
+_OCCUPIED = 8.0  # difference of a block of the visual image from the empty pad that counts as a change, of 255
+_BLOCKS = 3  # number of changed blocks that show an object
 
 Image = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predicted:
-    """A prediction and the images that it was made from."""
+    """A prediction, and facts about the images from which it was made."""
 
-    visual: Image  # at rest, the mean over the model's samples
-    tactile: Image
-    outcomes: list[tuple[str, float]]  # names and probabilities, empty for a model without
-    contact: bool | None  # whether the object touches the pad now. None: there is no background to compare with
-    occupied: bool | None  # whether there is an object. None: there is no background to compare with
-    newest_s: float  # arrival of the newer one of its images, on `time.monotonic` (s)
+    visual: Image  # predicted visual image at rest, the mean over the model's samples
+    tactile: Image  # predicted tactile image at rest
+    outcomes: list[tuple[str, float]]  # names and probabilities of the outcomes, empty if the model predicts none
+    contact: bool | None  # True if the object touches the pad now. None: unknown without images of the empty pad
+    occupied: bool | None  # True if an object is in view. None: unknown without images of the empty pad
+    newest_s: float  # arrival of the newer input image, on the clock `time.monotonic` (s)
 
 
 class Seen(NamedTuple):
-    """All that is shown at one moment."""
+    """All content of the live display at one time."""
 
-    visual: Image  # newest image, in the view of the sensor
-    tactile: Image
-    time_s: float  # arrival of the newest image, on `time.monotonic` (s)
-    images_per_s: float
-    predicted: Predicted | None
+    visual: Image  # newest visual image, in the view of the sensor
+    tactile: Image  # newest tactile image, in the view of the sensor
+    time_s: float  # arrival of the newest image, on the clock `time.monotonic` (s)
+    images_per_s: float  # images per second of both streams together
+    predicted: Predicted | None  # newest prediction, or None before the first one
     rate: float  # predictions per second
-    latency_s: float | None  # median, from the arrival of the newer image until the prediction is shown
-    recorded: int | None  # images in the recording. None: there is none
-    note: str  # on the source
+    latency_s: float | None  # median time from the arrival of an input's newer image until its prediction is shown (s)
+    recorded: int | None  # number of images in the recording, or None if nothing is recorded
+    note: str  # remark on the source
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Backgrounds:
     """The raw images of the empty pad."""
 
-    visual: Image
-    tactile: Image
-    divided: bool  # whether the images for the model are divided by them
+    visual: Image  # raw image without light
+    tactile: Image  # raw image with light
+    divided: bool  # True if the images for the model are divided by the images of the empty pad
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Views:
-    """The way from raw images to the view of the sensor."""
+    """The conversion from raw images to the view of the sensor."""
 
-    lens: hardware.Lens
-    pinhole: hardware.Pinhole
-    backgrounds: Backgrounds | None
+    lens: hardware.Lens  # lens of the raw images
+    pinhole: hardware.Pinhole  # view of the sensor
+    backgrounds: Backgrounds | None  # images of the empty pad, if they are known
 
     def shown(self, image: Image) -> Image:
-        """The view of a raw image, for people."""
+        """Convert a raw image to the view of the sensor for display, uint8 RGB of shape (SIDE, SIDE, 3)."""
         return hardware.rectified(self.lens, self.pinhole, image, (SIDE, SIDE))
 
     def floats(self, image: Image, resolution: tuple[int, int]) -> Float[np.ndarray, "height width 3"]:
-        """The view of a raw image, for a model, [0, 1]."""
+        """Convert a raw image to the view of the sensor with the resolution (height, width), float32 in [0, 1]."""
         return hardware.rectified(self.lens, self.pinhole, image, resolution).astype(np.float32) / 255
 
     def prepared(self, visual: Image, tactile: Image, empty: Mapping[str, np.ndarray]) -> hardware.SensorView:
-        """Raw images as a model takes them, in the light of its untouched sensor.
+        """Convert raw images to the inputs of a model.
+
+        If the images of the empty pad are known and `divided` is True, the brightness and the colours are adapted to
+        those of the model's training images (`hardware.relit`).
 
         Args:
-            visual: Raw image.
-            tactile: Raw image.
-            empty: The images of the untouched sensor, `Predictor.empty`.
+            visual: Raw visual image.
+            tactile: Raw tactile image.
+            empty: Images of the untouched sensor in the model's training (`Predictor.empty`). Their size is the
+                resolution of the result.
         """
         model = hardware.SensorView(**empty)
         rows, columns = model.visual.shape[:2]
@@ -97,7 +101,7 @@ class Views:
 
 
 class Live:
-    """Predicts in a thread of its own, always from the newest images.
+    """Predicts in a thread, always from the newest images.
 
     ```python
     with Live(predictor, views, names, (), show) as live:
@@ -114,23 +118,29 @@ class Live:
         condition: tuple[float, ...],
         show: Callable[[], None],
     ):
-        """Compile the prediction, which takes about half a minute at the first time on a machine, and start.
+        """Compile the model, and start the thread.
+
+        The compilation takes about half a minute at the first time on a machine.
 
         Args:
-            predictor: The model. It has to take visual images.
-            views: The way from raw images to its view.
-            outcomes: Names of the outcomes of its scenario, in their order.
-            condition: Its condition, in SI units. Empty: zeros.
-            show: Called in the thread after each prediction. The latency ends when it returns.
+            predictor: Trained model. Visual images must be among its inputs.
+            views: Conversion from raw images to the view of the sensor.
+            outcomes: Names of the outcomes of the model's scenario, in the scenario's order. If their number does not
+                match the model's outcomes, they are numbered instead.
+            condition: Condition of the scenario, in SI units. An empty tuple stands for zeros.
+            show: Function that the thread calls after each prediction. The latency includes this call.
 
         Raises:
-            ValueError: The model takes no visual images, or needs another condition.
+            ValueError: The model cannot use visual images, or `condition` has the wrong length.
         """
         if "visual" not in predictor.modalities:
-            raise ValueError(f"{predictor!r} takes no visual images: give another --model")
+            raise ValueError(f"{predictor!r} takes no visual images as inputs: give another --model")
         width = predictor.model.config.condition
         if len(condition) not in (0, width):
-            raise ValueError(f"condition has {len(condition)} numbers, but {predictor!r} needs {width}")
+            raise ValueError(
+                f"condition has {len(condition)} numbers, but {predictor!r} needs {width}: change or leave out "
+                "--condition"
+            )
         self._predictor, self._views, self._outcomes = predictor, views, outcomes
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None
         self._show = show
@@ -151,10 +161,14 @@ class Live:
         self._thread.start()
 
     def offer(self, visual: hardware.Shot, tactile: hardware.Shot) -> None:
-        """Predict from these images next. Images that were offered before and not yet taken are left out.
+        """Predict from these images next, and skip images that were offered earlier and still wait.
+
+        Args:
+            visual: Newest visual image.
+            tactile: Newest tactile image.
 
         Raises:
-            Exception: The error that has ended the thread.
+            Exception: An earlier prediction failed. This error has ended the thread.
         """
         with self._changed:
             if self._error is not None:
@@ -165,13 +179,13 @@ class Live:
 
     @property
     def newest(self) -> Predicted | None:
-        """The newest prediction."""
+        """The newest prediction, or None before the first one."""
         with self._changed:
             return self._newest
 
     @property
     def rate(self) -> float:
-        """Predictions per second, of the last three seconds."""
+        """Predictions per second over the last three seconds."""
         now_s = time.monotonic()
         with self._changed:
             recent = [shown_s for shown_s in self._shown_s if shown_s > now_s - _RECENT_S]
@@ -179,12 +193,12 @@ class Live:
 
     @property
     def latency_s(self) -> float | None:
-        """Median time from the arrival of the newer image of a prediction until it is shown (s)."""
+        """Median time from the arrival of an input's newer image until its prediction is shown (s), or None."""
         with self._changed:
             return statistics.median(self._latencies_s) if self._latencies_s else None
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
@@ -208,17 +222,19 @@ class Live:
                     self.made += 1
                     self._shown_s.append(now_s)
                     self._latencies_s.append(now_s - predicted.newest_s)
-        except Exception as error:  # raised by the next call of `offer`
+        except Exception as error:  # the next call of `offer` raises this error
             with self._changed:
                 self._error = error
 
     def _taken(self) -> tuple[hardware.Shot, hardware.Shot] | None:
+        """Wait for the next images. None: the thread must stop."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopped or self._next is not None)
             shots, self._next = self._next, None
             return None if self._stopped else shots
 
     def _predict(self, visual: hardware.Shot, tactile: hardware.Shot) -> Predicted:
+        """Predict from raw images."""
         contact, occupied = self._contact(visual, tactile)
         view = self._views.prepared(visual.image, tactile.image, self._untouched)
         found = self._compute(view._asdict(), contact=contact is not False)
@@ -236,14 +252,14 @@ class Live:
         )
 
     def _compute(self, views: Mapping[str, np.ndarray], *, contact: bool) -> sts.Prediction:
-        """Predict, and wait for the result. A touch without contact does not count."""
+        """Predict from images in the view of the sensor. The tactile image is ignored unless `contact` is True."""
         touch = views["tactile"] if "tactile" in self._streams else None
         present: dict[str, ArrayLike] | None = None if touch is None else {"tactile": np.bool_(contact)}
         found = self._predictor(visual=views["visual"], tactile=touch, condition=self._condition, present=present)
         return jax.block_until_ready(found)
 
     def _contact(self, visual: hardware.Shot, tactile: hardware.Shot) -> tuple[bool | None, bool | None]:
-        """Whether the tactile image shows a contact, and whether any of both shows an object."""
+        """Return whether the object touches the pad, and whether one of the images shows an object."""
         if self._empty is None:
             return None, None
         observation = guide.observe(tactile.time_s, visual.image, tactile.image)
@@ -253,6 +269,6 @@ class Live:
 
 
 def _shown(image: Float[Array, "height width 3"] | None) -> Image:
-    """A predicted image for people."""
+    """Convert a predicted image in [0, 1] to uint8 in the size for display. None becomes a black image."""
     pixels = np.zeros((1, 1, 3)) if image is None else np.asarray(jnp.clip(image, 0, 1))
     return cv2.resize(np.round(255 * pixels).astype(np.uint8), (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)

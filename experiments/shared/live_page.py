@@ -1,4 +1,4 @@
-"""A browser page with the live images and the predicted ones beside them."""
+"""The browser page of `experiments.live`, with the live images and the predicted images."""
 
 import time
 from pathlib import Path
@@ -15,12 +15,12 @@ class LivePage(Site):
     """The page of `experiments.live`."""
 
     def __init__(self, host: str, port: int, *, title: str):
-        """Listen.
+        """Start the server of the page.
 
         Args:
-            host: Address or name, such as 127.0.0.1.
-            port: 0: a free one.
-            title: Names the source and the model.
+            host: Address or name on which the server listens, such as 127.0.0.1.
+            port: TCP port. 0 selects a free one.
+            title: Text that names the source and the model.
 
         Raises:
             OSError: The address cannot be used. The message names it and the remedy.
@@ -30,13 +30,13 @@ class LivePage(Site):
         super().__init__(host, port, _PAGE, _STREAMS)
 
     def show(self, seen: Seen) -> None:
-        """Show a state in all open pages."""
+        """Show new images and facts in all open pages."""
         with self._changed:
             self._seen, self._number = seen, self._number + 1
             self._changed.notify_all()
 
     def facts(self) -> dict[str, Any]:
-        """The current state without its images."""
+        """The current values of the display without its images, for JSON."""
         with self._changed:
             seen, ended = self._seen, self._ended
         if seen is None:
@@ -58,7 +58,7 @@ class LivePage(Site):
         }
 
     def image(self, stream: str) -> Image | None:
-        """The newest image of a stream."""
+        """The newest image to show under a name, such as `visual` or `predicted_visual`, or None."""
         with self._changed:
             seen = self._seen
         if seen is None:

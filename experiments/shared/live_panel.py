@@ -1,4 +1,4 @@
-"""Moments of the live view as pictures and videos."""
+"""Writes the live display of `experiments.live` as a picture or a video."""
 
 import time
 from pathlib import Path
@@ -13,20 +13,23 @@ from experiments.shared.live import Seen
 
 VIDEOS = (".mp4", ".mkv", ".avi")
 
-_SIDE = 240  # pixels, of an image
-_GAP = 8  # pixels
-_HEAD = 24  # pixels, height of the titles
-_TEXT = 220  # pixels, width of the text
+_SIDE = 240  # side of an image (pixels)
+_GAP = 8  # distance between two images (pixels)
+_HEAD = 24  # height of the titles (pixels)
+_TEXT = 220  # width of the text (pixels)
 _TITLES = ("visual, now", "tactile, now", "visual, predicted at rest", "tactile, predicted at rest")
 _BAR = "#3f51b5"
 _CODEC = cv2.VideoWriter.fourcc(*"mp4v")
 _RATE = 10.0  # panels per second of a video
-_EVERY_S = 1.0  # s, between two panels of which a picture shows some
-_ROWS = 6  # panels of a picture
+_EVERY_S = 1.0  # time between two panels that are kept for a picture (s)
+_ROWS = 6  # largest number of panels of a picture, which are chosen evenly from those that were kept
 
 
 def panel(seen: Seen) -> UInt8[np.ndarray, "height width 3"]:
-    """The four images, the outcome probabilities, and rate and latency. All panels have the same size."""
+    """Draw the display at one time: the live and the predicted images, the outcome probabilities, rate and latency.
+
+    All panels have the same size.
+    """
     found = seen.predicted
     images = [seen.visual, seen.tactile, *([] if found is None else [found.visual, found.tactile])]
     sheet = Image.new("RGB", (4 * (_SIDE + _GAP) + _TEXT, _HEAD + _SIDE + _GAP), "white")
@@ -49,7 +52,7 @@ def panel(seen: Seen) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def lines(seen: Seen) -> list[str]:
-    """The state in words."""
+    """The rate, the latency, the contact and the remark on the source, as lines of text."""
     found = seen.predicted
     latency = "" if seen.latency_s is None else f"latency {1000 * seen.latency_s:.0f} ms"
     known = found is not None and found.contact is not None
@@ -60,14 +63,17 @@ def lines(seen: Seen) -> list[str]:
 
 
 class PanelFile:
-    """A file of panels: a video of 10 panels a second, or a picture with up to six of them."""
+    """A file of panels: a video with 10 panels per second, or a picture with up to six panels below each other."""
 
     def __init__(self, path: Path):
         """Check the path.
 
+        Args:
+            path: Path of the file. Its suffix selects a picture or a video.
+
         Raises:
-            ValueError: The suffix is neither that of a picture nor of a video.
-            OSError: The folder does not exist, or cannot be written to.
+            ValueError: The suffix is neither that of a picture nor that of a video.
+            OSError: The file cannot be written.
         """
         self._path = path
         self._is_video = path.suffix.lower() in VIDEOS
@@ -78,12 +84,16 @@ class PanelFile:
         else:
             known = ", ".join((*output.PICTURES, *VIDEOS))
             raise ValueError(f"save is {path}, but its suffix must be one of {known}")
-        self._panels: list[np.ndarray] = []  # of a picture
+        self._panels: list[np.ndarray] = []  # panels of which the picture shows some
         self._writer: cv2.VideoWriter | None = None
-        self._next_s = -float("inf")  # when the next panel is due
+        self._next_s = -float("inf")  # time at which the next panel is due (s)
 
     def add(self, seen: Seen) -> None:
-        """Add a moment, if the next one is due."""
+        """Draw and add a panel if the next one is due and the model has made predictions.
+
+        Raises:
+            OSError: The video cannot be written.
+        """
         now_s = time.monotonic()
         if now_s < self._next_s or seen.rate == 0:
             return
@@ -101,7 +111,7 @@ class PanelFile:
         self._writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 
     def close(self) -> bool:
-        """Write the picture, or the end of the video. False: there was nothing to write."""
+        """Write the picture, or complete the video. Returns False if there was no panel to write."""
         if self._writer is not None:
             self._writer.release()
         elif self._panels:

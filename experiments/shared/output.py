@@ -1,4 +1,4 @@
-"""Checks of output paths before any work is done."""
+"""Checks output paths before a command starts its work."""
 
 import tempfile
 from pathlib import Path
@@ -7,18 +7,21 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".pdf")  # format
 
 
 def check_picture(path: Path) -> None:
-    """Raise an error unless a picture can be written.
+    """Check that a picture can be written to a path.
 
     Raises:
-        OSError: Its folder does not exist or is not writable, or the path is a folder.
-        ValueError: The suffix is not that of a known format.
+        OSError: The folder of the picture does not exist or cannot be written to, the existing picture cannot be
+            overwritten, or the path is a folder.
+        ValueError: The suffix is not one of `PICTURES`.
     """
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give the name of a picture, such as {path / 'picture.png'}")
     if path.suffix.lower() not in PICTURES:
         raise ValueError(f"{path} has the suffix {path.suffix!r}, but it must be one of {', '.join(PICTURES)}")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent} does not exist: make it for {path.name}, or give another --out")
+        raise FileNotFoundError(
+            f"the folder {path.parent} does not exist: make it for {path.name}, or give another --out"
+        )
     _write(path.parent)
     if path.exists():
         try:
@@ -36,12 +39,13 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise type(error)(f"{path} cannot be made ({error.strerror}): give another --out") from error
+        raise type(error)(f"the folder {path} cannot be made ({error.strerror}): give another --out") from error
     _write(path)
 
 
 def _write(folder: Path) -> None:
+    """Raise an error if no file can be written to a folder."""
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise type(error)(f"{folder} cannot be written to ({error.strerror}): give another --out") from error
+        raise type(error)(f"the folder {folder} cannot be written to ({error.strerror}): give another --out") from error

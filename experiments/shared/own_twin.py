@@ -1,4 +1,4 @@
-"""A digital twin in a process of its own, commissioned, with a hand that holds and releases the object."""
+"""Starts a digital twin in another process, commissions it, and holds and releases its object."""
 
 import contextlib
 import json
@@ -11,31 +11,37 @@ from pathlib import Path
 
 from experiments import commission
 
-SIZE = (640, 480)  # pixels, width and height
-FIELD_OF_VIEW = 160.0  # degrees, across the diagonal
-HELD_S = 6.0  # s, for which the object is held
-FREE_S = 6.0  # s, for which it moves and rests
-_ENDED_S = 10.0  # s, for the process to end by itself
-_ANSWER_S = 120.0  # s, longest answer, which waits for rendering
+SIZE = (640, 480)  # width and height of the images (pixels)
+FIELD_OF_VIEW = 160.0  # field of view across the diagonal (degrees)
+HELD_S = 6.0  # time for which the object is held (s)
+FREE_S = 6.0  # time for which the object moves and rests after its release (s)
+_ENDED_S = 10.0  # time within which the process ends by itself, before it is killed (s)
+_ANSWER_S = 120.0  # longest wait for an answer of the twin, which may render images first (s)
 
 
 class OwnTwin:
-    """The running twin. `folder` has its sensor file."""
+    """A twin that runs in another process. `own_twin` starts and stops it."""
 
     def __init__(self, folder: Path, leds: Path, url: str):
-        """Use `own_twin`."""
+        """Use `own_twin` instead.
+
+        Args:
+            folder: Folder with the twin's sensor file.
+            leds: Serial port of the twin's LED controller.
+            url: URL of the twin's HTTP server.
+        """
         self.folder, self.leds = folder, str(leds)
-        self.note = ""  # on the object
+        self.note = ""  # remark on the state of the object
         self._url = url
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._operate, name="hand", daemon=True)
 
     def start(self) -> None:
-        """Let the hand begin."""
+        """Start a thread that holds and releases the object repeatedly."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the hand."""
+        """Stop the thread."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -46,14 +52,14 @@ class OwnTwin:
                 ("hold", HELD_S, "a hand holds the object"),
                 ("release", FREE_S, "the hand has let go"),
             ):
-                with contextlib.suppress(OSError):  # the twin has ended
+                with contextlib.suppress(OSError):  # the twin may have ended
                     self.phase(command)
                 self.note = note
                 if self._stop.wait(seconds):
                     return
 
     def phase(self, command: str) -> dict[str, object]:
-        """Give the twin a command, and return its state."""
+        """Send the twin a command (`hold`, `release` or `clear`), and return the state with which it answers."""
         request = urllib.request.Request(f"{self._url}/{command}", method="POST")
         with urllib.request.urlopen(request, timeout=_ANSWER_S) as answer:
             return json.load(answer)
@@ -61,11 +67,11 @@ class OwnTwin:
 
 @contextlib.contextmanager
 def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
-    """Start a twin, write its sensor file into a folder, and end it afterwards.
+    """Start a twin, commission it, and stop it afterwards.
 
     Args:
-        folder: An empty folder.
-        seed: Of the object and its trajectories.
+        folder: Empty folder, which receives the sensor file and the link to the serial port.
+        seed: Seed of the object and its trajectories.
 
     Raises:
         RuntimeError: The twin does not start.
@@ -74,7 +80,8 @@ def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
     command = [sys.executable, "-m", "experiments.twin", "--attached", "--port", str(leds), "--seed", str(seed)]
     command += ["--resolution", str(SIZE[1]), str(SIZE[0]), "--field-of-view", str(FIELD_OF_VIEW)]
     pipe = subprocess.PIPE
-    # Ctrl-C must not reach the twin, which ends after its reader or when the pipe to it is closed.
+    # Ctrl-C must not reach the twin, because it has to run until this process has stopped reading its images. If this
+    # process ends, the pipe is closed, and the twin stops by itself.
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True) as process:
         try:
             url = _address(process)
@@ -102,7 +109,7 @@ def own_twin(folder: Path, *, seed: int = 0) -> Iterator[OwnTwin]:
 
 
 def _address(process: subprocess.Popen[str]) -> str:
-    """The URL that a twin prints when it is ready."""
+    """Wait until a twin is ready, and return the URL that it prints."""
     assert process.stdout is not None
     url = ""
     for line in process.stdout:
@@ -110,4 +117,7 @@ def _address(process: subprocess.Popen[str]) -> str:
             url = line.split()[1].removesuffix("/camera")
         if "Ctrl-C" in line:
             return url
-    raise RuntimeError("the twin did not start. Its own error stands above: start it alone with -m experiments.twin")
+    raise RuntimeError(
+        "the digital twin did not start. Its error message is printed above. To reproduce it, run `python -m "
+        "experiments.twin`"
+    )

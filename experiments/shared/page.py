@@ -1,4 +1,4 @@
-"""A browser page with both live streams, the current instruction and buttons, for a person who collects."""
+"""The browser page of `experiments.real collect`, with both live streams, the current instruction and buttons."""
 
 import time
 from pathlib import Path
@@ -12,15 +12,15 @@ _STREAMS = ("visual", "tactile")
 
 
 class Page(Site):
-    """A `Person` in front of a browser."""
+    """Shows views to a person in a browser, and returns the person's actions (a `hardware.Person`)."""
 
     def __init__(self, host: str, port: int, *, count: int | None = None):
-        """Listen.
+        """Start the server of the page.
 
         Args:
-            host: Address or name, such as 127.0.0.1.
-            port: 0: a free one.
-            count: Number of trajectories that is shown as the goal.
+            host: Address or name on which the server listens, such as 127.0.0.1.
+            port: TCP port. 0 selects a free one.
+            count: Number of trajectories that the page shows as the goal. None: no goal.
 
         Raises:
             OSError: The address cannot be used. The message names it and the remedy.
@@ -37,13 +37,21 @@ class Page(Site):
             self._changed.notify_all()
 
     def action(self) -> Action | None:
-        """The action of the button that was pressed last."""
+        """The action of the button that was pressed last, or None if there is no new one."""
         with self._changed:
             action, self._action = self._action, None
             return action
 
     def pressed(self, content: Any) -> bool:
-        """Take over an action, unless the page showed another stage than the current one."""
+        """Accept the action of a button.
+
+        Args:
+            content: Decoded JSON with `action`, and with the `stage` and the `number` of the trajectory on the page.
+
+        Returns:
+            False if the content is invalid, or if the page showed an old stage or trajectory. The action `stop` is
+            accepted in every stage.
+        """
         with self._changed:
             view = self._view
             try:
@@ -57,7 +65,7 @@ class Page(Site):
             return True
 
     def facts(self) -> dict[str, Any]:
-        """The current view without its images."""
+        """The current view without its images, for JSON."""
         with self._changed:
             view, ended = self._view, self._ended
         if view is None:
@@ -83,13 +91,13 @@ class Page(Site):
         }
 
     def image(self, stream: str) -> Image | None:
-        """The newest image of a stream."""
+        """The newest image of a stream, or None before the first pair."""
         with self._changed:
             pair = None if self._view is None else self._view.pair
         return None if pair is None else getattr(pair, stream).image
 
     def still(self, path: str) -> Image | None:
-        """An image of the current trajectory, such as `end/initial/visual.jpg`."""
+        """An image of the current trajectory by its path, such as `end/initial/visual.jpg`, or None."""
         head, _, rest = path.partition("/")
         end, _, name = rest.partition("/")
         stream = name.removesuffix(".jpg")

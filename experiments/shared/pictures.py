@@ -1,4 +1,4 @@
-"""Pictures and descriptions of a trajectory, from outside and through the sensor."""
+"""Draws and describes trajectories."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +11,16 @@ from sts_jax import dataset, evaluation
 
 
 def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, data: dataset.Dataset) -> None:
-    """Draw the first fully rendered trajectory with the most informative outcome. There must be one."""
+    """Draw a fully rendered trajectory as a strip of pictures.
+
+    It is the first one whose outcome comes earliest in the scenario's list of outcomes.
+
+    Args:
+        path: Path of the picture.
+        collection: Collection of the dataset.
+        sensor: Sensor of the collection.
+        data: Dataset with at least one fully rendered trajectory.
+    """
     full = data.full_trajectories()
     rank = [collection.scenario.outcomes.index(o) for o in data.trajectory["outcome"][full]]
     index = int(full[np.argmin(rank)])
@@ -31,9 +40,19 @@ def draw_strip(path: Path, collection: dataset.Collection, sensor: sts.Sensor, d
 
 
 def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor: sts.Sensor, wall: float) -> np.ndarray:
-    """A trajectory from outside, `(frames, h, w, 3)` in [0, 1], with the final gravity pointing down.
+    """Render a trajectory from outside, with the final direction of gravity pointing down.
 
-    An object that fell off is not drawn once its pose is frozen.
+    An object that has fallen off is not drawn after its pose is frozen.
+
+    Args:
+        body: The object.
+        pose: Poses in the sensor frame, shape (frames, 7).
+        gravity: Gravity in the sensor frame (m/s^2), shape (frames, 3).
+        sensor: Sensor, whose pad is drawn.
+        wall: Height of the stop wall (m), 0 for none.
+
+    Returns:
+        Pictures of shape (frames, height, width, 3) in [0, 1].
     """
     size, up = jnp.array(sensor.gel.size), -jnp.asarray(gravity[-1])
     frozen = np.append(False, (pose[1:] == pose[:-1]).all(1)) & np.asarray(sts.physics.fell_off(jnp.asarray(pose)))
@@ -44,7 +63,14 @@ def views(body: sts.objects.Body, pose: np.ndarray, gravity: np.ndarray, sensor:
 def describe(
     scenario: sts.physics.Scenario, name: str, trajectory: Mapping[str, np.ndarray], hidden: Mapping[str, np.ndarray]
 ) -> str:
-    """Describe one trajectory: class, outcome, hidden values and condition, from leaves of `physics.Trajectory`."""
+    """Describe a trajectory in words: class, outcome, hidden properties and condition.
+
+    Args:
+        scenario: Scenario of the trajectory.
+        name: Class of the object.
+        trajectory: Fields of `physics.Trajectory` for one trajectory.
+        hidden: Fields of `physics.Hidden` for the same trajectory.
+    """
     words = [f"a {name} {scenario.named(int(trajectory['outcome']))}"]
     words += [f"{key.replace('_', ' ')} {hidden[key]:.2f}" for key in ("fill", "shell_scale", "friction")]
     if hidden["up"][2] < 1:

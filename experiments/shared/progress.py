@@ -1,4 +1,4 @@
-"""Progress that is shown to the user."""
+"""Shows the progress of a command to the user."""
 
 import sys
 import time
@@ -7,7 +7,7 @@ from tqdm import tqdm
 
 
 class Bar:
-    """A progress bar on a terminal, and elsewhere a plain line about every ten seconds."""
+    """A progress bar on a terminal, or a plain line about every ten seconds if standard error is not a terminal."""
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
@@ -22,7 +22,14 @@ class Bar:
             self._bar.close()
 
     def __call__(self, stage: str, done: int, total: int, note: str = "") -> None:
-        """Show the progress of a stage."""
+        """Show the progress of a stage.
+
+        Args:
+            stage: Name of the stage. A new name starts a new bar.
+            done: Number of finished items.
+            total: Number of all items.
+            note: Remark at the end of the line.
+        """
         if sys.stderr.isatty():
             if stage != self._stage or self._bar is None:
                 if self._bar is not None:

@@ -1,4 +1,4 @@
-"""Learning from recorded trajectories: reading, training arrays, and the training of the models of Table 2."""
+"""Reads recorded trajectories, and trains the models of the paper's Table 2 on them."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -16,47 +16,50 @@ from sts_jax.hardware import twin
 from sts_jax.training import TrainConfig
 
 NAMES = ("vae-visual", "vae-tactile", "mvae-without-pose")  # the rows of the paper's Table 2
-LEAST = 5  # trajectories, so that one of them can be held out
+LEAST = 5  # smallest number of trajectories, so that one of them can be held out
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """How the models of Table 2 are trained and evaluated."""
 
-    training: TrainConfig
-    count: int = 100  # trajectories that the digital twin collects if the work directory has none of a device
-    size: tuple[int, int] = (640, 480)  # width and height of the twin's images, pixels
-    steps: tuple[int, int, int] | None = None  # gradient steps of the three models (None: training.epochs decides)
-    # a subset of modalities is trained to predict all targets, or its own (paper)
+    training: TrainConfig  # options of the training
+    # number of trajectories that the digital twin collects if the work directory has none of a device
+    count: int = 100
+    size: tuple[int, int] = (640, 480)  # width and height of the twin's images (pixels)
+    # number of gradient steps of each of the three models. None: training.epochs determines the numbers
+    steps: tuple[int, int, int] | None = None
+    # modalities that the models learn to predict from a subset of the modalities: all, or only those of the
+    # subset (own, as in the paper)
     targets: Literal["all", "own"] = "all"
-    rest: bool = True  # train that an object at rest stays, too: the final pair is a second input of each trajectory
-    # copies of each training trajectory at other places of the pad, up to `largest_shift` away, see training.shifted
-    shifts: int = 15
-    largest_shift: int = 8  # pixels of the view, of 2.3 mm each at 64 pixels
-    image_size: int = 64  # pixels, side of the views (paper)
-    held_out: float = 0.2  # share of the trajectories for validation (paper)
-    seed: int = 0  # of the split
-    num_shown: int = 6  # validation trajectories in the figure
+    # also train with the final pair as an input, so that the models learn that an object at rest stays at rest
+    rest: bool = True
+    shifts: int = 15  # number of copies of each training trajectory, in which the object lies at another place
+    largest_shift: int = 8  # largest shift of a copy (pixels). At 64 pixels, a pixel is 2.3 mm wide
+    image_size: int = 64  # side of the images that are used and predicted (pixels). The paper uses 64
+    held_out: float = 0.2  # share of the trajectories for validation. The paper uses 0.2
+    seed: int = 0  # seed of the split into training and validation
+    num_shown: int = 6  # number of validation trajectories in the figure
 
 
 class Recorded(NamedTuple):
-    """Recorded trajectories as the sensor's pinhole sees them, and the images of its empty pad."""
+    """Recorded trajectories and images of the empty pad, all in the view of the sensor."""
 
-    train: hardware.Moments
-    validation: hardware.Moments
-    empty: dict[str, np.ndarray]  # by stream, uint8 (size, size, 3)
-    identity: str  # of the trajectories and the sensor file
-    source: str  # of the images, for titles
+    train: hardware.Moments  # training trajectories
+    validation: hardware.Moments  # validation trajectories
+    empty: dict[str, np.ndarray]  # image of the empty pad for each stream, uint8 (size, size, 3)
+    identity: str  # checksum of the trajectories and the sensor file
+    source: str  # description of the sensor, for titles
 
 
 def check(config: Config) -> None:
-    """Check the configuration.
+    """Check the fields of the configuration.
 
     Raises:
         ValueError: A field is out of range.
     """
     if not 0 < config.held_out < 1:
-        raise ValueError(f"held_out must be a share between 0 and 1, got {config.held_out}")
+        raise ValueError(f"held_out must be a share above 0 and below 1, got {config.held_out}")
     if config.shifts < 0 or not 0 <= config.largest_shift < config.image_size:
         raise ValueError(
             f"shifts must be >= 0 and largest_shift in [0, {config.image_size}) pixels, got {config.shifts} and "
@@ -66,15 +69,20 @@ def check(config: Config) -> None:
         raise ValueError(f"count must be >= {LEAST}, got {config.count}")
     if config.num_shown < 1:
         raise ValueError(f"num_shown must be >= 1, got {config.num_shown}")
-    training.paper_model(("visual",), training.Preprocessing((config.image_size, config.image_size)))  # size fits
+    # This raises an error if no network exists for images of this size.
+    training.paper_model(("visual",), training.Preprocessing((config.image_size, config.image_size)))
 
 
 def read(config: Config, workdir: Path) -> Recorded:
-    """Read, rectify and split the confirmed trajectories of a work directory.
+    """Read the confirmed trajectories of a work directory, rectify their images, and split them for validation.
+
+    Args:
+        config: Configuration of the experiment.
+        workdir: Work directory with the folder `dataset` and the sensor file.
 
     Raises:
         FileNotFoundError: There is no session, or no sensor file.
-        ValueError: There are too few trajectories, the sensor file has no backgrounds, or it is of another sensor.
+        ValueError: There are too few trajectories, the sensor file has no backgrounds, or it does not fit the images.
         OSError: A file is damaged.
     """
     recordings = hardware.load_recordings(workdir / "dataset")
@@ -107,12 +115,14 @@ def read(config: Config, workdir: Path) -> Recorded:
 
 
 def is_twin(recordings: hardware.Recordings) -> bool:
-    """Whether the trajectories are of a digital twin, whose LED controller has a serial number of its own kind."""
+    """Return whether a digital twin made the trajectories. Serial numbers of its LED controller begin with TWIN."""
     return str(recordings.session["leds"]).startswith("TWIN")
 
 
 def missing(config: Config, workdir: Path) -> int:
-    """The number of trajectories that the twin on its virtual clock has to collect: none if there are some of a device.
+    """The number of trajectories that the digital twin still has to collect.
+
+    It is 0 if the work directory contains trajectories of a device or of a served twin.
 
     Raises:
         OSError: `session.json` is damaged.
@@ -124,39 +134,46 @@ def missing(config: Config, workdir: Path) -> int:
 
 
 def samples(config: Config, count: int) -> int:
-    """The number of training samples of some trajectories."""
+    """The number of training samples from `count` trajectories, with shifted copies and images at rest."""
     return round((1 - config.held_out) * count) * (1 + config.shifts) * (2 if config.rest else 1)
 
 
 def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
-    """The device and the sensor of a work directory.
+    """Read the sensor file of a work directory.
+
+    Returns:
+        The device, with the lens and the names of its backgrounds, and the constants of the sensor.
 
     Raises:
-        FileNotFoundError: There is none.
-        ValueError: It is damaged, or has no backgrounds.
+        FileNotFoundError: There is no sensor file.
+        ValueError: The sensor file is damaged, or names no background images.
     """
     path = workdir / "sensor.json"
     if not path.exists():
         raise FileNotFoundError(
-            f"{path} is missing, which holds the lens and the images of the empty pad: copy the sensor file and its "
-            "background images of `python -m experiments.commission` into the work directory"
+            f"the sensor file {path} is missing, which contains the lens and names the images of the empty pad: copy "
+            "the sensor file and the background images of `python -m experiments.commission` into the work directory"
         )
     device = hardware.Device.load(path)
     if device.background_visual is None or device.background_tactile is None:
         raise ValueError(
-            f"{path} names no background images, and contacts are found by comparison with them: run `python -m "
+            f"{path} names no background images, but they are needed to find contacts: run `python -m "
             "experiments.commission` again, and copy the sensor file and its images into the work directory"
         )
     return device, sts.Sensor.load(path)
 
 
 def identity(workdir: Path, recordings: hardware.Recordings) -> str:
-    """SHA-256 of the trajectories and of the sensor file, which names the checksums of its images."""
+    """The checksum of the trajectories and the sensor file, which contains the checksums of its backgrounds."""
     return _files.digest({"dataset": recordings.identity, "sensor": _files.sha256(workdir / "sensor.json")})
 
 
 def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
-    """The trainings of the three models."""
+    """Prepare the training of each of the three models.
+
+    Raises:
+        ValueError: No initial tactile image shows a contact.
+    """
     size, blank = (config.image_size, config.image_size), data.empty["tactile"]
     preprocessing = training.touch_of_noisy_images(training.Preprocessing(size), data.train.tactile[:, 0], blank)
     visual, tactile = (augmented(config, getattr(data.train, name), data.empty[name]) for name in ("visual", "tactile"))
@@ -165,7 +182,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
         arrays, own = training.image_moments(visual, tactile, modalities, preprocessing, blank)
         if own.absent:
             raise ValueError(
-                "no first tactile image of the training trajectories shows a contact: draw them with `python -m "
+                "no first tactile image of the training trajectories shows a contact: draw the images with `python -m "
                 "experiments.real review --sheet review.png`, and compare them with the background of sensor.json"
             )
         schedule = config.training
@@ -175,12 +192,15 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
 
 
 def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarray:
-    """The training trajectories of a stream, with their shifted copies, and with the moment at rest as a second input.
+    """Augment the training images of a stream by shifted copies, and by copies whose input is the final image.
 
     Args:
-        config: The experiment.
-        images: First and last images, uint8 (n, 2, size, size, 3).
-        empty: The image of the empty pad, uint8 (size, size, 3).
+        config: Configuration of the experiment.
+        images: Initial and final images, uint8 of shape (n, 2, size, size, 3).
+        empty: Image of the empty pad, uint8 of shape (size, size, 3).
+
+    Returns:
+        Images of all samples, uint8 of shape (samples, 2, size, size, 3).
     """
     random, far = np.random.default_rng(config.seed), config.largest_shift
     parts = [images]
@@ -192,7 +212,11 @@ def augmented(config: Config, images: np.ndarray, empty: np.ndarray) -> np.ndarr
 
 
 def train(config: Config, data: Recorded, folder: Path) -> None:
-    """Train the models, each with a progress bar."""
+    """Train the three models in `folder`, and show the progress.
+
+    Raises:
+        ValueError: No initial tactile image shows a contact.
+    """
     for job in jobs(config, data):
         with Bar() as bar:
 

@@ -1,4 +1,4 @@
-"""The ceilings of an experiment: its first held-out starts re-rolled once, scored, and kept in the work directory."""
+"""Simulates held-out starts again with newly drawn hidden properties (re-rolls), and stores their scores."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,16 +14,16 @@ from sts_jax import _files, dataset, evaluation
 from sts_jax.dataset.records import read_arrays
 
 Judge = Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores]
-SEED = 20  # of the re-rolls
-FORMAT = 2  # of the files (2: outcomes are decided by the ratio of probability to frequency)
+SEED = 20  # seed of the re-rolls
+FORMAT = 2  # version of the files (2: outcomes are decided by the ratio of probability to frequency)
 
 
 class Ceilings(NamedTuple):
-    """Re-rolls of the first held-out starts, and their scores."""
+    """Re-rolls of the first held-out starts, and their scores as predictions."""
 
-    scores: dict[str, evaluation.Scores]  # of their mean, and of a single re-roll
-    pose: np.ndarray  # (times, n, 7), last poses
-    outcome: np.ndarray  # int (times, n)
+    scores: dict[str, evaluation.Scores]  # scores of the mean of the re-rolls, and of a single re-roll
+    pose: np.ndarray  # poses at rest, shape (times, n, 7)
+    outcome: np.ndarray  # numbers of the outcomes, int of shape (times, n)
 
 
 def ceilings(
@@ -38,20 +38,21 @@ def ceilings(
     num: int,
     judge: Judge,
 ) -> Ceilings:
-    """The ceilings of the first `num` held-out items: read, or computed and written to `ceiling{suffix}.npz`.
+    """Read the re-rolls of the first `num` held-out trajectories, or compute and write them.
 
-    `ceiling{suffix}.json` records the checksums of the inputs from which they were computed.
+    The re-rolls are in `ceiling{suffix}.npz`. `ceiling{suffix}.json` records the checksums of the inputs from which
+    they were computed. If an input has changed, the re-rolls are computed again.
 
     Args:
-        workdir: The work directory.
-        suffix: Suffix of the names of the files, for a second split.
-        collection: The collection of the experiment.
-        sensor: The sensor that renders the ends of the re-rolls.
-        data: The dataset of the items.
-        test: The held-out items.
-        times: Number of re-rolls per item.
-        num: Number of items.
-        judge: Scores a prediction of all these items, see `evaluation.scorer`.
+        workdir: Work directory.
+        suffix: Suffix in the names of the files, which distinguishes several splits.
+        collection: Collection of the experiment.
+        sensor: Sensor that renders the re-rolls at rest.
+        data: Dataset of the experiment.
+        test: Held-out trajectories.
+        times: Number of re-rolls of each trajectory.
+        num: Number of trajectories with re-rolls.
+        judge: Function that scores a prediction of these trajectories (`evaluation.scorer`).
     """
     few = dataset.Pairs(*(leaf[:num] for leaf in test))
     record, path = workdir / f"ceiling{suffix}.json", workdir / f"ceiling{suffix}.npz"
@@ -80,7 +81,16 @@ def reroll(
     judge: Judge,
     progress: Callable[[int], object] | None = None,
 ) -> Ceilings:
-    """Re-roll some items, and score the mean of the re-rolls and a single one."""
+    """Re-roll trajectories, and score the mean of the re-rolls and a single re-roll as predictions.
+
+    Args:
+        collection: Collection of the experiment.
+        sensor: Sensor that renders the re-rolls at rest.
+        test: Trajectories to re-roll.
+        times: Number of re-rolls of each trajectory.
+        judge: Function that scores a prediction of these trajectories.
+        progress: Function that receives the number of simulated re-rolls.
+    """
     mean = evaluation.ceiling(collection, sensor, test, times, jax.random.key(SEED), progress=progress)
     samples = mean.samples
     if samples is None or samples.pose is None or samples.outcome is None:
@@ -94,7 +104,7 @@ def reroll(
 
 
 def _flat(made: Ceilings) -> dict[str, np.ndarray]:
-    """All arrays by a path such as `one re-roll/visual/bce`."""
+    """All arrays by a path such as `one re-roll/visual/bce`, for a file."""
     arrays = {"pose": made.pose, "outcome": made.outcome}
     for name, scores in made.scores.items():
         for field, value in scores._asdict().items():

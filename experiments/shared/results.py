@@ -1,4 +1,4 @@
-"""Checksums of the inputs and outputs of results, which show whether the results are up to date."""
+"""Records the checksums of the inputs and outputs of results, and checks if the results are up to date."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,19 +8,21 @@ from sts_jax import _files
 
 
 def identity(folder: Path) -> str:
-    """SHA-256 of the names and contents of all files in a model's folder, without hidden files."""
+    """The SHA-256 checksum of the names and contents of all files in a model's folder, except hidden files."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     return _files.digest({path.relative_to(folder).as_posix(): _files.sha256(path) for path in files})
 
 
 def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], outputs: Sequence[Path]) -> None:
-    """Write results as JSON, with the checksums of their inputs and of the files made with them.
+    """Write results as JSON, with the checksums of their inputs and of further output files.
+
+    Write this file after all others, because it marks the results as complete.
 
     Args:
-        path: The JSON file. It is written last and marks the results as complete.
-        content: The results.
-        inputs: The checksum of each input, by a name for messages.
-        outputs: The other files, in the folder of `path` or below it.
+        path: Path of the JSON file.
+        content: Results.
+        inputs: Checksum of each input, by the name that messages show.
+        outputs: Further output files, in the folder of `path` or below it.
     """
     record = {
         **content,
@@ -31,11 +33,14 @@ def write(path: Path, content: Mapping[str, Any], inputs: Mapping[str, str], out
 
 
 def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
-    """The reason why results must be computed again, or None if they are up to date.
+    """Check if results must be computed again.
 
     Args:
-        path: The file that `write` wrote.
-        inputs: The checksum of each input as it is now.
+        path: Path of the JSON file that `write` has written.
+        inputs: Present checksum of each input.
+
+    Returns:
+        The reason for a new computation, or None if the results are up to date.
     """
     try:
         record = _files.read_json(path, "it will be written again")

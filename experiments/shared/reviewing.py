@@ -1,4 +1,4 @@
-"""`review`: list, confirm, discard, check and draw the trajectories of a work directory."""
+"""`review` of `experiments.real`: list, confirm, discard, check and draw the trajectories of a work directory."""
 
 import dataclasses
 from pathlib import Path
@@ -11,27 +11,35 @@ from experiments.shared.command import Folder
 from experiments.shared.progress import say
 from sts_jax import hardware
 
-SHEET = 20  # newest trajectories that a sheet shows
-PANEL = 200  # pixels, width of an image on a sheet
+SHEET = 20  # number of trajectories, the newest ones, that `--sheet` draws by default
+PANEL = 200  # width of an image on the sheet (pixels)
 
 
 @dataclasses.dataclass(frozen=True)
 class Review:
-    """List the trajectories, discard, restore or confirm some, check the files, or draw a sheet."""
+    """List the trajectories, discard, restore or confirm some of them, check their files, or draw their images."""
 
-    workdir: Folder = Path("runs/real")
-    discard: tuple[int, ...] = ()  # move these to the folder `discarded`
-    restore: tuple[int, ...] = ()  # move these back
-    confirm: tuple[int, ...] = ()  # confirm these, which were complete when the session was interrupted
-    note: str = ""  # stored with those that are confirmed
-    check: bool = False  # read all images and compare their checksums
+    workdir: Folder = Path("runs/real")  # work directory. The trajectories are in its folder `dataset`
+    discard: tuple[int, ...] = ()  # numbers of trajectories to move to the folder `discarded`
+    restore: tuple[int, ...] = ()  # numbers of discarded trajectories to move back
+    # numbers of trajectories to confirm. They have both pairs of images, but the session was interrupted before they
+    # were confirmed
+    confirm: tuple[int, ...] = ()
+    note: str = ""  # text that is stored with the trajectories of --confirm
+    check: bool = False  # read all images, and compare their checksums
     sheet: Path | None = None  # draw the newest confirmed trajectories into this picture
-    numbers: tuple[int, ...] = ()  # draw these instead
+    numbers: tuple[int, ...] = ()  # numbers of trajectories that --sheet draws instead
     debug: bool = False  # show the traceback of every error
 
 
 def review(config: Review) -> None:
-    """Apply the changes, then check, draw or list."""
+    """Apply the changes, then check the files, draw the images, or list the trajectories.
+
+    Raises:
+        SystemExit: `check` is True, and a file is damaged.
+        ValueError: A trajectory cannot be drawn, or the suffix of `sheet` is not that of a picture.
+        OSError: A trajectory does not exist, or a file cannot be read or written.
+    """
     folder = config.workdir / "dataset"
     if config.sheet is not None:
         output.check_picture(config.sheet)
@@ -55,10 +63,10 @@ def review(config: Review) -> None:
 
 
 def check(folder: Path) -> None:
-    """Read all confirmed trajectories.
+    """Read all confirmed trajectories, and report the damaged ones.
 
     Raises:
-        SystemExit: Some are damaged. All of them are named.
+        SystemExit: A trajectory is damaged.
     """
     recordings, damaged = hardware.load_recordings(folder), 0
     for index in range(len(recordings)):
@@ -75,12 +83,19 @@ def check(folder: Path) -> None:
 def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
     """Draw trajectories as rows of four images: initial visual and tactile, final visual and tactile.
 
+    Args:
+        folder: Folder of the session.
+        numbers: Numbers of the trajectories. If empty, the newest `SHEET` trajectories are drawn.
+        path: Path of the picture.
+
     Raises:
-        ValueError: There is no confirmed trajectory, or one of the numbers has none.
+        ValueError: There is no confirmed trajectory at all, or none with one of the numbers.
     """
     recordings = hardware.load_recordings(folder)
     if unknown := set(numbers) - set(recordings.numbers):
-        raise ValueError(f"{folder} has no confirmed trajectories {sorted(unknown)}: give others with --numbers")
+        raise ValueError(
+            f"{folder} has no confirmed trajectories {sorted(unknown)}: give other --numbers, or leave them out"
+        )
     if not recordings.numbers:
         raise ValueError(f"{folder} has no confirmed trajectory to draw: collect some first")
     chosen = numbers or recordings.numbers[-SHEET:]

@@ -1,4 +1,4 @@
-"""Trajectories of the digital twin on its virtual clock, collected by the ordinary guide into an ordinary session."""
+"""Collects trajectories of the digital twin on its virtual clock, with the guide and the session of a real sensor."""
 
 import contextlib
 import dataclasses
@@ -17,27 +17,29 @@ from sts_jax import hardware
 from sts_jax.hardware import EmptyPad, GuideConfig, View, twin
 
 OBJECT = "camera"  # class of the object. The paper releases a small camera
-FIELD_OF_VIEW = 160.0  # degrees across the diagonal of the lens, as of the paper's device
-RATE = 15.0  # frames/s of the camera. The guide needs few, and each one costs time
-WAIT_S = 0.1  # s of the computer's clock between two looks at a disk that is too slow
-MOTION_RATE = 4.0  # drawn poses per second of a moving object. Between two of them the object must not seem to rest
+FIELD_OF_VIEW = 160.0  # field of view across the diagonal (degrees), that of the paper's device
+RATE = 15.0  # frame rate of the camera (frames/s). The guide needs few frames, and each frame costs time
+WAIT_S = 0.1  # time of the computer's clock between two attempts while the session cannot be written (s)
+# Rendered poses per second of a moving object. They must follow each other fast enough that the guide does not take the
+# object for one at rest.
+MOTION_RATE = 4.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulated:
-    """A collection of the twin.
+    """Options of a collection with the twin.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A field is out of range.
     """
 
-    workdir: Path  # the trajectories go to its folder `dataset`, the sensor file is `sensor.json`
-    count: int = 100  # confirmed trajectories after which the collection ends, earlier ones included
-    size: tuple[int, int] = (640, 480)  # width and height of the images, pixels
-    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # of the LED channels in the tactile stream
-    seed: int = 0  # of the object, the trajectories and the noise
-    note: str = ""  # stored with each trajectory
-    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)
+    workdir: Path  # work directory. The trajectories go to its folder `dataset`, the sensor file is `sensor.json`
+    count: int = 100  # number of confirmed trajectories, earlier ones included, after which the collection ends
+    size: tuple[int, int] = (640, 480)  # width and height of the images (pixels)
+    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # duty cycles of the LEDs in the tactile stream, 0 to 255
+    seed: int = 0  # seed of the object, the trajectories and the noise
+    note: str = ""  # text that is stored with each trajectory
+    guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)  # thresholds and times of the guide
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -47,7 +49,7 @@ class Simulated:
 
 
 class Hand(twin.Hand):
-    """Moves the twin's object, and shows the progress."""
+    """Moves the twin's object as the guide instructs, and shows the progress."""
 
     def __init__(self, device: twin.Twin, session: hardware.Session, bar: Bar, count: int):
         super().__init__(device, session)
@@ -55,7 +57,7 @@ class Hand(twin.Hand):
         self._problem: str | None = None
 
     def show(self, view: View) -> None:
-        """Act in a new stage, and show the number of confirmed trajectories, or a problem."""
+        """Follow the instruction of a view, and show the number of confirmed trajectories, or a problem."""
         super().show(view)
         self._bar("collect", view.confirmed, self._count)
         if view.problem is not None:
@@ -66,15 +68,15 @@ class Hand(twin.Hand):
 
 
 def collect(config: Simulated) -> None:
-    """Collect until there are enough trajectories. A collection that was interrupted is continued.
+    """Collect until there are enough trajectories, or continue an interrupted collection.
 
-    Trajectory n of the session is trajectory n of the scene, so none is repeated.
+    Trajectory n of the session is trajectory n of the scene. A continued collection therefore repeats none.
 
     Raises:
-        ValueError: The work directory holds data of another sensor.
+        ValueError: The work directory contains data of another sensor or with other options.
         LockedError: Another process collects into the work directory.
         SensorFileError: The sensor file in the work directory is damaged.
-        OSError: Something cannot be written.
+        OSError: A file cannot be written.
     """
     dataset = config.workdir / "dataset"
     if (dataset / hardware.recordings.SESSION).exists() and len(hardware.load_recordings(dataset)) >= config.count:
@@ -87,7 +89,7 @@ def collect(config: Simulated) -> None:
             hardware.Session.open(dataset, sensor.origin, settling=sensor.settling) as session,
             Bar() as bar,
         ):
-            say(f"{session.confirmed} trajectories in {dataset}, which is continued")
+            say(f"{dataset} has {session.confirmed} confirmed trajectories. New ones are added")
             begun_s = time.monotonic()
             number = hardware.collect(
                 sensor,
@@ -105,7 +107,7 @@ def collect(config: Simulated) -> None:
 
 
 def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
-    """The lens of the twin."""
+    """Make the lens of the twin."""
     return hardware.Lens.ideal(
         *config.size, field_of_view=math.radians(FIELD_OF_VIEW), distance=float(sensor.camera.distance)
     )
@@ -113,7 +115,7 @@ def lens(config: Simulated, sensor: sts.Sensor) -> hardware.Lens:
 
 @contextlib.contextmanager
 def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
-    """A twin whose next trajectory has a number."""
+    """Start a twin whose next trajectory has the number `first`, and close it afterwards."""
     sensor, resolution = sts.Sensor(), config.size[::-1]
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(config.seed), OBJECT),
@@ -129,7 +131,12 @@ def started(config: Simulated, first: int) -> Iterator[twin.Twin]:
 
 
 def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSensor, EmptyPad]:
-    """The sensor with the settling and the backgrounds of its file, which is written if there is none."""
+    """Make the sensor with the settling times and backgrounds of the sensor file. A missing file is written first.
+
+    Raises:
+        ValueError: The sensor file was written with another image size or with other levels.
+        SensorFileError: The sensor file is damaged, or belongs to another device.
+    """
     file = config.workdir / hardware.sensor_file.NAME
     if not file.exists():
         commission(config, device)
@@ -137,7 +144,7 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
     there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
     if (there.width, there.height, there.levels) != (*config.size, config.levels):
         raise ValueError(
-            f"{file} is of images of {there.width} x {there.height} with levels {there.levels}, but the options "
+            f"{file} describes images of {there.width} x {there.height} with levels {there.levels}, but the options "
             f"are {config.size[0]} x {config.size[1]} with levels {config.levels}: choose another --workdir"
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
@@ -146,7 +153,7 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
 
 
 def commission(config: Simulated, device: twin.Twin) -> None:
-    """Measure the settling, record the backgrounds, and write the sensor file."""
+    """Measure the settling times, record the backgrounds, and write the sensor file."""
     simulated = sts.Sensor()
     sensor = twin.VirtualSensor(device, levels=config.levels)
     recorded = backgrounds.record(sensor)

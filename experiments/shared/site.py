@@ -1,4 +1,4 @@
-"""A small web server for one page with live images, which other sites in the same browser can neither see nor use."""
+"""A small web server for one page with live images. Other web sites in the same browser cannot see or use the page."""
 
 import abc
 import contextlib
@@ -15,40 +15,40 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-_WIDEST = 820  # pixels, to which images are reduced
-_QUALITY = 80  # of JPEG
-_INTERVAL_S = 0.1  # between two images of a stream
-_OPEN_S = 2.0  # s since the last question of a page after which it counts as closed
-_LAST_S = 0.4  # s for open pages to ask once more at the end
-_LARGEST = 1000  # bytes of a request
+_WIDEST = 820  # largest width of the images in the page (pixels)
+_QUALITY = 80  # JPEG quality
+_INTERVAL_S = 0.1  # time between two images of a stream (s)
+_OPEN_S = 2.0  # time since the last request for facts after which the page counts as closed (s)
+_LAST_S = 0.4  # time at the end in which open pages can request the last facts (s)
+_LARGEST = 1000  # largest size of a request's content (bytes)
 
 Image = UInt8[np.ndarray, "height width 3"]
 
 
 class Site(abc.ABC):
-    """A page in a browser. The server listens on one address only.
+    """A web server with one page.
 
-    Requests under another name than the address are refused, and so are actions without the page's own header. Another
-    page that is open in the same browser can therefore neither see the images nor press the buttons.
+    The server listens on one address only. It refuses requests for another host name, and actions without the page's
+    own header. Another site in the same browser can therefore neither see the images nor press the buttons.
     """
 
     def __init__(self, host: str, port: int, document: Path, streams: tuple[str, ...]):
-        """Listen.
+        """Start the server in a thread.
 
         Args:
-            host: Address or name, such as 127.0.0.1.
-            port: 0: a free one.
-            document: The HTML file.
-            streams: Names of the live images. The page shows them as `NAME.mjpg`.
+            host: Address or name on which the server listens, such as 127.0.0.1.
+            port: TCP port. 0 selects a free one.
+            document: Path of the HTML file of the page.
+            streams: Names of the live images. The page loads each from `NAME.mjpg`.
 
         Raises:
             OSError: The address cannot be used. The message names it and the remedy.
         """
         self.document, self.streams = document, streams
         self._changed = threading.Condition()
-        self._number = 0  # of changes
+        self._number = 0  # number of changes of the content so far
         self._ended = False
-        self._asked_s = -float("inf")  # when a page last asked for the facts
+        self._asked_s = -float("inf")  # time of the last request for facts, on the clock `time.monotonic` (s)
         site = self
 
         class Handler(_Handler):
@@ -67,18 +67,25 @@ class Site(abc.ABC):
 
     @abc.abstractmethod
     def facts(self) -> dict[str, Any]:
-        """What the page shows besides images, as JSON. `ended` states that there will be no more."""
+        """The content of the page besides images, for JSON. `ended` is True after the last change."""
 
     @abc.abstractmethod
     def image(self, stream: str) -> Image | None:
-        """The newest image of a stream, the same object as before if it has not changed."""
+        """The newest image of a stream, or None. If the image has not changed, the same object is returned again."""
 
     def still(self, path: str) -> Image | None:
-        """The image at a path such as `end/initial/visual.jpg`, or None."""
+        """The single image at a path such as `end/initial/visual.jpg`, or None if there is none."""
         return None
 
     def pressed(self, content: Any) -> bool:
-        """Take over an action. False: it does not fit."""
+        """Accept an action of the page.
+
+        Args:
+            content: Decoded JSON of the request.
+
+        Returns:
+            False if the action is invalid or comes too late.
+        """
         return False
 
     @property
@@ -88,29 +95,29 @@ class Site(abc.ABC):
 
     @property
     def is_local(self) -> bool:
-        """Whether only programs of this computer can reach the page."""
+        """True if only programs on this computer can reach the page."""
         with contextlib.suppress(ValueError):
             return ipaddress.ip_address(self.host).is_loopback
         return self.host == "localhost"
 
     @property
     def is_open(self) -> bool:
-        """Whether a browser shows the page."""
+        """True if a browser shows the page at present."""
         return time.monotonic() - self._asked_s < _OPEN_S
 
     def asked(self) -> dict[str, Any]:
-        """The facts for a page that asks."""
+        """Note that a page requests the facts, and return them."""
         self._asked_s = time.monotonic()
         return self.facts()
 
     def wait(self, last: int) -> int | None:
-        """Wait for a change after the one with a number. None: there will be no more."""
+        """Wait until there are more than `last` changes. Returns their number, or None after the last change."""
         with self._changed:
             self._changed.wait_for(lambda: self._ended or self._number > last)
             return None if self._ended else self._number
 
     def close(self) -> None:
-        """Show in the open pages that the program has ended, and stop."""
+        """Show in open pages that the program has ended, and stop the server."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -122,19 +129,19 @@ class Site(abc.ABC):
 
 
 class _Handler(http.server.BaseHTTPRequestHandler):
-    """Requests of a page."""
+    """Answers the requests of the page."""
 
     owner: Site
 
     def log_message(self, *_: object) -> None:
-        """Print nothing."""
+        """Do not log requests."""
 
     def do_GET(self) -> None:
-        """Answer with the page, the facts, an image or a stream."""
+        """Send the page, the facts, an image or a stream."""
         path = self.path.partition("?")[0].removeprefix("/")
-        with contextlib.suppress(OSError):  # the browser has left
+        with contextlib.suppress(OSError):  # the browser may have closed the connection
             if not self._own_name():
-                self.send_error(403, "Open the page under the address that the program has printed")
+                self.send_error(403, "Open the page at the address that the program has printed")
             elif path == "":
                 self._send("text/html; charset=utf-8", self.owner.document.read_bytes())
             elif path == "view":
@@ -147,7 +154,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 self.send_error(404)
 
     def do_POST(self) -> None:
-        """Take over an action."""
+        """Pass an action of the page to `Site.pressed`."""
         length = self.headers.get("Content-Length", "")
         with contextlib.suppress(OSError):
             if not self._own_name() or self.path != "/action" or self.headers.get("X-Collect") != "1":
@@ -165,13 +172,13 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.end_headers()
 
     def _own_name(self) -> bool:
-        """Whether the browser asks for the address on which the server listens, and not for another site's name."""
+        """Return whether the request names this server as its host, and not another site."""
         name = ""
         with contextlib.suppress(ValueError):
             name = urllib.parse.urlsplit("//" + self.headers.get("Host", "")).hostname or ""
         if name == self.owner.host or (self.owner.is_local and name in ("localhost", "127.0.0.1", "::1")):
             return True
-        with contextlib.suppress(ValueError):  # all addresses of this computer
+        with contextlib.suppress(ValueError):  # a server on 0.0.0.0 has all addresses of this computer
             return self.owner.host in ("0.0.0.0", "::") and bool(ipaddress.ip_address(name))
         return False
 
@@ -201,7 +208,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
 
 def _jpeg(image: Image) -> bytes:
-    """An image, reduced and encoded."""
+    """Reduce an image to at most `_WIDEST` pixels in width, and encode it as JPEG."""
     height, width = image.shape[:2]
     if width > _WIDEST:
         image = cv2.resize(image, (_WIDEST, round(height * _WIDEST / width)), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""The stages of an experiment: collect, train, evaluate. Each resumes and shows its progress."""
+"""The stages of an experiment: collect, train, evaluate. Each stage shows its progress and can be resumed."""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -18,12 +18,12 @@ Stage = Literal["collect", "train", "evaluate"]
 
 
 def main(config: Config, workdir: Path, *, only: Stage | None = None) -> None:
-    """Collect, train, evaluate.
+    """Collect the dataset, train the models, evaluate them, and print the main table.
 
     Args:
-        config: The experiment.
-        workdir: The work directory.
-        only: Run this stage only, on the results of the stages before it.
+        config: Configuration of the experiment.
+        workdir: Work directory for the results.
+        only: Stage to run, with the results of the earlier stages in `workdir`. None: run all stages.
 
     Raises:
         ValueError: A field of the configuration is out of range, or the work directory has another configuration.
@@ -46,12 +46,19 @@ def main(config: Config, workdir: Path, *, only: Stage | None = None) -> None:
 
 
 def claim(config: Config, workdir: Path) -> None:
-    """Write `config.json`, or raise an error that names the fields in which an existing one differs."""
+    """Write `config.json`, or check that an existing file has the same content.
+
+    Raises:
+        ValueError: The work directory has another configuration. The message names the fields that differ.
+    """
     _files.claim(workdir / "config.json", dataclasses.asdict(config))
 
 
 def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Dataset:
-    """Make the missing shards of the dataset and open it."""
+    """Simulate and render the parts of the dataset that are missing, and open it.
+
+    Objects that cannot be simulated are listed in `objects.txt` in the work directory.
+    """
     with Bar() as bar:
         made = dataset.collect(
             config.collection,
@@ -64,18 +71,23 @@ def collect(config: Config, workdir: Path, sensor: sts.Sensor) -> dataset.Datase
         say(line)
     note(workdir / "objects.txt", left_out)
     if made.resampled:
-        say(f"collect: {made.resampled} trajectories went non-finite or sank and were drawn again")
+        say(f"collect: {made.resampled} trajectories had non-finite values or sank into the pad and were drawn again")
     return dataset.load(workdir / "dataset")
 
 
 def _collected(workdir: Path) -> dataset.Dataset:
-    """Open the dataset of an earlier run."""
+    """Open the dataset of an earlier run.
+
+    Raises:
+        FileNotFoundError: There is no complete dataset.
+    """
     if not (workdir / "dataset" / "collection.json").exists():
         raise FileNotFoundError(f"{workdir / 'dataset'} is not a collected dataset: run with --only collect first")
     return dataset.load(workdir / "dataset")
 
 
 def _check_trained(config: Config, workdir: Path, split: str) -> None:
+    """Raise a `FileNotFoundError` unless all models of a split have been trained."""
     for name in MODELS[config.model]:
         folder = model_folder(workdir, name, config, split)
         if not (folder / "config.json").exists():
@@ -83,7 +95,7 @@ def _check_trained(config: Config, workdir: Path, split: str) -> None:
 
 
 def note(path: Path, lines: Sequence[str]) -> None:
-    """Add to a text file those of some lines that it does not have."""
+    """Append lines to a text file, except those that it contains already."""
     there = path.read_text(errors="replace") if path.exists() else ""
     new = "".join(f"{line}\n" for line in lines if f"{line}\n" not in there)
     if new:
@@ -91,14 +103,14 @@ def note(path: Path, lines: Sequence[str]) -> None:
 
 
 class Job(NamedTuple):
-    """One training of an experiment."""
+    """The model and the data of one training."""
 
-    name: str  # of the model
-    schedule: TrainConfig
-    model: mvae.Config | statespace.Config
-    arrays: training.Arrays
-    preprocessing: training.Preprocessing
-    empty: dict[str, np.ndarray]  # images of the untouched sensor, uint8
+    name: str  # name of the model
+    schedule: TrainConfig  # options of the training
+    model: mvae.Config | statespace.Config  # configuration of the networks
+    arrays: training.Arrays  # training data
+    preprocessing: training.Preprocessing  # preprocessing of the inputs, which is stored with the model
+    empty: dict[str, np.ndarray]  # image of the untouched sensor for each stream, uint8
 
 
 def jobs(
@@ -108,14 +120,14 @@ def jobs(
     views: dataset.Views | None = None,
     falls: dataset.Ends | None = None,
 ) -> Iterator[Job]:
-    """The trainings of an experiment.
+    """Prepare the training of each model of an experiment.
 
     Args:
-        config: The experiment.
-        sensor: That of the collection.
-        pairs: The training trajectories, with images as they were collected.
-        views: Further pictures of the training objects, for the state-space model.
-        falls: Trajectories of the training objects that are used without their images, for the state-space model.
+        config: Configuration of the experiment.
+        sensor: Sensor of the collection.
+        pairs: First and last frames of the training trajectories, with images as they were collected.
+        views: Further images of the training objects. Only the state-space model uses them.
+        falls: Trajectories of the training objects without images. Only the state-space model uses them.
     """
     preprocessing, scenario = preprocessing_of(config), config.collection.scenario
     frame = dataset.empty_frame(sensor, config.collection)
@@ -123,7 +135,7 @@ def jobs(
     if config.model == "statespace":
         state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty, image_size=config.image_size)
         arrays = training.state_moments(pairs, state, scenario, own, empty, views=views, falls=falls)
-        del pairs  # as large as the arrays, which hold copies
+        del pairs  # frees memory, because `arrays` contains copies of the same size
         yield Job("statespace", config.state_training, state, arrays, own, empty)
         return
     pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
@@ -136,11 +148,19 @@ def jobs(
 
 
 def train(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.Sensor, split: str) -> None:
-    """Train the models of an experiment on one split, each with a progress bar."""
+    """Train the models of an experiment on one split, and show the progress.
+
+    Args:
+        config: Configuration of the experiment.
+        data: Dataset of the experiment.
+        workdir: Work directory for the models.
+        sensor: Sensor of the collection.
+        split: Split, one of `config.splits`.
+    """
     rows, more = evaluation.rows_of(data, split)["train"], config.model == "statespace"
     views = data.views("train") if more else None
     falls = data.ends(data.members("train", rendered=False)) if more else None
-    # The trajectories have no name here, so that `jobs` can free their memory.
+    # The trajectories are passed without a variable of their own, so that `jobs` can free their memory.
     for job in jobs(config, sensor, data.pairs(rows, symmetries=True), views, falls):
         with Bar() as bar:
 
@@ -160,7 +180,14 @@ def run(
     targets: Literal["all", "own"],
     progress: Callable[[int, int, dict[str, float]], None],
 ) -> None:
-    """Train one model in a folder, or go on where an earlier call on it stopped."""
+    """Train a model in a folder, or continue an interrupted training.
+
+    Args:
+        job: Model and data.
+        folder: Folder of the model.
+        targets: Modalities that a model of the paper predicts from a subset: all, or only those of the subset ("own").
+        progress: Function that receives the number of finished steps, the number of all steps, and values of the log.
+    """
     training.save_blank(folder, job.empty["visual"], job.empty["tactile"])
     training.train(
         job.schedule,
@@ -175,13 +202,21 @@ def run(
 
 
 def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, validation: dataset.Pairs) -> None:
-    """Calibrate a trained state-space model on the trajectories of validation objects."""
+    """Calibrate the probabilities of a trained state-space model.
+
+    Args:
+        job: Model and data of the training.
+        model: Configuration of the networks.
+        folder: Folder of the trained model.
+        config: Configuration of the experiment.
+        validation: First and last frames of the validation trajectories.
+    """
     arrays = training.state_moments(validation, model, config.collection.scenario, job.preprocessing, job.empty)
     training.calibrate(folder, arrays)
 
 
 def preprocessing_of(config: Config) -> training.Preprocessing:
-    """How an experiment's measurements are made ready for the networks."""
+    """The preprocessing of the inputs that the configuration of an experiment determines."""
     collection = config.collection
     small = (config.image_size, config.image_size)
     return training.Preprocessing(

@@ -1,4 +1,4 @@
-"""The evaluation of the models of Table 2: its table, and its figure of predictions."""
+"""Evaluates the models of Table 2, and writes the table and a figure of predictions."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -20,15 +20,19 @@ FLOOR = "the truth itself (entropy)"
 
 
 def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str:
-    """Judge the models on the validation trajectories and return the table.
+    """Score the models on the validation trajectories, and write and return the results.
 
-    Writes `metrics.json`, `table.md` and `figures/`. Nothing is done again while the checksums in `metrics.json` hold.
+    The results are `metrics.json`, `table.md` and `figures/`. `metrics.json` records the checksums of all inputs and
+    results. While all checksums match, nothing is evaluated again.
 
     Args:
-        config: The experiment.
-        data: The trajectories.
-        workdir: The folder from which they were read.
-        folder: The folder of the results.
+        config: Configuration of the experiment.
+        data: Recorded trajectories.
+        workdir: Work directory from which the trajectories were read.
+        folder: Folder with the trained models, which receives the results.
+
+    Returns:
+        The table in Markdown.
     """
     done, table = folder / "metrics.json", folder / "table.md"
     models = {name: folder / "models" / name for name in NAMES}
@@ -58,7 +62,11 @@ def evaluate(config: Config, data: Recorded, workdir: Path, folder: Path) -> str
 
 
 def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predicted]:
-    """The predictions of each model from all its inputs, and those of the MVAE from each of them, by title."""
+    """Predict the validation trajectories with each model, from each subset of its inputs.
+
+    Returns:
+        Predictions by the title of the row in the table.
+    """
     found = {}
     first = {stream: getattr(data.validation, stream)[:, 0].astype(np.float32) / 255 for stream in evaluation.STREAMS}
     for name, path in models.items():
@@ -72,7 +80,7 @@ def predictions(models: Mapping[str, Path], data: Recorded) -> dict[str, Predict
 
 
 def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], path: Path) -> None:
-    """Draw the first validation trajectories: both inputs, and each stream's truth beside its predictions."""
+    """Draw the first validation trajectories: the two input images, and predicted and true images at rest."""
     held = data.validation
     labels = [f"#{number}" for number in held.number[: config.num_shown]]
 
@@ -111,7 +119,14 @@ def draw(config: Config, data: Recorded, predicted: Mapping[str, Predicted], pat
 
 
 def as_table(config: Config, data: Recorded, summary: dict, logs: Mapping[str, list[dict]]) -> str:
-    """The table in Markdown."""
+    """Format the table in Markdown.
+
+    Args:
+        config: Configuration of the experiment.
+        data: Recorded trajectories.
+        summary: Scores with intervals, from `evaluation.image_summary`.
+        logs: Training logs by the title of the model.
+    """
     names = [FLOOR, *dict.fromkeys(name for own in summary.values() for name in own["predictors"])]
     heads = ["predictor"]
     for stream in summary:

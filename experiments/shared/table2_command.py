@@ -1,4 +1,4 @@
-"""`train`: from the options of the command line to Table 2."""
+"""`train` of `experiments.real`: train models on recorded trajectories, and write the paper's Table 2."""
 
 import dataclasses
 import tempfile
@@ -18,26 +18,28 @@ from experiments.shared.recorded import Config
 from experiments.shared.simulated import Simulated
 from sts_jax import _files
 
-_FEW = 2, recorded.LEAST  # trajectories that are measured: at first, and in all
-_STEPS = 4  # gradient steps that are measured
+_FEW = 2, recorded.LEAST  # number of trajectories after which the time is measured. The first ones include compilation
+_STEPS = 4  # number of gradient steps in a measurement
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train VAE visual, VAE tactile and MVAE without pose on the collected trajectories, and write Table 2."""
 
-    # the configuration of the preset, every field of which can be changed
+    # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]
-    workdir: Folder = Path("runs/real")  # the trajectories are in its folder `dataset`, beside its `sensor.json`
-    name: str = "table2"  # the results go to this folder of the work directory
-    preset: Literal["smoke", "default", "paper"] = "default"  # the configuration that other options change
-    only: stages.Stage | None = None  # run this stage only
-    plan: bool = False  # print the expected seconds of each stage, from a short measurement, and stop
+    workdir: Folder = Path("runs/real")  # work directory with the folder `dataset` and the sensor file `sensor.json`
+    name: str = "table2"  # folder in the work directory for the results
+    preset: Literal["smoke", "default", "paper"] = "default"  # configuration from which the options start
+    only: stages.Stage | None = None  # run only this stage
+    plan: bool = False  # measure each stage for a short time, print its expected duration, and stop
     debug: bool = False  # show the traceback of every error
 
 
 def learn(args: Train) -> None:
-    """Collect trajectories of the twin if there are none, train, evaluate, and print the table.
+    """Collect trajectories of the twin if there are too few, train, evaluate, and print the table.
+
+    Trajectories of a device are used as they are.
 
     Raises:
         ValueError: An option is out of range, or the results were made with other options or trajectories.
@@ -47,7 +49,7 @@ def learn(args: Train) -> None:
     """
     recorded.check(args.config)
     if args.name != Path(args.name).name or args.name in ("", "dataset"):
-        raise ValueError(f"name must be the name of a folder other than dataset, got {args.name!r}")
+        raise ValueError(f"name must be a folder name without a path and not 'dataset', got {args.name!r}")
     sts.enable_compilation_cache()
     folder = args.workdir / args.name
     if args.plan or (args.preset == "paper" and not (folder / "metrics.json").exists()):
@@ -70,7 +72,7 @@ def learn(args: Train) -> None:
 
 
 def collect(config: Config, workdir: Path) -> None:
-    """Collect the missing trajectories of the twin. Trajectories of a device are left as they are."""
+    """Collect the missing trajectories of the twin. With trajectories of a device, nothing is collected."""
     count = recorded.missing(config, workdir)
     if not count:
         return
@@ -79,11 +81,14 @@ def collect(config: Config, workdir: Path) -> None:
 
 
 def plan(config: Config, missing: int) -> str:
-    """Measure a little of each stage, and return a line with the expected seconds for each.
+    """Run a small part of each stage with the twin, and estimate the duration of the whole experiment.
 
     Args:
-        config: The experiment.
+        config: Configuration of the experiment.
         missing: Number of trajectories that the twin has to collect.
+
+    Returns:
+        A text with one line for each stage, and a line for their sum.
     """
     with tempfile.TemporaryDirectory() as name:
         workdir, clock = Path(name), [time.perf_counter()]
@@ -109,7 +114,7 @@ def plan(config: Config, missing: int) -> str:
 
 
 def _training(config: Config, data: recorded.Recorded, folder: Path) -> list[Line]:
-    """The expected time of each training, from some steps of it."""
+    """Estimate the duration of each training from a few steps."""
     lines, samples = [], recorded.samples(config, config.count)
     for job in recorded.jobs(config, data):
         clock = [time.perf_counter()]

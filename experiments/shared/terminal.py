@@ -1,4 +1,4 @@
-"""A terminal without a browser: prints the instruction when it changes, and reads keys."""
+"""The terminal of `experiments.real collect --headless`: prints the instructions, and reads keys."""
 
 import contextlib
 import os
@@ -13,26 +13,27 @@ KEYS = {"\n": Action.CONFIRM, "\r": Action.CONFIRM, "d": Action.DISCARD, "q": Ac
 
 
 class Terminal:
-    """A `Person` at a terminal: Enter confirms, d discards, q stops. So does each line of another standard input.
+    """Shows views to a person at a terminal, and returns the person's actions (a `hardware.Person`).
 
-    The end of the input stops.
+    Enter confirms, d discards and q stops. If the standard input is not a terminal, each line acts like a key: an empty
+    line confirms, `d` discards and `q` stops. The end of the input stops, too.
     """
 
     def __init__(self, count: int | None = None, *, keys: bool = True):
-        """Print the keys.
+        """Print a line that explains the keys.
 
         Args:
-            count: Number of trajectories that is shown as the goal.
-            keys: Whether keys are read.
+            count: Number of trajectories that is shown as the goal. None: no goal.
+            keys: False if no keys are read, so that the line is not printed.
         """
         self._goal = "" if count is None else f" of {count}"
         self._shown: object = None
-        self._stages: tuple[Stage | None, Stage | None] = (None, None)  # of the last two views
+        self._stages: tuple[Stage | None, Stage | None] = (None, None)  # stages of the last two views
         if keys:
             say("Enter confirms, d discards, q stops")
 
     def show(self, view: View) -> None:
-        """Print a view if it differs from the last one."""
+        """Print the instruction or the problem of a view if it has changed."""
         self._stages = self._stages[1], view.stage
         shown = view.instruction, view.problem, view.number
         if shown != self._shown:
@@ -43,7 +44,8 @@ class Terminal:
     def action(self) -> Action | None:
         """The action of the next key, or None.
 
-        Unknown keys are ignored, and so is a key that was pressed before the person saw the current stage.
+        Unknown keys are ignored. Enter and d are also ignored if they were pressed before the person saw the current
+        stage.
         """
         while select.select([sys.stdin], [], [], 0)[0]:
             data = os.read(sys.stdin.fileno(), 1)
@@ -58,17 +60,17 @@ class Terminal:
         return None
 
     def _rest_of_line(self) -> None:
-        """Skip to the end of a line, whose line feed is no confirmation."""
+        """Skip to the end of the line, so that its line feed does not count as Enter."""
         while os.read(sys.stdin.fileno(), 1) not in (b"\n", b""):
             pass
 
 
 @contextlib.contextmanager
 def single_keys() -> Iterator[None]:
-    """Let the terminal pass on each key at once.
+    """Let the terminal pass on each key without waiting for Enter, and restore its mode afterwards.
 
     Raises:
-        ValueError: The standard input cannot be read key by key.
+        ValueError: The terminals of this system cannot be read key by key.
     """
     if not sys.stdin.isatty():
         yield
@@ -77,7 +79,7 @@ def single_keys() -> Iterator[None]:
         import termios
         import tty
     except ImportError as error:
-        raise ValueError("this system's terminal passes no single keys: leave out --headless") from error
+        raise ValueError("the terminal of this system cannot be read key by key: leave out --headless") from error
     before = termios.tcgetattr(sys.stdin)
     try:
         tty.setcbreak(sys.stdin)

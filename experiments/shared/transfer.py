@@ -1,4 +1,4 @@
-"""The library's model of released objects on recorded trajectories. It was trained on simulated images only."""
+"""Predicts recorded trajectories with the library's model `released`, which was trained on simulated images only."""
 
 import dataclasses
 from pathlib import Path
@@ -19,18 +19,18 @@ TITLE = "state-space model, simulated training"
 
 
 def predictions(config: Config, data: Recorded, workdir: Path) -> Predicted | None:
-    """The predictions from both held images of the validation trajectories.
+    """Predict the validation trajectories from both images of the held object.
 
-    The images are taken in the light of the model's empty pad, and its predictions are brought back into that of the
-    recorded sensor.
+    The brightness and the colours of the images are first adapted to those of the model's training images
+    (`hardware.relit`). Those of the predictions are adapted back to the recorded sensor.
 
     Args:
-        config: The experiment.
-        data: The trajectories, at the resolution of the table.
-        workdir: The folder from which they were read.
+        config: Configuration of the experiment.
+        data: Recorded trajectories, at the resolution of the table.
+        workdir: Work directory from which the trajectories were read.
 
     Returns:
-        The predictions, or None if the table has another resolution than the model's predictions.
+        The predictions, or None if the model's images do not have the resolution of the table.
     """
     predictor = sts.Predictor.load(NAME)
     side, (height, _) = config.image_size, predictor.preprocessing.resolution
@@ -51,10 +51,11 @@ def predictions(config: Config, data: Recorded, workdir: Path) -> Predicted | No
 
 
 def _unit(images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Convert uint8 images to float32 in [0, 1]."""
     return {stream: own.astype(np.float32) / 255 for stream, own in images.items()}
 
 
 def _reduced(image: np.ndarray, side: int) -> np.ndarray:
-    """The means of an image's blocks."""
+    """Reduce a square image to `side` pixels by averaging blocks of pixels."""
     step = image.shape[0] // side
     return image.reshape(side, step, side, step, 3).mean((1, 3))

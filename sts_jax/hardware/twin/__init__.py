@@ -1,4 +1,4 @@
-"""The digital twin of the sensor: camera and LED controller of simulated objects."""
+"""The digital twin of the sensor: a simulated camera and LED controller that stand in for the real devices."""
 
 from sts_jax.hardware.twin.device import Made, State, Twin
 from sts_jax.hardware.twin.faults import Fault

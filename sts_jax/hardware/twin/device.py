@@ -19,37 +19,38 @@ from sts_jax.hardware.twin.lights import LightHistory
 from sts_jax.hardware.twin.log import Exposure, Log
 from sts_jax.hardware.twin.scene import Phase, Scene
 
-ANSWER_S = 0.004  # s, duration of a request on the virtual clock. The levels apply in its middle
-_TICK_S = 0.005  # s, period of the watchdog's checks on the virtual clock
+ANSWER_S = 0.004  # duration of a request on the virtual clock (s). Its levels apply after half of this time
+_TICK_S = 0.005  # period with which the watchdog is checked on the virtual clock (s)
 
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The twin at one moment."""
+    """The state of a twin at one time."""
 
-    now_s: float  # of the twin's clock
-    phase: str  # of the scene: empty, held, moving or still
-    trajectory: int  # number of the trajectory, or -1 before the first
-    frame: int  # index of the drawn pose in the trajectory
-    pose: tuple[float, ...] | None  # mesh frame in the sensor frame (m, quaternion)
-    levels: protocol.Levels  # of the LEDs
-    counter: int  # changes of the levels since the controller's boot
+    now_s: float  # time on the twin's clock (s)
+    phase: str  # phase of the scene: empty, held, moving or still
+    trajectory: int  # number of the current or last trajectory, or -1 before the first one
+    frame: int  # index of the rendered pose in the trajectory
+    pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
+    levels: protocol.Levels  # duty cycles of the four LED channels, 0 to 255
+    counter: int  # number of changes of the levels since the controller's boot
     boot: int  # number of the controller's boot
-    frames: int  # frames produced so far
+    frames: int  # number of frames produced so far
 
 
 class Made(NamedTuple):
-    """One frame, as it is delivered."""
+    """One frame that the camera has produced."""
 
-    exposure: Exposure
-    jpeg: bytes
+    exposure: Exposure  # ground truth of the frame
+    jpeg: bytes  # image of the frame, as a client receives it
 
 
 class Twin:
-    """A simulated sensor: EmulatedController, light, scene, and camera.
+    """A simulated sensor: LED controller, LEDs, scene and camera.
 
-    It runs on a virtual clock, which advances with `step`, `capture`, `set` and `ping` only. The same calls and seeds
-    give the same frames. `Served` runs it on the real clock behind a serial port and a camera stream instead.
+    A new twin runs on a virtual clock. Only `step`, `capture`, `set` and `ping` advance this clock, so the same calls
+    with the same seeds return the same frames. `Served` runs a twin on the real clock instead, behind a serial port and
+    a camera stream.
 
     ```python
     with Twin(ObjectScene(body)) as twin:
@@ -59,18 +60,18 @@ class Twin:
     ```
     """
 
-    # Set at the boot
-    _epoch_s: float  # the camera's first exposure begins
+    # `_boot` sets these.
+    _epoch_s: float  # begin of the camera's first exposure
     _controller: EmulatedController
     _lights: LightHistory
     _sequence: int  # number of the last request of `set` and `ping`
-    _index: int  # the last frame of `capture`
-    _made: int  # number of frames
-    _last: Made | None
-    _due_s: float  # delivery of the last frame
+    _index: int  # number of the last frame that `capture` returned
+    _made: int  # number of frames produced so far
+    _last: Made | None  # last frame that was produced
+    _due_s: float  # time of delivery of the last frame
     _stalled_until_s: float
-    _phase: str | None  # seen by `operate`
-    _next_s: float  # next action of `operate`
+    _phase: str | None  # phase at the last call of `operate`
+    _next_s: float  # time of the next command of `operate`
 
     def __init__(
         self,
@@ -84,30 +85,31 @@ class Twin:
         log: str | os.PathLike | None = None,
         record: str | os.PathLike | None = None,
     ):
-        """Boot with the lights off.
+        """Boot the twin with its lights off.
 
         Args:
-            scene: The contents of the view.
-            rate: Frames per second of the camera.
-            imperfections: Of camera and lights.
-            warp: From the rendered view to the raw view of a lens, `lens_warp`. Default: no distortion.
-            seed: Of noise, jitter and the times of `release_every`.
-            release_every: Mean duration (s) of one cycle of holding and resting, with which objects are held and
-                released at random. Their motion comes in addition. Default: on command only.
-            log: File for one JSON line per frame (`Exposure`).
-            record: File for all frames as motion JPEG, in the order of the log.
+            scene: Scene in front of the camera.
+            rate: Frame rate of the camera (frames/s).
+            imperfections: Deviations of the camera and the lights from ideal ones. Default: `Imperfections()`.
+            warp: Lens distortion, made by `lens_warp`. Default: no distortion.
+            seed: Seed of the noise, the jitter and the times of `release_every`.
+            release_every: Mean time for which an object is held plus mean time for which it then rests (s). The twin
+                holds and releases objects at random times by itself. Default: objects move on `command` only.
+            log: Path of a file that receives one JSON line with the fields of `Exposure` per frame. Default: no log.
+            record: Path of a motion JPEG file that receives all frames in the order of the log. Default: no file.
 
         Raises:
-            ValueError: A value is out of range.
-            OSError: A file cannot be written.
+            ValueError: `rate` or `release_every` is not positive and finite, or the exposure is longer than the time
+                between two frames.
+            OSError: `log` or `record` cannot be written.
         """
         self.imperfections = photometry.Imperfections() if imperfections is None else imperfections
         if not 0 < rate < math.inf:
             raise ValueError(f"rate must be positive and finite, got {rate}")
         if self.imperfections.exposure_s > 1 / rate:
             raise ValueError(
-                f"exposure_s is {self.imperfections.exposure_s} s, but at {rate:g} frames/s it must be at most "
-                f"{1 / rate:.4f} s: lower rate or exposure_s"
+                f"imperfections.exposure_s is {self.imperfections.exposure_s} s, but at {rate:g} frames/s it must be "
+                f"at most {1 / rate:.4f} s: lower rate or exposure_s"
             )
         if release_every is not None and not 0 < release_every < math.inf:
             raise ValueError(f"release_every must be positive and finite, got {release_every}")
@@ -117,8 +119,8 @@ class Twin:
         self._release_every = release_every
         self._random = random.Random(seed)
         self._serial_number = f"TWIN{seed}"
-        self._lock = threading.Lock()  # of the controller, the lights, the scene's commands and the faults
-        self._commands = threading.Lock()  # one command at a time
+        self._lock = threading.Lock()  # protects the controller, the lights, the scene's commands and the faults
+        self._commands = threading.Lock()  # lets one command run at a time
         self._waiting = faults.Queue()
         self._log = Log(log, record)
         self._clock: Callable[[], float] | None = None
@@ -127,17 +129,17 @@ class Twin:
 
     @property
     def now_s(self) -> float:
-        """Current time (s)."""
+        """The current time on the twin's clock (s)."""
         return self._virtual_s if self._clock is None else self._clock()
 
     @property
     def serial_number(self) -> str:
-        """Serial number of the LED controller."""
+        """Serial number of the LED controller: `TWIN` followed by the seed."""
         return self._serial_number
 
     @property
     def state(self) -> State:
-        """The current state."""
+        """The current state of the scene, the lights and the camera."""
         with self._lock:
             now = self.now_s
             seen, leds = self.scene.at(now), self._controller
@@ -154,24 +156,37 @@ class Twin:
             )
 
     def run_on(self, clock: Callable[[], float]) -> None:
-        """Leave the virtual clock for another one (s). The controller boots.
+        """Replace the virtual clock by another one, and boot the controller again.
+
+        Args:
+            clock: Function that returns the time of the new clock (s), such as `time.monotonic`.
 
         Raises:
-            RuntimeError: The virtual clock has advanced, so times would be mixed.
+            RuntimeError: The virtual clock has advanced already, so times of both clocks would be mixed.
         """
         if self._virtual_s:
-            raise RuntimeError(f"the virtual clock is at {self._virtual_s} s: make a new Twin to serve it")
+            raise RuntimeError(
+                f"the virtual clock of this Twin has advanced to {self._virtual_s} s, but a twin must be served before "
+                "its clock advances: make a new Twin to serve it"
+            )
         self._clock = clock
         self._boot(clock())
 
     def command(self, command: str) -> State:
-        """Apply `hold`, `release` or `clear` to the scene. Returns when the scene has changed.
+        """Move the object in the scene.
 
-        On the real clock, the renderings that the command needs come first, so it may take seconds. On the virtual
-        clock, a pose is rendered when a frame shows it.
+        On the real clock, this method first renders the images that the command needs, which may take seconds. On the
+        virtual clock, `capture` renders a pose when a frame shows it for the first time.
+
+        Args:
+            command: `hold` holds the object on the pad in the first pose of the next trajectory, `release` lets it go,
+                and `clear` takes it away.
+
+        Returns:
+            The state after the command.
 
         Raises:
-            ValueError: The command is unknown or not possible now.
+            ValueError: The command is unknown or not possible in the present phase, or no simulated trajectory settles.
         """
         with self._commands:
             if self._clock is not None:
@@ -181,7 +196,11 @@ class Twin:
         return self.state
 
     def operate(self) -> None:
-        """Hold or release the object if `release_every` demands it now."""
+        """Hold or release the object if this is due.
+
+        `step` and `Served` call this method regularly. It acts at random times if `release_every` was given, and does
+        nothing otherwise.
+        """
         if self._release_every is None:
             return
         now, phase = self.now_s, self.state.phase
@@ -192,7 +211,7 @@ class Twin:
             self.command("release" if phase == Phase.HELD else "hold")
 
     def receive(self, data: bytes) -> bytes:
-        """Pass bytes to the LED controller. Returns the bytes that it sends."""
+        """Pass bytes of the host to the LED controller, and return the bytes that the controller sends."""
         with self._lock:
             now = self.now_s
             sent = self._controller.receive(data, now)
@@ -200,16 +219,17 @@ class Twin:
         return sent
 
     def tick(self) -> bytes:
-        """Let the controller's watchdog act. Returns the bytes that the controller sends."""
+        """Let the controller's watchdog check the time, and return the bytes that the controller sends."""
         return self.receive(b"")
 
     def inject(self, fault: faults.Fault) -> None:
-        """Inject a fault of the camera (`stall`, `repeat`, `black`, `resize`) or restart the controller (`reboot`).
+        """Simulate a fault of the camera or a restart of the LED controller.
 
-        `Served.inject` accepts all faults.
+        Args:
+            fault: Fault of one of the kinds `stall`, `repeat`, `black`, `resize` and `reboot`.
 
         Raises:
-            ValueError: The fault concerns a connection, which the virtual clock does not have.
+            ValueError: The fault concerns a connection. Only a served twin has connections, see `Served.inject`.
         """
         if fault.kind == "reboot":
             with self._lock:
@@ -224,22 +244,39 @@ class Twin:
             with self._lock:
                 self._waiting.add(fault)
         else:
-            raise ValueError(f"the fault {fault.kind} concerns a connection: serve the twin, and use Served.inject")
+            raise ValueError(
+                f"fault has the kind {fault.kind!r}, which concerns a connection, but Twin.inject accepts only "
+                f"{', '.join(faults.DEVICE_KINDS)}: serve the twin, and call Served.inject"
+            )
 
     def end_s(self, index: int) -> float:
-        """End of the exposure of a frame (s)."""
+        """The time at which the exposure of frame `index` ends (s)."""
         return self._epoch_s + self.imperfections.exposure_s + index / self.rate
 
     def next_index(self, after: int, now_s: float) -> int:
-        """The first frame after another one that is not delivered before a time (s)."""
+        """The number of the next frame whose delivery is still possible.
+
+        Args:
+            after: Number of an earlier frame.
+            now_s: Time before which the frame must not be delivered (s).
+
+        Returns:
+            The smallest number that is greater than `after` and whose frame, without jitter, is delivered at `now_s` or
+            later.
+        """
         elapsed = now_s - self.imperfections.lag_s - self.end_s(0)
         return max(after + 1, math.ceil(elapsed * self.rate - 1e-6))
 
     def make(self, index: int) -> Made | None:
-        """Produce a frame whose exposure has ended, and log it. One thread calls it, with increasing numbers.
+        """Produce a frame whose exposure has ended, and write it to the log.
+
+        Only one thread may call this method.
+
+        Args:
+            index: Number of the frame. It must be greater than in the call before.
 
         Returns:
-            The frame, or None while the camera is stalled.
+            The frame, or None while the fault `stall` lasts.
         """
         constants = self.imperfections
         end = self.end_s(index)
@@ -283,14 +320,20 @@ class Twin:
         return made
 
     def step(self, seconds: float) -> None:
-        """Advance the virtual clock (s). Watchdog and `release_every` act on time.
+        """Advance the virtual clock. The watchdog and `release_every` act whenever they are due.
+
+        Args:
+            seconds: Time by which the clock advances, >= 0 (s).
 
         Raises:
-            ValueError: The time is negative.
+            ValueError: `seconds` is negative or not finite.
             RuntimeError: The twin runs on the real clock.
         """
         if self._clock is not None:
-            raise RuntimeError("the twin runs on the real clock, which advances by itself")
+            raise RuntimeError(
+                "the twin is served on the real clock, which advances by itself: read it through hardware.STS, or make "
+                "a new Twin for step, capture, set and ping"
+            )
         if not 0 <= seconds < math.inf:
             raise ValueError(f"seconds must be >= 0 and finite, got {seconds}")
         target = self._virtual_s + seconds
@@ -300,10 +343,10 @@ class Twin:
             self.operate()
 
     def capture(self) -> tuple[Exposure, np.ndarray]:
-        """Advance the virtual clock to the delivery of the next frame.
+        """Advance the virtual clock until the next frame is delivered.
 
         Returns:
-            The truth about the frame, and its image, uint8 RGB (height, width, 3), decoded from its JPEG.
+            The ground truth of the frame, and its image: uint8 RGB of shape (height, width, 3), decoded from its JPEG.
 
         Raises:
             RuntimeError: The twin runs on the real clock.
@@ -316,16 +359,36 @@ class Twin:
                 return made.exposure, photometry.decode(made.jpeg)
 
     def set(self, levels: Sequence[int]) -> Lit:
-        """Set the lights, as `Leds.set` does. It advances the virtual clock by `ANSWER_S`."""
+        """Set the lights, and advance the virtual clock by the duration of the request (`ANSWER_S`).
+
+        Args:
+            levels: Duty cycles of the four LED channels, 0 (off) to 255 (always on).
+
+        Returns:
+            The controller's answer, as `hardware.Leds.set` returns it.
+
+        Raises:
+            ValueError: There are not four levels, or one is out of range.
+            RuntimeError: The twin runs on the real clock.
+        """
         first, second, third, fourth = levels
         return self._request(protocol.Set(self._next_sequence(), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
-        """Ask for the levels that are applied now, as `Leds.ping` does. It advances the virtual clock by `ANSWER_S`."""
+        """Ask the controller for the current levels, and advance the virtual clock by `ANSWER_S`.
+
+        A request also resets the watchdog, which turns the lights off after 1 s without one.
+
+        Returns:
+            The controller's answer, as `hardware.Leds.ping` returns it.
+
+        Raises:
+            RuntimeError: The twin runs on the real clock.
+        """
         return self._request(protocol.Ping(self._next_sequence()))
 
     def close(self) -> None:
-        """End the renderer's thread and close the log. Closing twice is allowed."""
+        """Stop the scene's rendering thread and close the log. Closing twice is allowed."""
         self.scene.close()
         self._log.close()
 
@@ -338,6 +401,7 @@ class Twin:
         self.close()
 
     def _boot(self, now_s: float) -> None:
+        """Reset the controller, the lights and the camera at a time (s)."""
         self._epoch_s = now_s
         self._controller = EmulatedController(now_s=now_s, serial_number=self._serial_number)
         self._lights = LightHistory(self.imperfections.rise_s)
@@ -354,6 +418,7 @@ class Twin:
         return self._sequence
 
     def _request(self, request: protocol.Set | protocol.Ping) -> Lit:
+        """Pass a request to the controller, which executes it after half of `ANSWER_S`."""
         sent_s = self.now_s
         self.step(ANSWER_S / 2)
         lines = self.receive(protocol.encode_request(request)).splitlines(keepends=True)

@@ -1,17 +1,17 @@
-"""Faults of the twin's camera, LED controller and connections, for tests of a host."""
+"""Simulated faults of the twin's camera, LED controller and connections, to test the programs that use a sensor."""
 
 import dataclasses
 import math
 
-IMAGE_KINDS = ("repeat", "black", "resize")  # of single frames
-DEVICE_KINDS = (*IMAGE_KINDS, "stall", "reboot")  # of camera and controller
-LINE_KINDS = ("deaf", "lost", "late", "doubled", "garbled", "vanish")  # of the serial port
+IMAGE_KINDS = ("repeat", "black", "resize")  # faults of single frames
+DEVICE_KINDS = (*IMAGE_KINDS, "stall", "reboot")  # faults of the camera and the controller
+LINE_KINDS = ("deaf", "lost", "late", "doubled", "garbled", "vanish")  # faults of the serial port
 KINDS = (*DEVICE_KINDS, *LINE_KINDS, "drop")
 
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One simulated fault.
 
     | kind | effect |
     |---|---|
@@ -29,15 +29,15 @@ class Fault:
     | `reboot` | the LED controller restarts: its lights are off, and its boot number increases |
     """
 
-    kind: str
-    count: int = 1  # frames, requests or answers
-    seconds: float = 1.0  # s
+    kind: str  # one of the kinds in the table
+    count: int = 1  # number of affected frames, requests or answers, >= 1
+    seconds: float = 1.0  # duration of the kinds `stall`, `late` and `vanish`, >= 0 (s)
 
     def __post_init__(self) -> None:
-        """Check the values.
+        """Check the fields.
 
         Raises:
-            ValueError: The kind is unknown, or a number is out of range.
+            ValueError: The kind is unknown, or `count` or `seconds` is out of range.
         """
         if self.kind not in KINDS:
             raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {self.kind!r}")
@@ -48,17 +48,21 @@ class Fault:
 
 
 class Queue:
-    """Faults that wait for their frame or answer. It is not thread-safe."""
+    """Faults that have been injected but not applied yet. The queue is not thread-safe."""
 
     def __init__(self) -> None:
         self._waiting: list[Fault] = []
 
     def add(self, fault: Fault) -> None:
-        """Append a fault, `count` times."""
+        """Append a fault as often as its `count` states."""
         self._waiting += [fault] * fault.count
 
     def take(self, *kinds: str) -> Fault | None:
-        """Remove and return the first fault of one of the kinds."""
+        """Remove and return the first fault of one of these kinds, or of any kind if none is given.
+
+        Returns:
+            The fault, or None if no such fault waits.
+        """
         for i, fault in enumerate(self._waiting):
             if not kinds or fault.kind in kinds:
                 return self._waiting.pop(i)
@@ -66,6 +70,6 @@ class Queue:
 
 
 def garble(line: bytes) -> bytes:
-    """The line with one flipped bit, which its checksum reveals."""
+    """A line of the protocol with one flipped bit. Its checksum is therefore wrong."""
     middle = len(line) // 2
     return line[:middle] + bytes([line[middle] ^ 1]) + line[middle + 1 :]

@@ -1,30 +1,33 @@
-"""`Hand`: the person of a collection whose object is simulated."""
+"""`Hand`: a program that moves the twin's object in place of a person while trajectories are collected."""
 
 from sts_jax.hardware.collecting import Action, AutomaticPerson, View
 from sts_jax.hardware.guide import Stage
 from sts_jax.hardware.session import Session
 from sts_jax.hardware.twin.device import Twin
 
-_UNSEEN_S = 3.0  # s in which the guide sees no contact of a held object, so that the next pose is tried
-_UNSEEN = 10  # poses in a row without a contact, after which no other one is tried
-_UNMOVED_S = 3.0  # s after the release in which nothing moves, so that the object stays where it was
+_UNSEEN_S = 3.0  # time without a visible contact after which the next held pose is tried (s)
+_UNSEEN = 10  # held poses in a row without a visible contact after which the hand gives up
+_UNMOVED_S = 3.0  # time without motion after a release after which the object counts as resting where it was (s)
 
 
 class Hand(AutomaticPerson):
-    """Moves the twin's object as the guide asks, and confirms every trajectory.
+    """Moves the twin's object as `hardware.collect` instructs, and confirms every trajectory.
 
-    It acts on the guide's views alone. As a person does, it confirms the release of an object that stays where it was.
-    A held pose that shows no contact is left out together with its number in the session. Trajectory n of the session
-    is therefore trajectory n of the scene, if the scene begins with the session's next number.
+    `hardware.collect` guides a person by means of a `View`, and the hand decides by these views alone. If an object
+    stays where it was after its release, the hand confirms the release, as a person would. If a held pose causes no
+    visible contact, the hand skips the pose and its trajectory number in the session.
+
+    Trajectory n of the session is therefore trajectory n of the scene, provided that the scene starts with the
+    session's next number (`ObjectScene(first=hardware.next_recording(folder))`).
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
-        """Keep twin and session.
+        """Prepare the hand. The object does not move before the first call of `show`.
 
         Args:
-            twin: Whose object is moved.
-            session: To which the trajectories are added.
-            patience_s: Longest time in one stage (s of the twin's clock).
+            twin: Twin whose object the hand moves.
+            session: Session that receives the trajectories.
+            patience_s: Longest time in one stage of the guide, > 0 (s on the twin's clock).
 
         Raises:
             ValueError: `patience_s` is not positive.
@@ -35,16 +38,19 @@ class Hand(AutomaticPerson):
         self._twin, self._session = twin, session
         self._patience_s = patience_s
         self._seen: Stage | None = None  # stage of the last view
-        self._since_s = self._now_s = 0.0  # begin of that stage, and time of the last view
-        self._placed = False  # whether the object is on the pad
-        self._held_s: float | None = None  # time since which it is held, without a problem of the session
-        self._unseen = 0  # held poses in a row without a contact
+        self._since_s = self._now_s = 0.0  # begin of that stage, and time of the last view (s)
+        self._placed = False  # True if the object is on the pad
+        self._held_s: float | None = None  # time since which the object is held without a problem of the session (s)
+        self._unseen = 0  # held poses in a row without a visible contact
 
     def show(self, view: View) -> None:
-        """Send the command that a view asks for.
+        """Send the twin the command that the instruction in a view requires.
+
+        Args:
+            view: Newest images and instruction of `hardware.collect`.
 
         Raises:
-            ValueError: The guide waits for longer than `patience_s`, or sees no contact of many poses.
+            ValueError: One stage lasts longer than `patience_s`, or ten held poses in a row cause no visible contact.
         """
         super().show(view)
         entered, self._seen = view.stage is not self._seen, view.stage
@@ -64,12 +70,13 @@ class Hand(AutomaticPerson):
                 self._held_s, self._unseen = None, 0
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
-                f"the guide still asks `{view.instruction}` after {self._now_s - self._since_s:.1f} s "
-                f"(contact: {view.contact}, still: {view.still}): its thresholds do not suit the twin's images"
+                f"the guide still shows the instruction `{view.instruction}` after {self._now_s - self._since_s:.1f} s "
+                f"(contact: {view.contact}, still: {view.still}), so its thresholds do not suit the twin's images: "
+                "change the GuideConfig that hardware.collect receives"
             )
 
     def action(self) -> Action | None:
-        """Confirm in the review, and a release after which nothing moves."""
+        """Confirm each reviewed trajectory, and each release after which nothing moves. None: no action now."""
         if self._seen is Stage.RELEASE and self._now_s - self._since_s > _UNMOVED_S:
             return Action.CONFIRM
         return super().action()

@@ -1,4 +1,4 @@
-"""The light of the LEDs over time, and its mean over an exposure."""
+"""The brightness of the LEDs over time, and its mean over an exposure."""
 
 import bisect
 import math
@@ -6,41 +6,45 @@ from typing import NamedTuple
 
 from sts_jax.hardware import protocol
 
-_RISEN = 30.0  # rise times after which the target is reached, to 1e-13
+_RISEN = 30.0  # time constants after which the target counts as reached, because exp(-30) is 1e-13
 
 
 class Light(NamedTuple):
-    """The share of the LEDs' full power during an interval, 0 to 1."""
+    """The brightness of the LEDs during an interval, as a share of their full power, 0 to 1."""
 
-    mean: float
-    lowest: float
-    highest: float
+    mean: float  # mean share
+    lowest: float  # smallest share
+    highest: float  # largest share
 
 
 class _Change(NamedTuple):
-    """The share from one change of the levels to the next: it approaches `target` from `share`."""
+    """A change of the levels. From here to the next change, the brightness goes from `share` to `target`."""
 
-    time_s: float
-    share: float
-    target: float
+    time_s: float  # time of the change (s)
+    share: float  # share of the full power at this time
+    target: float  # share of the full power of the new levels
 
 
 class LightHistory:
-    """The levels of the LEDs over time.
+    """The brightness of the LEDs over time, as a share of their full power.
 
-    After a change at time t0, the share of the full power approaches its target a exponentially from s0:
+    After a change of the levels at time t0, the share approaches its new value exponentially:
 
-        share(t) = a + (s0 - a) exp(-(t - t0) / rise)
+        s(t) = a + (s0 - a) exp(-(t - t0) / tau)
 
-    The share of a state is the mean of its four levels over 255. The pulses of the modulation (31 kHz) are far shorter
-    than an exposure and therefore count with their mean. The object is not thread-safe.
+    The share is s0 at t0. Its new value a is the mean of the four levels divided by 255, and tau is `rise_s`. LEDs are
+    dimmed by pulses at 31 kHz. These pulses are far shorter than an exposure, so only their mean matters. The object
+    is not thread-safe.
     """
 
     def __init__(self, rise_s: float = 0.0):
         """Start with the lights off.
 
         Args:
-            rise_s: Time constant of the approach (s). At 0 the light follows the levels at once.
+            rise_s: Time constant tau, >= 0 (s). At 0, the brightness follows the levels at once.
+
+        Raises:
+            ValueError: `rise_s` is negative or not finite.
         """
         if not 0 <= rise_s < math.inf:
             raise ValueError(f"rise_s must be >= 0 and finite, got {rise_s}")
@@ -48,10 +52,14 @@ class LightHistory:
         self._changes = [_Change(-math.inf, 0.0, 0.0)]
 
     def set(self, time_s: float, levels: protocol.Levels) -> None:
-        """Record the levels from a time on (s). Times must not decrease. Unchanged levels are ignored.
+        """Record a change of the levels. Levels of unchanged mean are ignored.
+
+        Args:
+            time_s: Time of the change (s), not earlier than that of the last change.
+            levels: Duty cycles of the four channels, 0 to 255.
 
         Raises:
-            ValueError: The time is before that of the last change.
+            ValueError: `time_s` is earlier than the last change.
         """
         last, target = self._changes[-1], sum(levels) / (255 * len(levels))
         if time_s < last.time_s:
@@ -60,10 +68,14 @@ class LightHistory:
             self._changes.append(_Change(time_s, self._share(last, time_s), target))
 
     def over(self, start_s: float, end_s: float) -> Light:
-        """The mean (an exact integral), lowest and highest share between two times (s).
+        """The brightness between two times. The mean is an exact integral.
+
+        Args:
+            start_s: Begin of the interval (s).
+            end_s: End of the interval (s), later than `start_s`.
 
         Raises:
-            ValueError: The interval is empty.
+            ValueError: `start_s` is not less than `end_s`.
         """
         if not start_s < end_s:
             raise ValueError(f"start_s must be less than end_s, got {start_s} and {end_s}")
@@ -76,18 +88,19 @@ class LightHistory:
             if begin >= end:
                 break
             low, high = self._share(change, begin), self._share(change, end)
-            # The integral of the exponential is the rise time times its difference.
+            # The integral of (s0 - a) exp(-(t - t0) / tau) over the interval is tau times its decrease.
             integral += change.target * (end - begin) + self._rise_s * (low - high)
             shares += [low, high]
         lowest, highest = min(shares), max(shares)
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
 
     def forget(self, before_s: float) -> None:
-        """Drop the changes that no interval after a time (s) needs."""
+        """Delete the changes that are not needed for any interval after `before_s` (s)."""
         keep = bisect.bisect_right(self._changes, before_s, key=lambda change: change.time_s) - 1
         del self._changes[:keep]
 
     def _share(self, change: _Change, time_s: float) -> float:
+        """The share of the full power at a time after a change and before the next one."""
         if change.share == change.target or time_s - change.time_s >= _RISEN * self._rise_s:
             return change.target
         return change.target + (change.share - change.target) * math.exp((change.time_s - time_s) / self._rise_s)

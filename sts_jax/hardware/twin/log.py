@@ -1,4 +1,4 @@
-"""The twin's own log: the truth about each frame."""
+"""The twin's log: the ground truth of each frame."""
 
 import contextlib
 import dataclasses
@@ -11,31 +11,35 @@ from typing import Any, BinaryIO, TextIO
 
 @dataclasses.dataclass(frozen=True)
 class Exposure:
-    """The truth about one frame. Times are seconds of the twin's clock, which is `time.monotonic` when it is served."""
+    """The ground truth of one frame.
+
+    All times are on the twin's clock. If the twin is served, this clock is `time.monotonic`. A repeated frame (fault
+    `repeat`) has an index and a time of delivery of its own, and all other fields of the frame that it repeats.
+    """
 
     index: int  # number of the frame, from 0
-    start_s: float  # begin of the exposure
-    end_s: float  # end of the exposure
-    due_s: float  # time of delivery. A busy machine delivers later
-    light: float  # share of the LEDs' power during the exposure: mean
-    lowest: float  # lowest
-    highest: float  # and highest value
-    phase: str  # of the scene in the middle of the exposure: empty, held, moving or still
-    trajectory: int  # number of the trajectory, or -1 before the first
-    frame: int  # index of the drawn pose in the trajectory
-    pose: tuple[float, ...] | None  # mesh frame in the sensor frame (m, quaternion)
-    fault: str | None = None  # repeat, black or resize. The other fields of a repeated frame are those of its original
+    start_s: float  # begin of the exposure (s)
+    end_s: float  # end of the exposure (s)
+    due_s: float  # planned time of delivery (s). A busy machine delivers later
+    light: float  # mean brightness of the LEDs during the exposure, as a share of their full power
+    lowest: float  # smallest brightness during the exposure, as a share
+    highest: float  # largest brightness during the exposure, as a share
+    phase: str  # phase of the scene in the middle of the exposure: empty, held, moving or still
+    trajectory: int  # number of the current or last trajectory, or -1 before the first one
+    frame: int  # index of the rendered pose in the trajectory
+    pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
+    fault: str | None = None  # simulated fault of the frame: repeat, black, resize or None
 
 
 class Log:
-    """Writes one JSON line for each frame, and optionally the JPEG of each frame into one motion JPEG file."""
+    """Writes the ground truth of each frame as a JSON line, and the frames themselves into a motion JPEG file."""
 
     def __init__(self, path: str | os.PathLike | None, record: str | os.PathLike | None):
         """Create the files.
 
         Args:
-            path: Of the JSON lines, None: not written.
-            record: Of the motion JPEG file with the same frames in the same order, None: not written.
+            path: Path of the file for the JSON lines. None: no such file.
+            record: Path of the motion JPEG file, with the same frames in the same order. None: no such file.
 
         Raises:
             OSError: A file cannot be written.
@@ -48,10 +52,10 @@ class Log:
                 self._lines = files.enter_context(Path(path).open("w", buffering=1))
             if record is not None:
                 self._jpegs = files.enter_context(Path(record).open("wb", buffering=0))
-            self._files = files.pop_all()  # all are open
+            self._files = files.pop_all()  # keeps the files open after this block, because both could be opened
 
     def write(self, exposure: Exposure, jpeg: bytes) -> None:
-        """Write one frame. Both files are complete up to this frame afterwards."""
+        """Write one frame to both files without buffering."""
         with self._lock:
             if self._jpegs is not None:
                 self._jpegs.write(jpeg)
@@ -66,7 +70,16 @@ class Log:
 
 
 def read_log(path: str | os.PathLike) -> list[Exposure]:
-    """The frames of a log, in order. A line that is still being written is left out."""
+    """Read the frames of a log in the order in which they were written.
+
+    The log may still grow. An incomplete last line is ignored.
+
+    Args:
+        path: Path that `Twin` received as `log`.
+
+    Raises:
+        OSError: The file cannot be read.
+    """
     text = Path(path).read_text()
     rows: list[dict[str, Any]] = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
     return [Exposure(**row | {"pose": None if row["pose"] is None else tuple(row["pose"])}) for row in rows]

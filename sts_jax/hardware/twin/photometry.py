@@ -1,4 +1,4 @@
-"""From the two ends of the light to one frame of the camera: exposure, leakage, vignetting, noise, JPEG. NumPy only."""
+"""One camera frame from the images of a scene without and with light: blending, vignetting, noise and JPEG."""
 
 import dataclasses
 import math
@@ -7,28 +7,34 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-_FULL = 65535  # uint16 value of the linear light 1
-# Random numbers beyond those of one frame. The noise of each frame begins at another one of them
+_FULL = 65535  # uint16 value of full-scale linear light
+# Drawing noise for every frame is too slow, so one array of random numbers serves all frames. The array is longer than
+# a frame by this number, and each frame starts at another position in it.
 _SPARE = 1 << 20
-_STRIP = 1 << 18  # values that are processed at once, so that they stay in the processor's cache
+_STRIP = 1 << 18  # number of values that are processed at once, so that they stay in the processor's cache
 
 
 @dataclasses.dataclass(frozen=True)
 class Imperfections:
-    """The differences between the twin's camera and lights and ideal ones. All defaults are our choice."""
+    """Deviations of the twin's camera and lights from ideal ones. All defaults are our choice."""
 
-    exposure_s: float = 0.012  # s, time during which the camera integrates the light of one frame
-    lag_s: float = 0.04  # s, from the end of the exposure to the delivery of the frame. Assumed range: 0.015 to 0.12
-    jitter_s: float = 0.0  # s, largest random addition to the lag
-    rise_s: float = 0.0005  # s, time constant of the LEDs
-    leakage: float = 0.005  # share of the tactile light that remains when the LEDs are off
-    vignetting: float = 0.25  # share of the light that the lens loses in the corners, as the square of the distance
+    exposure_s: float = 0.012  # time during which the camera integrates the light of one frame (s)
+    # time from the end of the exposure to the delivery of the frame (s). We assume 0.015 to 0.12 s for real cameras
+    lag_s: float = 0.04
+    jitter_s: float = 0.0  # largest random addition to the lag (s)
+    rise_s: float = 0.0005  # time constant with which the LEDs approach a new level (s)
+    leakage: float = 0.005  # share of the LEDs' full light that remains when they are off
+    # share of the light that the lens loses in the corners. The loss grows with the square of the distance from the
+    # image's centre
+    vignetting: float = 0.25
     read_noise: float = 0.0015  # standard deviation of the noise in the dark, as a share of full-scale linear light
-    full_well: float = 8000.0  # electrons of a pixel at full scale. Shot noise is the square root of the electrons
-    jpeg_quality: int = 92  # of OpenCV's encoder, 1 to 100
+    # number of electrons of a pixel at full scale. The standard deviation of the shot noise is the square root of the
+    # number of electrons
+    full_well: float = 8000.0
+    jpeg_quality: int = 92  # quality of OpenCV's JPEG encoder, 1 to 100
 
     def __post_init__(self) -> None:
-        """Check the ranges.
+        """Check the fields.
 
         Raises:
             ValueError: A field is out of range. The message names it.
@@ -47,39 +53,54 @@ class Imperfections:
 
 
 class Ends(NamedTuple):
-    """One scene under both ends of the light, in linear light, as uint16 of shape (height, width, 3)."""
+    """The two images of a scene between which the light blends: LEDs off, and LEDs at full power.
 
-    visual: np.ndarray  # LEDs off
-    tactile: np.ndarray  # LEDs at full power
+    Both are in linear light, uint16 of shape (height, width, 3), where 65535 is full scale.
+    """
+
+    visual: np.ndarray  # image with the LEDs off
+    tactile: np.ndarray  # image with the LEDs at full power
 
 
 class Warp(NamedTuple):
-    """The way from the rendered view to the camera's raw view. `lens_warp` makes it of a lens."""
+    """The mapping from a rendered image to the raw image of a camera with lens distortion. See `lens_warp`."""
 
-    maps: tuple[np.ndarray, np.ndarray]  # of `cv2.remap`, of the raw size times a whole number of samples
-    size: tuple[int, int]  # (height, width) of the raw view, pixels
+    maps: tuple[np.ndarray, np.ndarray]  # maps for `cv2.remap`, with n x n samples per raw pixel, which are averaged
+    size: tuple[int, int]  # (height, width) of the raw image (pixels)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """The raw view of an image in linear light. It is dark where it shows more than the image."""
+        """Convert a rendered image to the raw image.
+
+        Args:
+            image: Rendered image in linear light, shape (height, width, 3).
+
+        Returns:
+            Raw image of the same type. Pixels that look beyond the edge of `image` are 0.
+        """
         sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)
 
 
 class Blender:
-    """Makes frames of the two ends of a scene.
+    """Makes camera frames from the images of a scene without and with light.
 
-    `ends` takes the time of a few frames and is called once for each pose. `frame` is called for each frame, by one
+    Call `ends` once for each pose, because it takes as long as a few frames. Call `frame` for each frame, from one
     thread at a time.
     """
 
     def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, warp: Warp | None = None, seed: int = 0):
-        """Prepare the tables.
+        """Prepare the lookup tables.
 
         Args:
-            imperfections: Of these, `Blender` applies leakage, vignetting and noise.
-            exposure: Exposure of the visual stream over that of the tactile one, `Room.exposure` of the sensor.
-            warp: From the rendered view to the camera's raw view. Default: they are the same.
-            seed: Of the noise.
+            imperfections: Deviations of the camera. `Blender` uses `leakage`, `vignetting`, `read_noise` and
+                `full_well`.
+            exposure: Exposure of the visual stream divided by that of the tactile stream (`Sensor().room.exposure`),
+                > 0.
+            warp: Lens distortion. Default: none.
+            seed: Seed of the noise.
+
+        Raises:
+            ValueError: `exposure` is not positive and finite.
         """
         if not 0 < exposure < math.inf:
             raise ValueError(f"exposure must be positive and finite, got {exposure}")
@@ -89,9 +110,8 @@ class Blender:
         self._rng = np.random.default_rng(seed)
         self._noise = np.zeros(0, np.float32)
         self._begin = 0
-        self._step = (
-            2 * int(self._rng.integers(_SPARE // 2)) + 1
-        )  # odd, so that it passes all places before a repetition
+        # _SPARE is a power of 2. An odd step therefore visits all start positions before it repeats one.
+        self._step = 2 * int(self._rng.integers(_SPARE // 2)) + 1
         values = np.arange(_FULL + 1) / _FULL
         self._to_linear = np.round(_FULL * _linear(values)).astype(np.uint16)
         self._to_srgb = np.round(255 * _srgb(values)).astype(np.uint8)
@@ -99,25 +119,47 @@ class Blender:
         self._deviation = (_FULL * np.sqrt(variance)).astype(np.float32)
 
     def ends(self, visual: np.ndarray, tactile: np.ndarray) -> Ends:
-        """Convert both ends to linear light, and apply the lens and its vignetting.
+        """Convert both images of a scene to linear light, and apply the lens distortion and the vignetting.
 
         Args:
-            visual: Image with the LEDs off, sRGB in [0, 1], (height, width, 3), `Frame.visual`.
-            tactile: Image with the LEDs at full power, `Frame.tactile`.
+            visual: Image with the LEDs off (`Frame.visual`), sRGB in [0, 1], shape (height, width, 3).
+            tactile: Image with the LEDs at full power (`Frame.tactile`), of the same form.
+
+        Raises:
+            ValueError: An image has another shape.
         """
         return Ends(self._end(visual), self._end(tactile))
 
     def blend(self, ends: Ends, light: float) -> np.ndarray:
-        """The frame without noise, uint8 RGB. It equals `sts_jax.expose` without leakage, vignetting and warp.
+        """Make a frame without noise.
+
+        Without leakage, vignetting and lens distortion, the frame equals the image of `sts_jax.expose` up to rounding.
 
         Args:
-            ends: Of the scene.
-            light: Mean share of the LEDs' power during the exposure, 0 to 1.
+            ends: Images of the scene, as `Blender.ends` returns them.
+            light: Mean brightness of the LEDs during the exposure, as a share of their full power, 0 to 1.
+
+        Returns:
+            Frame, uint8 RGB of shape (height, width, 3).
+
+        Raises:
+            ValueError: `light` is out of range.
         """
         return self._to_srgb[self._mixed(ends, light)]
 
     def frame(self, ends: Ends, light: float) -> np.ndarray:
-        """The frame with noise, uint8 RGB. See `blend` for the arguments."""
+        """Make a frame with noise.
+
+        Args:
+            ends: Images of the scene, as `Blender.ends` returns them.
+            light: Mean brightness of the LEDs during the exposure, as a share of their full power, 0 to 1.
+
+        Returns:
+            Frame, uint8 RGB of shape (height, width, 3).
+
+        Raises:
+            ValueError: `light` is out of range.
+        """
         linear = self._mixed(ends, light).reshape(-1)
         if len(self._noise) < linear.size:
             self._noise = self._rng.standard_normal(linear.size + _SPARE, np.float32)
@@ -134,15 +176,16 @@ class Blender:
         return out.reshape(ends.visual.shape)
 
     def _mixed(self, ends: Ends, light: float) -> np.ndarray:
-        """The blend of `sts_jax.expose` in linear light, uint16."""
+        """Blend both images by the equation of `sts_jax.expose`, in linear light, uint16."""
         if not 0 <= light <= 1:
-            raise ValueError(f"light must be a share from 0 to 1, got {light}")
+            raise ValueError(f"light must be a share of the LEDs' full power from 0 to 1, got {light}")
         light = self._imperfections.leakage + (1 - self._imperfections.leakage) * light
         bright = light * self._exposure
         share = bright / (1 - light + bright)
         return cv2.addWeighted(ends.visual, 1 - share, ends.tactile, share, 0)
 
     def _end(self, image: np.ndarray) -> np.ndarray:
+        """Convert one sRGB image to linear light, uint16, and apply the lens distortion and the vignetting."""
         image = np.asarray(image)
         if image.ndim != 3 or image.shape[2] != 3:
             raise ValueError(f"image must have the shape (height, width, 3), got {image.shape}")
@@ -159,7 +202,15 @@ class Blender:
 
 
 def encode(image: np.ndarray, quality: int) -> bytes:
-    """The JPEG of a uint8 RGB image."""
+    """Encode an image as JPEG.
+
+    Args:
+        image: Image, uint8 RGB of shape (height, width, 3).
+        quality: Quality of OpenCV's encoder, 1 to 100.
+
+    Raises:
+        ValueError: OpenCV cannot encode the image.
+    """
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ValueError(f"OpenCV cannot encode an image of shape {image.shape} and type {image.dtype}")
@@ -167,18 +218,22 @@ def encode(image: np.ndarray, quality: int) -> bytes:
 
 
 def decode(data: bytes) -> np.ndarray:
-    """The uint8 RGB image of a JPEG."""
+    """Decode a JPEG image, and return it as uint8 RGB of shape (height, width, 3).
+
+    Raises:
+        ValueError: The bytes are not a JPEG image.
+    """
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise ValueError(f"{len(data)} bytes are not a JPEG image")
+        raise ValueError(f"data must be a JPEG image, but its {len(data)} bytes cannot be decoded")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _linear(srgb: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values (IEC 61966-2-1)."""
+    """Convert sRGB values in [0, 1] to linear light (IEC 61966-2-1)."""
     return np.where(srgb > 0.04045, ((srgb + 0.055) / 1.055) ** 2.4, srgb / 12.92)
 
 
 def _srgb(linear: np.ndarray) -> np.ndarray:
-    """sRGB of linear light (IEC 61966-2-1)."""
+    """Convert linear light in [0, 1] to sRGB values (IEC 61966-2-1)."""
     return np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)

@@ -1,4 +1,4 @@
-"""The pseudo-terminal of the twin's LED controller."""
+"""The serial port of the twin's LED controller, which is a pseudo-terminal."""
 
 import contextlib
 import os
@@ -12,23 +12,24 @@ from pathlib import Path
 from sts_jax.hardware.twin import faults
 from sts_jax.hardware.twin.device import Twin
 
-_WAIT_S = 0.003  # s, longest wait for bytes. The watchdog and late answers are checked as often
-_SPEED = termios.B115200  # of the protocol
+_WAIT_S = 0.003  # longest wait for bytes, after which the watchdog and late answers are checked (s)
+_SPEED = termios.B115200  # baud rate of the protocol
 
 
 class LedPort:
-    """A pseudo-terminal that speaks the LED protocol, with a thread that serves it.
+    """A pseudo-terminal that answers requests of the LED protocol, in a thread of its own.
 
-    A host that sets another baud rate than 115200 sends and receives unreadable bytes, as on a real line.
+    As on a real serial line, a host that opens the port at another baud rate than 115200 receives unreadable bytes, and
+    its requests are not executed.
     """
 
     def __init__(self, twin: Twin, link: str | os.PathLike | None = None):
         """Open the pseudo-terminal and start the thread.
 
         Args:
-            twin: On the real clock.
-            link: Symbolic link to the pseudo-terminal, which gives the port a name that does not change. A link that
-                exists is replaced.
+            twin: Twin that runs on the real clock.
+            link: Path at which a symbolic link to the pseudo-terminal is made, so that the port has a fixed name. An
+                existing symbolic link is replaced. Default: no link.
 
         Raises:
             FileExistsError: `link` exists and is not a symbolic link.
@@ -37,10 +38,10 @@ class LedPort:
         self._twin = twin
         self._link = None if link is None else Path(link)
         self._queue = faults.Queue()
-        self._lock = threading.Lock()  # of the queue and the absence
-        self._absent_s: float | None = None  # requested absence of the port
-        self._late: list[tuple[float, bytes]] = []
-        self._partial = b""
+        self._lock = threading.Lock()  # protects the queue and `_absent_s`
+        self._absent_s: float | None = None  # time for which the port is to vanish (s), if the fault was injected
+        self._late: list[tuple[float, bytes]] = []  # delayed answers, each with the time at which it is sent
+        self._partial = b""  # received bytes of an incomplete line
         self._open()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="twin's LED port", daemon=True)
@@ -48,11 +49,11 @@ class LedPort:
 
     @property
     def device(self) -> str:
-        """Name of the port: the link if there is one."""
+        """Name of the port: that of the symbolic link if there is one, else that of the pseudo-terminal."""
         return self._name if self._link is None else str(self._link)
 
     def inject(self, fault: faults.Fault) -> None:
-        """Inject `deaf`, `lost`, `late`, `doubled`, `garbled` or `vanish`."""
+        """Simulate a fault of the kind `deaf`, `lost`, `late`, `doubled`, `garbled` or `vanish`."""
         with self._lock:
             if fault.kind == "vanish":
                 self._absent_s = fault.seconds
@@ -67,8 +68,10 @@ class LedPort:
 
     def _open(self) -> None:
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
-            raise FileExistsError(f"{self._link} exists and is not a symbolic link: choose another name for the port")
-        # The slave stays open here. Otherwise reading fails while no host has opened it.
+            raise FileExistsError(
+                f"link is {self._link}, which exists and is not a symbolic link: choose another name for the port"
+            )
+        # The slave stays open in this process, because reading the master fails while nobody has opened the slave.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -106,7 +109,7 @@ class LedPort:
                     self._receive(os.read(self._master, 4096))
 
     def _vanish(self, seconds: float) -> None:
-        """Remove the port for a time. The controller and its watchdog run on, as with a power supply of their own."""
+        """Remove the port for a time. The controller and its watchdog keep running, as with their own power supply."""
         self._close()
         self._partial, self._late = b"", []
         until = time.monotonic() + seconds
@@ -141,7 +144,7 @@ class LedPort:
         return attributes[4] == attributes[5] == _SPEED
 
     def _send(self, data: bytes) -> None:
-        """Send bytes. They are lost if no host reads and the line's buffer is full."""
+        """Send bytes to the host. If no host reads and the buffer of the line is full, they are lost."""
         if data:
             with contextlib.suppress(BlockingIOError):
                 os.write(self._master, data)

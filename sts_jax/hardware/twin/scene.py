@@ -1,4 +1,4 @@
-"""The scene over time: an empty pad, an object that is held, moves after its release, and lies still."""
+"""The scene in front of the twin's camera: an empty pad, or an object that is held, moves and lies still."""
 
 import abc
 import bisect
@@ -17,13 +17,13 @@ from sts_jax.hardware.twin.photometry import Blender, Ends
 from sts_jax.objects import Body
 from sts_jax.sensor import Sensor
 
-MOTION_RATE = 10.0  # drawn poses per second of a moving object, up to the size below
-_MOTION_PIXELS = 640 * 480  # a larger view takes longer to render and has proportionally fewer poses, at least 1
-STILL_M = 0.0002  # m, an object whose origin remains within this distance of its last place is still
-STILL_RAD = 0.01  # rad, the same for its orientation
-_BATCH = 16  # trajectories that are simulated at once
-_ATTEMPTS = 2  # batches without a settled trajectory before giving up
-_EVENTS = 64  # remembered changes of the scene. Exposures lie at most a few of them back
+MOTION_RATE = 10.0  # rendered poses per second of a moving object, in views of up to _MOTION_PIXELS
+_MOTION_PIXELS = 640 * 480  # a larger view takes longer to render, so it has proportionally fewer poses, at least 1
+STILL_M = 0.0002  # largest distance of an object at rest from its last position (m)
+STILL_RAD = 0.01  # largest angle of an object at rest from its last orientation (rad)
+_BATCH = 16  # trajectories that are simulated together
+_ATTEMPTS = 2  # batches without a settled trajectory after which an error is raised
+_EVENTS = 64  # remembered changes of the scene. An exposure is at most a few changes old when its frame is made
 _NOWHERE = np.array([0, 0, -1, 1, 0, 0, 0], np.float32)  # pose of an object that is not in view
 
 
@@ -31,66 +31,103 @@ class Phase(enum.StrEnum):
     """Phase of the scene."""
 
     EMPTY = "empty"  # no object is on the pad
-    HELD = "held"  # a hand holds the object on the pad in an unstable pose. The hand is not drawn
-    MOVING = "moving"  # it was let go
-    STILL = "still"  # it is at rest, or has left the pad
+    HELD = "held"  # a hand, which is not rendered, holds the object on the pad in an unstable pose
+    MOVING = "moving"  # the object was released and moves
+    STILL = "still"  # the object is at rest, or has left the pad
 
 
 class Seen(NamedTuple):
-    """The scene at one moment."""
+    """The state of the scene at one time."""
 
-    phase: Phase
-    trajectory: int  # number of the trajectory, from 0. With an empty pad that of the last one, or -1
-    frame: int  # index of the drawn pose in the trajectory
-    pose: tuple[float, ...] | None  # mesh frame in the sensor frame (m, quaternion), or None without an object
+    phase: Phase  # phase of the scene
+    trajectory: int  # number of the current trajectory, from 0. In an empty scene, number of the last one, or -1
+    frame: int  # index of the rendered pose in the trajectory
+    pose: tuple[float, ...] | None  # object's position (m) and quaternion (w, x, y, z), or None without an object
 
 
 class Scene(abc.ABC):
-    """The contents of the twin's view. `Twin` calls `at` and `command` one at a time."""
+    """Base class of the scenes in front of the twin's camera.
 
-    exposure: float = 1.0  # of the visual stream over that of the tactile one, `Room.exposure`
+    `Twin` never calls `at` and `command` at the same time.
+    """
+
+    exposure: float = 1.0  # exposure of the visual stream divided by that of the tactile stream (`Room.exposure`)
 
     @abc.abstractmethod
     def at(self, time_s: float) -> Seen:
-        """The scene at a time (s), not before the last but a few commands."""
+        """Return the state of the scene at a time.
+
+        Args:
+            time_s: Time on the twin's clock (s). It may lie before the last commands, but only a few of them.
+        """
 
     @abc.abstractmethod
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """The two ends of the light of a moment. Takes the time of a rendering unless `prepare` was called."""
+        """Return the images of a state of the scene without light and at full light.
+
+        The images are rendered now unless `prepare` has done so before.
+
+        Args:
+            seen: State of the scene, as `at` returns it.
+            blender: Camera that converts the rendered images.
+        """
 
     def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Do the work that a command needs, so that no later call of `ends` takes long. Threads may call it."""
+        """Render the images that a command needs, so that later calls of `ends` return at once.
+
+        This method may be called from any thread.
+
+        Args:
+            command: `hold`, `release` or `clear`.
+            blender: Camera that converts the rendered images.
+        """
 
     def command(self, command: str, time_s: float) -> None:
-        """Apply `release`, `hold` or `clear` from a time on (s), which must not decrease.
+        """Change the scene.
+
+        Args:
+            command: `hold`, `release` or `clear`.
+            time_s: Time on the twin's clock from which the change applies (s). It must not decrease between calls.
 
         Raises:
-            ValueError: The command is unknown or not possible in the current phase. The message names the remedy.
+            ValueError: The command is unknown or not possible in the current phase, or `time_s` has decreased.
         """
-        raise ValueError(f"command {command!r} is not possible: this scene does not change")
+        raise ValueError(
+            f"command is {command!r}, but a {type(self).__name__} does not change: use a scene with an object, such as "
+            "ObjectScene"
+        )
 
     def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Begin to work ahead in a thread. The virtual clock does not need it."""
+        """Start a thread that renders images before they are needed. A twin on its virtual clock does not need it.
+
+        Args:
+            blender: Camera that converts the rendered images.
+        """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
-        """End the thread."""
+        """Stop the thread that `start` has started, if there is one."""
 
 
 class Picture(Scene):
-    """Two constant images, such as a calibration board under both ends of the light."""
+    """A scene of two constant images, such as those of a calibration board without and with light."""
 
     def __init__(self, visual: np.ndarray, tactile: np.ndarray):
-        """Keep the images, sRGB in [0, 1], (height, width, 3), of the LEDs off and at full power."""
+        """Store the images.
+
+        Args:
+            visual: Image with the LEDs off, sRGB in [0, 1], shape (height, width, 3).
+            tactile: Image with the LEDs at full power, of the same form.
+        """
         self._images = np.asarray(visual), np.asarray(tactile)
         self._ends: tuple[Blender, Ends] | None = None
 
     def at(self, time_s: float) -> Seen:
-        """See `Scene.at`."""
+        """Return the same state for all times, see `Scene.at`."""
         del time_s
         return Seen(Phase.STILL, 0, 0, None)
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """See `Scene.ends`."""
+        """Return the constant images, see `Scene.ends`."""
         del seen
         if self._ends is None or self._ends[0] is not blender:
             self._ends = blender, blender.ends(*self._images)
@@ -100,32 +137,39 @@ class Picture(Scene):
 class _Motion(NamedTuple):
     """One simulated trajectory."""
 
-    pose: np.ndarray  # (frames, 7)
-    wrench: np.ndarray  # (frames, 6)
-    rate: float  # frames/s
-    rest: int  # first frame from which on the object is still
-    outcome: str
+    pose: np.ndarray  # mesh frame in the sensor frame: position (m) and quaternion, shape (frames, 7)
+    wrench: np.ndarray  # force (N) and moment (N m) of the pad on the object, shape (frames, 6)
+    rate: float  # frame rate of the simulation (frames/s)
+    rest: int  # first frame from which on the object is at rest
+    outcome: str  # outcome in words
 
     def drawn(self, elapsed_s: float, motion_rate: float) -> int:
-        """The pose that is drawn at a time since the release (s): the last one of the motion's rate."""
+        """The index of the pose that is rendered at a time after the release.
+
+        A moving object changes its rendered pose `motion_rate` times per second. From rest on, it is the last pose.
+
+        Args:
+            elapsed_s: Time since the release (s).
+            motion_rate: Rendered poses per second of the motion.
+        """
         frame = round(int(elapsed_s * motion_rate) * self.rate / motion_rate)
         return frame if elapsed_s * self.rate < self.rest and frame < self.rest else len(self.pose) - 1
 
     def indices(self, motion_rate: float) -> list[int]:
-        """All poses that are drawn, the first one and the one at rest before the others."""
+        """The indices of all poses that are rendered: the first and the last one, then those of the motion."""
         steps = int(self.rest / self.rate * motion_rate) + 1
         moving = [self.drawn(step / motion_rate, motion_rate) for step in range(steps)]
         return list(dict.fromkeys([0, len(self.pose) - 1, *moving]))
 
 
 class ObjectScene(Scene):
-    """An object that is held on the pad and released, once in each trajectory of a scenario.
+    """A scene with an object that is held on the pad and released, once in each trajectory of a scenario.
 
-    The scene begins empty. `hold` places the object in the first pose of the next trajectory, `release` lets it go, and
-    `clear` takes it away. From the release on, the poses of the trajectory are drawn at `motion_rate` until the object
-    is still. The drawn pose is then the last one.
+    The scene is empty at first. The command `hold` places the object in the first pose of the next trajectory,
+    `release` lets it go, and `clear` takes it away. After the release, the scene shows `motion_rate` poses of the
+    trajectory per second until the object is at rest, and the last pose from then on.
 
-    Trajectories that have not settled at the end of the simulation are left out.
+    A simulated trajectory in which the object has not come to rest at the end is skipped.
     """
 
     def __init__(
@@ -139,23 +183,23 @@ class ObjectScene(Scene):
         seed: int = 0,
         first: int = 0,
     ):
-        """Describe the scene. Nothing is simulated yet.
+        """Prepare the scene. The simulation starts when a trajectory is needed.
 
         Args:
-            body: The object.
-            sensor: Default: the paper's.
-            scenario: Starts and motion. Default: `physics.Released`.
-            resolution: (height, width) of the rendered view, pixels.
-            motion_rate: Drawn poses per second of the motion. Each one is rendered once. Default: 10 up to 640x480
-                pixels, and proportionally fewer for larger views.
-            seed: Of the trajectories.
-            first: Number of the first trajectory, to continue an earlier scene.
+            body: Object on the pad.
+            sensor: Constants of the sensor. Default: `Sensor()`, the paper's sensor.
+            scenario: Scenario whose trajectories the object follows. Default: `physics.Released()`.
+            resolution: (height, width) of the rendered view (pixels).
+            motion_rate: Rendered poses per second of a moving object, > 0. Each pose is rendered once. Default: 10 for
+                views of up to 640 x 480 pixels, and proportionally fewer for larger views, but at least 1.
+            seed: Seed of the trajectories.
+            first: Number of the first trajectory, >= 0. Use it to continue an earlier scene of the same seed.
 
         Raises:
-            ValueError: A value is out of range.
+            ValueError: `first`, `motion_rate` or a field of the scenario is out of range.
         """
         if first < 0:
-            raise ValueError(f"first must be >= 0, got {first}")
+            raise ValueError(f"first is the number of a trajectory and must be >= 0, got {first}")
         if motion_rate is None:
             motion_rate = max(1.0, MOTION_RATE * min(1.0, _MOTION_PIXELS / math.prod(resolution)))
         if not 0 < motion_rate < float("inf"):
@@ -170,23 +214,34 @@ class ObjectScene(Scene):
         self._key = jax.random.key(seed)
         self._events: list[tuple[float, Phase, int]] = [(-float("inf"), Phase.EMPTY, first - 1)]
         self._batches = 0
-        self._motions: list[_Motion] = []  # all so far. Their poses take a few kilobytes each
-        self._rendered: dict[tuple[int, int], Ends] = {}  # by trajectory and frame. (-1, 0) is the empty pad
-        self._working = threading.Lock()  # one simulation or rendering at a time
+        self._motions: list[_Motion] = []  # all trajectories so far, which take a few kilobytes each
+        self._rendered: dict[tuple[int, int], Ends] = {}  # images by trajectory and frame. (-1, 0) is the empty pad
+        self._working = threading.Lock()  # lets one simulation or rendering run at a time
         self._wake, self._stop = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
     @property
     def scenario(self) -> physics.Scenario:
-        """The scenario that the trajectories follow."""
+        """The scenario of the trajectories."""
         return self._scenario
 
     def outcome(self, trajectory: int) -> str:
-        """The outcome of a trajectory in words, as the scenario names it."""
+        """The outcome of a trajectory in words, such as "topples" (`Scenario.named`).
+
+        Args:
+            trajectory: Number of the trajectory, from 0. It is simulated now if this has not happened yet.
+
+        Raises:
+            ValueError: No trajectory of the scenario comes to rest.
+        """
         return self._motion(trajectory).outcome
 
     def at(self, time_s: float) -> Seen:
-        """See `Scene.at`."""
+        """Return the state of the scene at a time (s), see `Scene.at`.
+
+        Raises:
+            ValueError: No trajectory of the scenario comes to rest.
+        """
         index = bisect.bisect_right(self._events, time_s, key=lambda event: event[0]) - 1
         since_s, phase, number = self._events[max(index, 0)]
         if phase is Phase.EMPTY:
@@ -198,13 +253,13 @@ class ObjectScene(Scene):
         return Seen(phase, number, frame, tuple(float(value) for value in motion.pose[frame]))
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """See `Scene.ends`."""
+        """Return the images of a state without light and at full light, see `Scene.ends`. Each is rendered once."""
         if seen.phase is Phase.EMPTY:
             return self._render(-1, 0, blender)
         return self._render(seen.trajectory, seen.frame, blender)
 
     def prepare(self, command: str, blender: Blender) -> None:
-        """See `Scene.prepare`."""
+        """Render the images that a command needs, see `Scene.prepare`."""
         number = self._events[-1][2]
         match command:
             case "hold":
@@ -216,10 +271,14 @@ class ObjectScene(Scene):
                 self._render(-1, 0, blender)
 
     def command(self, command: str, time_s: float) -> None:
-        """See `Scene.command`."""
+        """Hold, release or remove the object, see `Scene.command`.
+
+        Raises:
+            ValueError: The command is unknown, `release` comes without a held object, or `time_s` has decreased.
+        """
         last_s, _, number = self._events[-1]
         if time_s < last_s:
-            raise ValueError(f"time_s must be at least that of the last command, {last_s}, got {time_s}")
+            raise ValueError(f"time_s must be at least {last_s} s, the time of the last command, got {time_s} s")
         phase = self.at(time_s).phase
         match command:
             case "hold":
@@ -229,16 +288,18 @@ class ObjectScene(Scene):
             case "clear":
                 self._events.append((time_s, Phase.EMPTY, number))
             case "release":
-                raise ValueError(f"nothing can be released: the phase is {phase}. Send hold first")
+                raise ValueError(
+                    f"command is 'release', but no object is held, because the phase is '{phase}'. Send hold first"
+                )
             case _:
-                raise ValueError(f"unknown command {command!r}: it must be release, hold or clear")
+                raise ValueError(f"command must be 'hold', 'release' or 'clear', got {command!r}")
         del self._events[:-_EVENTS]
         for key in [key for key in self._rendered if 0 <= key[0] < self._events[-1][2] - 1]:
             del self._rendered[key]
         self._wake.set()
 
     def start(self, blender: Blender) -> None:
-        """See `Scene.start`. The thread renders the current trajectory and the first pose of the next one."""
+        """Start a thread that renders the empty pad, the current trajectory and the next one (`Scene.start`)."""
         if self._thread is None:
             self._stop.clear()
             self._wake.set()
@@ -246,7 +307,7 @@ class ObjectScene(Scene):
             self._thread.start()
 
     def close(self) -> None:
-        """See `Scene.close`. A rendering that has begun is finished first."""
+        """Stop the thread. If it is rendering an image, it completes this image first."""
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
@@ -254,7 +315,7 @@ class ObjectScene(Scene):
             self._thread = None
 
     def _work(self, blender: Blender) -> None:
-        """Render ahead: the empty pad, the current trajectory, and the beginning of the next one."""
+        """Render the empty pad, the current trajectory and the next one, and start again after each command."""
         while not self._stop.is_set():
             self._wake.wait()
             self._wake.clear()
@@ -267,7 +328,8 @@ class ObjectScene(Scene):
                     self._render(trajectory, frame, blender)
 
     def _motion(self, number: int) -> _Motion:
-        if number < len(self._motions):  # without waiting for a rendering
+        """The trajectory with a number, which is simulated if necessary."""
+        if number < len(self._motions):  # before the lock, so that nobody waits for a rendering in another thread
             return self._motions[number]
         with self._working:
             attempts = 0
@@ -276,14 +338,14 @@ class ObjectScene(Scene):
                 attempts = 0 if found else attempts + 1
                 if attempts == _ATTEMPTS:
                     raise ValueError(
-                        f"none of {_ATTEMPTS * _BATCH} trajectories has settled within {self._scenario.frames} frames: "
-                        "give the scenario more frames"
+                        f"the object comes to rest in none of {_ATTEMPTS * _BATCH} trajectories, which have "
+                        f"scenario.frames = {self._scenario.frames} frames each: give the scenario more frames"
                     )
                 self._motions += found
             return self._motions[number]
 
     def _simulate(self) -> list[_Motion]:
-        """Simulate the next batch, and keep the trajectories that have settled."""
+        """Simulate the next batch of trajectories, and return those in which the object comes to rest."""
         key = jax.random.fold_in(self._key, self._batches)
         self._batches += 1
         found = physics.simulate(key, self._body, self.sensor, self._scenario, num=_BATCH)
@@ -295,7 +357,7 @@ class ObjectScene(Scene):
         ]
 
     def _render(self, trajectory: int, frame: int, blender: Blender) -> Ends:
-        """The two ends of one pose, from the cache if possible."""
+        """The images of one pose without light and at full light, rendered or from the cache."""
         if (ends := self._rendered.get((trajectory, frame))) is not None:
             return ends
         pose, wrench = _NOWHERE, np.zeros(6, np.float32)
@@ -312,7 +374,7 @@ class ObjectScene(Scene):
 
 
 def _rest(pose: np.ndarray) -> int:
-    """The first frame from which on all poses are close to the last one."""
+    """The first frame from which on all poses (frames, 7) are close to the last one."""
     apart = np.linalg.norm(pose[:, :3] - pose[-1, :3], axis=1)
     turned = 2 * np.arccos(np.clip(np.abs(pose[:, 3:] @ pose[-1, 3:]), 0, 1))
     moving = np.flatnonzero((apart > STILL_M) | (turned > STILL_RAD))

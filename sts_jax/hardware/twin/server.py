@@ -1,4 +1,4 @@
-"""`Served`: a twin behind a serial port and a camera stream, on the real clock."""
+"""`Served`: serves a twin on the real clock, with a serial port and a camera stream."""
 
 import ipaddress
 import os
@@ -11,11 +11,11 @@ from sts_jax.hardware.twin.device import Twin
 from sts_jax.hardware.twin.port import LedPort
 from sts_jax.hardware.twin.stream import CAMERA, CameraThread, WebServer
 
-_OPERATE_S = 0.05  # s, period of the checks of `release_every`
+_OPERATE_S = 0.05  # period with which `release_every` is checked (s)
 
 
 class Served:
-    """A twin that other processes use as if it were a sensor.
+    """A running server through which other processes use a twin as if it were a real sensor.
 
     ```python
     with Twin(ObjectScene(body)) as twin, Served(twin) as served:
@@ -23,8 +23,8 @@ class Served:
         ...
     ```
 
-    Threads serve the pseudo-terminal, the camera, each HTTP connection, the renderer and `release_every`. `close` ends
-    all of them.
+    The server runs in threads of this process: one each for the serial port, the camera, the rendering, the random
+    releases of `release_every`, and each HTTP connection. `close` stops all of them.
     """
 
     def __init__(
@@ -35,17 +35,19 @@ class Served:
         host: str = "127.0.0.1",
         http_port: int = 0,
     ):
-        """Start to serve. The twin's clock becomes `time.monotonic`.
+        """Start to serve the twin. Its clock becomes `time.monotonic`.
 
         Args:
-            twin: Whose virtual clock has not advanced.
-            link: Symbolic link that gives the serial port a fixed name.
-            host: Address of the interface on which HTTP listens. Other machines reach an address that is not loopback,
-                and there is no password.
-            http_port: 0: a free port.
+            twin: Twin whose virtual clock has not advanced yet.
+            link: Path at which a symbolic link to the serial port is made, so that the port has a fixed name. Default:
+                no link.
+            host: Address on which the HTTP server listens. With another address than that of the loopback interface,
+                other machines can connect, and there is no password.
+            http_port: TCP port of the HTTP server. 0 selects a free one.
 
         Raises:
-            OSError: The address or the link cannot be used. The message names it.
+            RuntimeError: The virtual clock of the twin has advanced.
+            OSError: `host`, `http_port` or `link` cannot be used. The message names it.
         """
         twin.run_on(time.monotonic)
         self._twin = twin
@@ -79,18 +81,18 @@ class Served:
 
     @property
     def url(self) -> str:
-        """URL of the HTTP server."""
+        """URL of the HTTP server, such as `http://127.0.0.1:45253`."""
         host, port = self._web.server_address[:2]
         return f"http://{host!s}:{port}"
 
     @property
     def camera(self) -> str:
-        """URL of the camera, for `cv2.VideoCapture`."""
+        """URL of the camera stream, for `cv2.VideoCapture`."""
         return self.url + CAMERA
 
     @property
     def description(self) -> str:
-        """How to connect, and from where."""
+        """A text of five lines: all addresses, and the machines that can connect to them."""
         host = str(self._web.server_address[0])
         reach = (
             f"{host} is the loopback interface: only this machine can connect."
@@ -105,7 +107,7 @@ class Served:
         )
 
     def inject(self, fault: faults.Fault) -> None:
-        """Inject a fault into camera, controller or connections."""
+        """Simulate a fault of the camera, the LED controller or a connection."""
         if fault.kind in faults.DEVICE_KINDS:
             self._twin.inject(fault)
         elif fault.kind == "drop":
@@ -114,7 +116,7 @@ class Served:
             self._leds.inject(fault)
 
     def close(self) -> None:
-        """End all threads, close port and sockets, and remove the link. Closing twice is allowed."""
+        """Stop all threads, close the serial port and all sockets, and remove the link. Closing twice is allowed."""
         if self._stop.is_set():
             return
         self._stop.set()

@@ -1,4 +1,4 @@
-"""The twin's camera as motion JPEG over HTTP, and its commands."""
+"""The HTTP server of a twin, with the camera's frames as motion JPEG, the state and the commands."""
 
 import contextlib
 import dataclasses
@@ -17,10 +17,10 @@ from sts_jax.hardware.twin.device import Made, Twin
 CAMERA = "/camera"
 COMMANDS = ("hold", "release", "clear")
 _BOUNDARY = "frame"
-_WAIT_S = 0.1  # s, period in which threads see that they must end
-_SEND_S = 10.0  # s, longest wait for a client that takes no bytes
-_BUFFER = 1 << 16  # bytes of the connection's send buffer. A larger one makes frames of a slow client older
-_KEPT = 32  # frames between exposure and delivery
+_WAIT_S = 0.1  # longest time until waiting threads notice that they must stop (s)
+_SEND_S = 10.0  # longest wait for a client that reads nothing (s)
+_BUFFER = 1 << 16  # size of a connection's send buffer (bytes). With a larger one, a slow client gets older frames
+_KEPT = 32  # largest number of frames that wait for their delivery
 
 
 class CameraThread:
@@ -38,22 +38,30 @@ class CameraThread:
 
     @property
     def stopped(self) -> bool:
-        """Whether the camera has ended."""
+        """True after `close` was called."""
         return self._stop.is_set()
 
     def join(self) -> None:
-        """Add a client."""
+        """Register a client. Frames are produced while at least one client is registered."""
         with self._changed:
             self._clients += 1
             self._changed.notify_all()
 
     def leave(self) -> None:
-        """Remove a client."""
+        """Remove a client that `join` has registered."""
         with self._changed:
             self._clients -= 1
 
     def following(self, index: int) -> Made | None:
-        """A frame after a number: the last one that is due, or the first one that is not. None after a short wait."""
+        """The frame that a client gets next. Waits for at most 0.1 s.
+
+        Args:
+            index: Number of the client's last frame.
+
+        Returns:
+            The newest frame that is due for delivery. If none is due, the next one that will be. None if no later frame
+            was produced in time.
+        """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
             if not later:
@@ -64,7 +72,7 @@ class CameraThread:
         return due[-1] if due else later[0] if later else None
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._stop.set()
         with self._changed:
             self._changed.notify_all()
@@ -77,7 +85,7 @@ class CameraThread:
                 if not self._clients:
                     self._changed.wait(_WAIT_S)
                     continue
-            # A thread that is late skips frames, as a camera does.
+            # If this thread is late, it skips frames, as a real camera does.
             index = max(index + 1, self._newest(self._twin.now_s))
             while (wait_s := self._twin.end_s(index) - self._twin.now_s) > 0:
                 if self._stop.wait(wait_s):
@@ -94,13 +102,20 @@ class CameraThread:
 
 
 class WebServer(http.server.ThreadingHTTPServer):
-    """Serves the camera and the commands."""
+    """The HTTP server of the camera stream, the state and the commands."""
 
     daemon_threads = False  # `server_close` waits for the threads of all connections
     allow_reuse_address = True
 
     def __init__(self, address: tuple[str, int], twin: Twin, camera: CameraThread, inject: Any):
-        """Bind the address. `inject` takes a `Fault`."""
+        """Bind the address.
+
+        Args:
+            address: Host and TCP port. Port 0 selects a free one.
+            twin: Twin that executes the commands.
+            camera: Source of the frames.
+            inject: Function that receives the `Fault` of a request.
+        """
         self.twin = twin
         self.camera = camera
         self.inject = inject
@@ -109,11 +124,11 @@ class WebServer(http.server.ThreadingHTTPServer):
         super().__init__(address, _Handler)
 
     def drop(self) -> None:
-        """Close the connections that receive frames."""
+        """Close all connections that receive frames."""
         _shut_down(self.streams)
 
     def server_close(self) -> None:
-        """Close the server and all connections, and wait for their threads."""
+        """Close the server and all connections, and wait until their threads have ended."""
         _shut_down(self.connections)
         super().server_close()
 
@@ -129,7 +144,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     timeout = _SEND_S
 
     def do_GET(self) -> None:
-        """Send the camera's frames or the state."""
+        """Send the camera's frames (`/camera`) or the state (`/state`)."""
         match self.path:
             case "/camera":
                 self._stream()
@@ -139,7 +154,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                 self._unknown()
 
     def do_POST(self) -> None:
-        """Apply a command or inject a fault."""
+        """Execute a command (`/hold`, `/release`, `/clear`), or inject a fault (`/fault?kind=...`)."""
         url = urllib.parse.urlsplit(self.path)
         try:
             if url.path[1:] in COMMANDS:
@@ -155,11 +170,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self._json(400, {"error": str(error)})
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Print nothing."""
+        """Do not log requests."""
 
     def _unknown(self) -> None:
         known = [f"GET {CAMERA}", "GET /state", *(f"POST /{name}" for name in COMMANDS), "POST /fault?kind="]
-        self._json(404, {"error": f"{self.command} {self.path} is not one of {', '.join(known)}"})
+        self._json(404, {"error": f"the request {self.command} {self.path} is not one of {', '.join(known)}"})
 
     def _json(self, code: int, content: dict[str, Any]) -> None:
         body = json.dumps(content).encode() + b"\n"
@@ -170,7 +185,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def _stream(self) -> None:
-        """Send frames when they are due. A client that takes them too slowly misses some."""
+        """Send each frame when it is due. A client that reads too slowly misses frames."""
         camera, twin = self.server.camera, self.server.twin
         index = -1
         self.send_response(200)
@@ -196,13 +211,13 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.close_connection = True
 
     def setup(self) -> None:
-        """Limit the send buffer."""
+        """Register the connection, and limit its send buffer."""
         self.server.connections.add(self.request)
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         super().setup()
 
     def finish(self) -> None:
-        """Forget the connection."""
+        """Remove the connection from the list."""
         self.server.connections.discard(self.request)
         with contextlib.suppress(OSError):  # the client has gone
             super().finish()

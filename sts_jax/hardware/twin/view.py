@@ -1,4 +1,4 @@
-"""The raw view of a fisheye lens, for the two ends of the light."""
+"""The distortion of a fisheye lens, which `Blender` applies to the rendered images."""
 
 import dataclasses
 import math
@@ -9,21 +9,27 @@ import numpy as np
 from sts_jax.hardware.lens import Lens, Pinhole, distortion
 from sts_jax.hardware.twin.photometry import Warp
 
-MOST_SAMPLES = 3  # per raw pixel and direction
-_OUTSIDE = -2.0  # coordinate of a pixel outside of the rendered view
+MOST_SAMPLES = 3  # largest default number of samples per raw pixel along each axis
+_OUTSIDE = -2.0  # coordinate of a raw pixel that lies outside the rendered view
 
 
 def lens_warp(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int], *, samples: int | None = None) -> Warp:
-    """The way from the rendered view to the raw view of a lens.
+    """Compute the mapping from a rendered image to the raw image of a fisheye lens.
 
-    Raw pixels that show more than the rendered view are dark.
+    A raw pixel that looks beyond the rendered view is dark.
 
     Args:
-        lens: The camera.
-        pinhole: The rendered view, `Sensor.camera`.
-        resolution: (height, width) of the rendered view, pixels.
-        samples: Samples of a raw pixel in each direction, which are averaged. Default: as many as the image needs to
-            show no aliasing, at most `MOST_SAMPLES`.
+        lens: Fisheye camera whose raw image is wanted.
+        pinhole: Pinhole camera of the rendered view, such as `sts_jax.Sensor().camera`.
+        resolution: (height, width) of the rendered image (pixels).
+        samples: Number of samples of a raw pixel along each axis, >= 1. The samples are averaged. Default: the number
+            that avoids aliasing, but at most `MOST_SAMPLES`.
+
+    Returns:
+        Mapping for the argument `warp` of `Twin` and `Blender`.
+
+    Raises:
+        ValueError: `samples` is less than 1.
     """
     if samples is None:
         samples = min(max(1, math.ceil(_largest_step(distortion(lens, pinhole, resolution), resolution))), MOST_SAMPLES)
@@ -45,7 +51,7 @@ def lens_warp(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int], *, samp
 
 
 def _largest_step(pixels: np.ndarray, resolution: tuple[int, int]) -> float:
-    """The largest distance in the rendered view between neighbours of the raw view (pixels)."""
+    """The largest distance in the rendered image between the positions of two neighbouring raw pixels (pixels)."""
     inside = ((pixels > -0.5) & (pixels < np.array(resolution[::-1]) - 0.5)).all(axis=-1, keepdims=True)
     pixels = np.where(inside, pixels, np.nan)
     steps = [np.linalg.norm(np.diff(pixels, axis=axis), axis=-1) for axis in (0, 1)]

@@ -1,4 +1,4 @@
-"""`VirtualSensor`: pairs of images of a twin on its virtual clock, each proven to be of one light."""
+"""`VirtualSensor`: reads pairs of visual and tactile images from a twin on its virtual clock."""
 
 import numpy as np
 
@@ -11,14 +11,18 @@ from sts_jax.hardware.sts import checked_levels
 from sts_jax.hardware.twin.device import Twin
 
 CAMERA = "twin"  # name of the camera in sessions and sensor files
-_SWITCHES = 8  # of each direction, to measure the settling
-_WATCH_S = 1.0  # s, longest time after a switch in which the light changes
-_PHASE = 0.618  # of a period, by which the phase of the measured switches advances
-_ATTEMPTS = 10  # images of one stream, of which the controller proves none
+_SWITCHES = 8  # number of switches in each direction from which the settling times are measured
+_WATCH_S = 1.0  # time after a switch during which frames are watched (s). The light must not change after it
+# Share of the frame period by which the start of each measured switch advances, so that the switches sample the whole
+# period. It is the golden ratio, whose multiples are spread evenly.
+_PHASE = 0.618
+_ATTEMPTS = 10  # images of one stream without a proof of their light after which an error is raised
 
 
 class VirtualSensor:
-    """A twin on the virtual clock, read as `hardware.STS` is. `hardware.collect` takes it.
+    """Reads pairs of visual and tactile images from a twin on its virtual clock.
+
+    It replaces `hardware.STS` in `hardware.collect`.
 
     ```python
     with Twin(ObjectScene(body)) as twin:
@@ -26,10 +30,10 @@ class VirtualSensor:
         pair = sensor.read()
     ```
 
-    As with `STS`, a frame counts as of one light if it arrives later than the settling time after the controller's
-    acknowledgement, and if the controller's next answer proves that its lights have not changed in between. The
-    settling time is measured from frames. Nobody waits for frames that arrive earlier, so the twin does not make them.
-    Faults of the camera are not looked for.
+    Each image is proven to be exposed under one constant light, as with `STS`. The settling time runs from the
+    controller's acknowledgement of a switch of the lights until all arriving frames show only the new light. `read`
+    uses a frame if it arrives after the settling time and if the controller's next answer proves that the lights have
+    not changed since the switch. Earlier frames are never rendered. Faults of the camera are not detected.
     """
 
     def __init__(
@@ -39,15 +43,16 @@ class VirtualSensor:
         levels: protocol.Levels = (255, 255, 255, 255),
         settling: Settling | None = None,
     ):
-        """Measure the settling times unless they are given.
+        """Connect to a twin, and measure its settling times unless they are given.
 
         Args:
-            twin: On the virtual clock, with a scene at rest.
-            levels: Duty cycles of the four channels in the tactile stream, 0 to 255. All are 0 in the visual stream.
-            settling: From an earlier measurement.
+            twin: Twin on its virtual clock. Its scene must be at rest if the settling times are measured.
+            levels: Duty cycles of the four LED channels in the tactile stream, 0 to 255, not all 0. All are 0 in the
+                visual stream.
+            settling: Settling times of an earlier measurement. Default: they are measured now.
 
         Raises:
-            ValueError: A level is out of range or all are 0.
+            ValueError: A level is out of range, or all are 0.
             NoContrastError: The lights do not change the image.
             RuntimeError: The twin runs on the real clock.
         """
@@ -61,7 +66,7 @@ class VirtualSensor:
 
     @property
     def settling(self) -> Settling:
-        """The settling times that are in use."""
+        """The settling times for which `read` waits after a switch of the lights."""
         return self._settling
 
     @property
@@ -71,14 +76,17 @@ class VirtualSensor:
 
     @property
     def origin(self) -> Origin:
-        """The origin of a session."""
+        """Description of this sensor for `hardware.Session.open`: the devices, the image size and the levels."""
         return Origin(CAMERA, self._twin.serial_number, *self._size, self._levels)
 
     def read(self) -> Pair:
-        """Take an image of each stream, as `STS.read`.
+        """Take an image of each stream. Both arrive after the call.
+
+        Returns:
+            The visual and the tactile image.
 
         Raises:
-            LightError: The lights do not stay on, so no image could be proven to be of one light.
+            LightError: In ten attempts, the controller's answers never proved that the lights were constant.
         """
         first = self._stream
         one = self._shot(first)
@@ -86,7 +94,7 @@ class VirtualSensor:
         return Pair(one, two) if first == "visual" else Pair(two, one)
 
     def _shot(self, stream: Stream) -> Shot:
-        """An image of one stream that is exposed after the call."""
+        """Take an image of one stream that arrives after the call, see `read`."""
         settled_s = self._settling.visual_s if stream == "visual" else self._settling.tactile_s
         for _ in range(_ATTEMPTS):
             if self._lit is None or self._stream != stream:
@@ -102,22 +110,23 @@ class VirtualSensor:
                 return Shot(image, stream, time_s, exposure.index, 0, before, after.sent_s)
             self._lit = None
         raise LightError(
-            f"no image of the {stream} stream could be proven to be of one light: lower the settling time of "
-            f"{settled_s:g} s, because the controller turns its lights off without a request for a second"
+            f"the lights changed in each of {_ATTEMPTS} attempts to take a {stream} image: lower the settling time of "
+            f"{settled_s:g} s, because the controller turns its lights off after 1 s without a request"
         )
 
     def _set(self, stream: Stream) -> Lit:
+        """Set the levels of a stream, and remember the controller's answer."""
         self._lit = self._twin.set(self._levels if stream == "tactile" else protocol.DARK)
         self._stream = stream
         return self._lit
 
     def _measured(self) -> Settling:
-        """The settling times, from frames after switches at several phases of the exposure."""
+        """Measure the settling times from the frames after switches at several phases of the exposure."""
         period_s = 1 / self._twin.rate
         on: list[Switch] = []
         off: list[Switch] = []
         for number in range(_SWITCHES):
-            phase_s = period_s * (_PHASE * number % 1)  # a watch ends just after a frame
+            phase_s = period_s * (_PHASE * number % 1)  # counted from a frame, because `_watched` ends at one
             self._twin.step(phase_s)
             on.append(self._watched("tactile"))
             self._twin.step(phase_s)
@@ -125,13 +134,13 @@ class VirtualSensor:
         return settling(on, off, period_s)
 
     def _watched(self, stream: Stream) -> Switch:
-        """Switch the lights and collect the frames that arrive afterwards, with thumbnails."""
+        """Switch the lights, and collect thumbnails of the frames that arrive in the second afterwards."""
         lit = self._set(stream)
         delays: list[float] = []
         looks: list[np.ndarray] = []
         while not delays or delays[-1] < _WATCH_S:
             _, image = self._twin.capture()
-            self._twin.ping()  # for the watchdog
+            self._twin.ping()  # so that the watchdog leaves the lights on
             delays.append(self._twin.now_s - lit.acknowledged_s)
             looks.append(thumbnail(image))
         return Switch(np.array(delays, np.float32), np.array(looks, np.float32))
