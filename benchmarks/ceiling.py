@@ -45,8 +45,8 @@ class Args:
         ValueError: `times` is less than 2.
     """
 
-    scenario: Literal["freefall", "inclined", "perturbed", "released"] = "freefall"
-    times: int = 16  # simulations of each start, at least 2
+    scenario: Literal["freefall", "inclined", "perturbed", "released"] = "freefall"  # scenario of the experiment
+    times: int = 16  # number of simulations of each start, at least 2
     workdir: Path | None = None  # work directory of a run with --preset default (default: collect a new dataset)
 
     def __post_init__(self) -> None:

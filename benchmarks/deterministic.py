@@ -40,8 +40,8 @@ class Args:
     """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
-    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
-    preset: Literal["smoke", "default", "long"] = "default"
+    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
+    preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
     seconds: float = 420.0  # duration of the training after compilation (s)
     seed: int = 0  # seed of the initial weights and of the order of the batches
 

@@ -200,7 +200,7 @@ def sessions(args: Args) -> hardware.Recordings:
 class Difference:
     """A known difference from clean images."""
 
-    name: str  # of the row
+    name: str  # title of the row in the table
     imperfections: twin.Imperfections = CLEAN
     lens: bool = False  # apply the fisheye lens
     rectified: bool = True  # rectify the images of the lens

@@ -102,7 +102,7 @@ class Args:
     """
 
     parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts to print (default: all parts of the scenario)
-    scenario: Literal["perturbed", "inclined"] = "perturbed"
+    scenario: Literal["perturbed", "inclined"] = "perturbed"  # the jerked pad, or the slope
     objects: int | None = None  # number of simulated objects (default: 200)
     num: int = 16  # number of simulated starts of each object
     again: int | None = None  # starts of each object that are simulated again with new contents (default: 8)

@@ -53,7 +53,7 @@ BOX = (0.06, 0.04, 0.025)  # m
 DROP = physics.Freefall(height=0.02, spread=0.02, frames=36)  # m, m, 1.1 s. Few objects still move at the end
 SHAKE = physics.Perturbed(frames=36)
 POINT = 1e-6  # m, radius of the contact sphere at each vertex
-CARRIAGE = 1e5  # kg, mass of the driven pad, a million times an object's
+CARRIAGE = 1e5  # kg, mass of the driven pad, a million times the mass of an object
 MESH_GAP = 0.001  # m, depth from which the mesh itself pushes, if its vertices are contacts: reached only at rims
 UP = math.cos(math.radians(20))  # cosine of the largest lean of an object that rests on a face
 
@@ -88,7 +88,7 @@ def mirror(start: Start) -> Start:
 
 
 def mirror_shape(shape: Shape) -> Shape:
-    """Mirror a shape, as `objects.mirror` does a body."""
+    """Mirror a shape, as `objects.mirror` mirrors a body."""
     flip = np.array([1, -1, 1], np.float32)
     return shape._replace(points=shape.points * flip, rests=shape.rests * flip, coms=shape.coms * flip)
 

@@ -49,7 +49,7 @@ from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
 
-# `simulate` has no public way to measure its compiled functions separately. A break shows at these imports.
+# `simulate` has no public way to measure its compiled functions separately. If their names change, these imports fail.
 from sts_jax.physics.draws import draw as draw_starts
 from sts_jax.physics.engines import Worlds, drawn_fields, gravity_at, roll_worlds
 from sts_jax.physics.mass_properties import rigid_of_draws

@@ -43,7 +43,7 @@ from sts_jax import tactile
 PITCH = 0.0295e-3  # m per pixel (taxim/calib/gelsight/params.json)
 RADIUS = 2e-3  # m, radius of the ball
 TRUSTED = 0.92  # share of a contact's radius within which the normals of the sphere are used
-EVERY = 4  # one press in this many is held out: the fourth, the eighth, ...
+EVERY = 4  # one of this many presses is held out: the fourth, the eighth, ...
 STEPS = 1000  # steps of Adam
 RATE = 0.1  # initial learning rate of Adam
 OUT = Path(__file__).parent / "results" / "presses"
@@ -55,8 +55,8 @@ class Presses:
 
     background: Float[np.ndarray, "h w 3"]
     images: Float[np.ndarray, "n h w 3"]
-    centres: Float[np.ndarray, "n 2"]  # column, row (pixels)
-    radii: Float[np.ndarray, "n"]  # of the contacts (pixels)
+    centres: Float[np.ndarray, "n 2"]  # column and row of the centre of each contact (pixels)
+    radii: Float[np.ndarray, "n"]  # radius of each contact (pixels)
 
 
 @jax.tree_util.register_dataclass

@@ -35,8 +35,8 @@ class Args:
     """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
-    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
-    preset: Literal["smoke", "default", "long"] = "default"
+    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
+    preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
     # shares of the training objects. A model of each share is trained for the largest number of `steps`
     shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)
     steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps. A model of each number sees all training objects
