@@ -1,1 +1,1 @@
-"""Measurements of speed, endurance, accuracy and information. Each module is a command that describes itself."""
+"""Commands that measure speed, endurance, accuracy and the information in touch. `--help` describes each of them."""

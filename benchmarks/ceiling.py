@@ -1,13 +1,18 @@
-"""Errors of the best possible prediction: held-out starts simulated several times, with new hidden values each time.
+"""Errors of the best possible prediction, from repeated simulations of each held-out start.
 
     python -m benchmarks.ceiling                         # freefall, about 10 minutes on two CPU cores
     python -m benchmarks.ceiling --scenario perturbed
     python -m benchmarks.ceiling --workdir runs/inclined --scenario inclined  # with the dataset of this run
 
-Prints the errors of the mean of the re-rolls (the best prediction from shape, pose and condition), of a single re-roll
-(a sharp sample of the truth), and of the baselines, with the metrics and the held-out starts of the experiment. Below
-the table it prints the distances between the ends of one start. Without `--workdir`, the dataset is collected into a
-temporary folder. With it, missing parts of that run's dataset are collected there.
+A re-roll is a second simulation of a start, with new random values of the hidden properties, such as friction and mass.
+The command uses the metrics and the held-out starts of the experiment. It prints the errors of three predictions:
+
+- the mean of the re-rolls, which is the best prediction from shape, pose and condition
+- a single re-roll, which is as sharp as a true image
+- the baselines
+
+Below the tables it prints how far the final poses of one start lie apart. Without `--workdir`, the dataset is collected
+into a temporary folder. With `--workdir`, missing parts of that run's dataset are collected in the run's folder.
 """
 
 import dataclasses
@@ -40,22 +45,25 @@ class Args:
         ValueError: `times` is less than 2.
     """
 
-    scenario: Literal["freefall", "inclined", "perturbed", "released"] = "freefall"
-    times: int = 16  # simulations of each start, at least 2
+    scenario: Literal["freefall", "inclined", "perturbed", "released"] = "freefall"  # scenario of the experiment
+    times: int = 16  # number of simulations of each start, at least 2
     workdir: Path | None = None  # work directory of a run with --preset default (default: collect a new dataset)
 
     def __post_init__(self) -> None:
         if self.times < 2:
-            raise ValueError(f"--times must be at least 2 to compare the ends of one start, got {self.times}")
+            raise ValueError(f"--times must be at least 2 to compare the final poses of a start, got {self.times}")
 
 
 def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]:
-    """Lines of text with the distances of ends from their start and from each other.
+    """Describe how far the final poses lie from their start and from each other.
 
     Args:
         start: First poses, `(n, 7)`.
         end: Last poses of the re-rolls, `(times, n, 7)`.
-        outcome: int `(times, n)`.
+        outcome: Outcome of each re-roll, int `(times, n)`.
+
+    Returns:
+        Four lines of text.
     """
     times = len(end)
     place, stays = 1e3 * end[..., :2], outcome != int(sts.physics.Outcome.FELL_OFF)
@@ -73,9 +81,9 @@ def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]
 
 
 def main(args: Args) -> None:
-    """Collect missing parts of the default dataset of an experiment, and print its ceilings."""
+    """Collect missing parts of the experiment's dataset, and print the errors of the best possible predictions."""
     config, sensor = CONFIGS[args.scenario], sts.Sensor()
-    if args.workdir is None:  # the symmetric copies change nothing about the held-out list
+    if args.workdir is None:  # save time: symmetric copies and whole films do not change the held-out list
         collection = dataclasses.replace(config.collection, symmetries=False, num_full=0)
         config = dataclasses.replace(config, collection=collection)
     with tempfile.TemporaryDirectory() as temporary, _files.lock(args.workdir or Path(temporary)):

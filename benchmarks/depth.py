@@ -1,12 +1,12 @@
-"""Depth of whole frames against embree: ten objects in ten poses each, at four sizes.
+"""Accuracy of rendered depth compared with embree's ray tracing: ten objects in ten poses each, at four image sizes.
 
     python -m benchmarks.depth    # about two minutes on two CPU cores
 
 Prints, for each size and object, the share of the pixels whose depth agrees with embree's within several limits. A
-pixel is interior if embree hits its whole 3x3 neighbourhood within 1 mm of depth. The objects are procedural ones,
-loaded ones (miniworld's meshes, Apache 2.0), a concave one and a thin one. In four poses the object touches the pad
-with a load, in three it is above the pad, and in three it is partly out of view. `tests/test_frame_depth.py` tests some
-of them. Writes no files.
+pixel is interior if the rays of its 3x3 neighbourhood all hit the object and their depths differ by less than 1 mm.
+Four objects are procedural, four are loaded from miniworld's meshes (Apache 2.0), one is a concave bowl and one a thin
+sheet. In four poses the object presses on the pad with 1 N, in three it is above the pad, and in three it is partly out
+of view. `tests/test_frame_depth.py` tests some of these cases. The command writes no files.
 """
 
 import dataclasses
@@ -43,14 +43,14 @@ class Difference(NamedTuple):
     interior_beyond_100um: int
     elsewhere: int  # on the object in both images
     elsewhere_beyond_1mm: int
-    silhouette: int  # embree hits only a part of the 3x3 neighbourhood
+    silhouette: int  # with a 3x3 neighbourhood that embree hits in part
     silhouette_differs: int  # on the object in one of the images only
-    strays: int  # the same, where embree hits all or none of the neighbourhood
+    strays: int  # of `silhouette_differs`, with a 3x3 neighbourhood that embree hits fully or not at all
     worst: float  # m, largest error in the interior
 
 
 def make(name: str) -> objects.Body:
-    """One of the objects, 50 to 130 mm long. The loaded ones are without texture, which has no depth."""
+    """Make one of the ten objects, 50 to 130 mm long. Loaded objects lose their textures, which depth does not need."""
     if name in PROCEDURAL:
         return objects.make(jax.random.key(5), name)
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
@@ -73,9 +73,16 @@ def make(name: str) -> objects.Body:
 
 
 def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax.Array, jax.Array]:
-    """Draw a pose of a kind of `POSES`, and its wrench.
+    """Draw a random pose of an object, and the wrench of the pad on the object.
 
-    The wrench is that of a force of 1 N upwards at the object's lowest point if it touches the pad, and zero otherwise.
+    Args:
+        body: The object.
+        rng: Source of the random pose.
+        kind: One of `POSES`.
+
+    Returns:
+        The pose `(7,)` and the wrench `(6,)`. If the object touches the pad, the wrench is that of a force of 1 N
+        upwards at the object's lowest point. Otherwise the wrench is zero.
     """
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)
@@ -87,7 +94,8 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
         x, y, z = *rng.uniform(-0.03, 0.03, 2), low + rng.uniform(0.001, 0.08)
     else:
         x, y = rng.permutation([rng.choice([-1, 1]) * rng.uniform(0.06, 0.09), rng.uniform(-0.05, 0.05)])
-        z = max(low + rng.uniform(-0.03, 0.02), 0.005 - points[:, 2].max())  # objects wholly below have fallen off
+        # At least 5 mm of the object are above the pad's face, because objects wholly below it have fallen off.
+        z = max(low + rng.uniform(-0.03, 0.02), 0.005 - points[:, 2].max())
     force = float(kind == "touching")
     lowest = points[points[:, 2].argmin()]
     wrench = [0, 0, force, (y + lowest[1]) * force, -(x + lowest[0]) * force, 0]
@@ -95,7 +103,16 @@ def places(body: objects.Body, rng: np.random.Generator, kind: str) -> tuple[jax
 
 
 def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> Iterator[tuple[jax.Array, jax.Array]]:
-    """Poses and their wrenches, as many of each kind in POSES as `numbers` has for it."""
+    """Draw the poses and wrenches of an object.
+
+    Args:
+        body: The object.
+        seed: Seed of the random poses.
+        numbers: Number of poses of each kind in `POSES`.
+
+    Yields:
+        A pose `(7,)` and its wrench `(6,)`, see `places`.
+    """
     rng = np.random.default_rng(seed)
     for kind, number in zip(POSES, numbers, strict=True):
         for _ in range(number):
@@ -103,7 +120,12 @@ def cases(body: objects.Body, seed: int, numbers: Sequence[int] = NUM_POSES) -> 
 
 
 def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
-    """Compare a depth image with embree's."""
+    """Compare a depth image with embree's.
+
+    Args:
+        depth: The rendered depth (m), `(h, w)`, infinite beside the object.
+        truth: Embree's depth (m), `(h, w)`, infinite beside the object.
+    """
     seen, hit = np.isfinite(depth), np.isfinite(truth)
     inner = interior(truth)
     other = hit & seen & ~inner
@@ -125,7 +147,7 @@ def difference(depth: np.ndarray, truth: np.ndarray) -> Difference:
 
 
 def total(differences: Sequence[Difference]) -> Difference:
-    """Sum the numbers of pixels and take the largest interior error."""
+    """Sum the numbers of pixels of several images, and keep the largest interior error."""
     added = {name: sum(getattr(d, name) for d in differences) for name in Difference._fields if name != "worst"}
     return Difference(**added, worst=max(d.worst for d in differences))
 
@@ -133,7 +155,19 @@ def total(differences: Sequence[Difference]) -> Difference:
 def measure(
     names: Sequence[str], shape: tuple[int, int], numbers: Sequence[int] = NUM_POSES, *, first_seed: int = 0
 ) -> dict[str, Difference]:
-    """Differences between the depth of whole frames and embree's, in the balanced pose, by name of the object."""
+    """Compare the depth of rendered frames with embree's.
+
+    Embree traces the object in the balanced pose that the frame reports.
+
+    Args:
+        names: Names of the objects, from `PROCEDURAL`, `LOADED` and `MADE`.
+        shape: Height and width of the images (pixels).
+        numbers: Number of poses of each kind in `POSES`.
+        first_seed: Offset of the seeds of the random poses.
+
+    Returns:
+        The differences by name of the object.
+    """
     sensor = sts.Sensor()
     sense = jax.jit(lambda *inputs: sts.sense(sensor, *inputs, resolution=shape))
     found = {}
@@ -150,7 +184,7 @@ def measure(
 
 
 def describe(d: Difference) -> str:
-    """One row of the table."""
+    """Format the differences as one row of the table."""
     rest = max(d.elsewhere, 1)
     return (
         f"{d.interior:9} {100 * (1 - d.interior_beyond_10um / max(d.interior, 1)):9.4f} {d.interior_beyond_100um:7} "

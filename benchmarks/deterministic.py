@@ -1,13 +1,13 @@
-"""Errors of a plain network that predicts one end, as a baseline for the state-space model at equal cost.
+"""Errors of a plain network that predicts a single final state, compared with the state-space model at equal cost.
 
     python -m benchmarks.deterministic runs/freefall  # a run of --preset default, about 9 minutes on two CPU cores
     python -m benchmarks.deterministic runs/perturbed --scenario perturbed --seconds 480
 
-Takes the dataset of a run, trains a convolutional network without a latent on the first images, the pose and the
-condition for the same number of seconds as the run's state-space model (`--seconds`), and prints its errors in a table
-with the baselines. The network minimises the cross-entropy of both last images and of the outcome and the squared error
-of the final pose. It uses only the trajectories that have images. Missing parts of the run's dataset are collected, and
-no other files are written.
+Trains a convolutional network without latent variables on the dataset of a run. Its inputs are the first images, the
+first pose and the condition. It minimises the cross-entropy of both last images and of the outcome, and the squared
+error of the final pose. Only trajectories with images are used. Set `--seconds` to the training time of the run's
+state-space model. Prints the errors of the network and of the baselines. Missing parts of the run's dataset are
+collected, and no other files are written.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from sts_jax import _files, dataset, evaluation, statespace, training
 
 EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed}
 BATCH, RATE, WARMUP = 32, 1e-3, 100
-POSE_WEIGHT, TACTILE_WEIGHT, OUTCOME_WEIGHT = 300.0, 4.0, 8.0  # against the nats of the visual image
+POSE_WEIGHT, TACTILE_WEIGHT, OUTCOME_WEIGHT = 300.0, 4.0, 8.0  # the visual image's cross-entropy (nat) has weight 1
 TITLE = "deterministic network, from all inputs"
 
 
@@ -40,14 +40,14 @@ class Args:
     """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
-    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
-    preset: Literal["smoke", "default", "long"] = "default"
-    seconds: float = 420.0  # duration of the training, after compilation
-    seed: int = 0  # of the initial weights and of the order of the batches
+    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
+    preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
+    seconds: float = 420.0  # duration of the training after compilation (s)
+    seed: int = 0  # seed of the initial weights and of the order of the batches
 
 
 class Network(nnx.Module):
-    """Maps images at 128x128, pose code and condition to both images at 64x64, pose code and outcome."""
+    """Network from the first images (128x128), pose code and condition to the last images (64x64), pose and outcome."""
 
     def __init__(self, images: int, numbers: int, outcomes: int, rngs: nnx.Rngs) -> None:
         widths = [3 * images, 32, 64, 128, 128]
@@ -60,7 +60,12 @@ class Network(nnx.Module):
         self.up = nnx.List([nnx.Conv(a, 4 * b, (3, 3), rngs=rngs) for a, b in ((128, 64), (64, 32), (32, 6))])
 
     def __call__(self, images: Float[Array, "n h w c"], numbers: Float[Array, "n k"]) -> tuple[Array, Array, Array]:
-        """Logits `(n, 64, 64, 6)` of the visual and the tactile image, pose codes `(n, 12)` and outcome logits."""
+        """Predict the last state from the arrays of `features`.
+
+        Returns:
+            Logits `(n, 64, 64, 6)`, three channels of the visual image and three of the tactile one, pose codes
+            `(n, 12)`, and logits of the outcomes, `(n, outcomes)`.
+        """
         x = images
         for layer in self.down:
             x = jax.nn.swish(layer(_fold(x)))
@@ -75,24 +80,29 @@ class Network(nnx.Module):
 
 
 def _fold(x: Float[Array, "n h w c"]) -> Float[Array, "n h/2 w/2 4*c"]:
-    """Blocks of 2x2 pixels as channels."""
+    """Move the pixels of each 2x2 block into the channels."""
     n, h, w, c = x.shape
     return x.reshape(n, h // 2, 2, w // 2, 2, c).swapaxes(2, 3).reshape(n, h // 2, w // 2, 4 * c)
 
 
 def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c/4"]:
-    """The inverse of `_fold`."""
+    """Undo `_fold`."""
     n, h, w, c = x.shape
     return x.reshape(n, h, w, 2, 2, c // 4).swapaxes(2, 3).reshape(n, 2 * h, 2 * w, c // 4)
 
 
 def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str, Array]) -> tuple[Array, Array]:
-    """The images less those of the empty sensor, side by side in the channels, and all numbers.
+    """Prepare the inputs of the network.
 
     Args:
-        inputs: `visual`, perhaps `tactile`, uint8 `(n, 128, 128, 3)`, and `pose` `(n, 12)`, codes.
-        condition: `(n, c)`, or None.
-        empty: both images of the untouched sensor, uint8.
+        inputs: Pose codes `pose`, `(n, 12)`, and images `visual`, uint8 `(n, 128, 128, 3)`. Images `tactile` are
+            optional and have the same shape.
+        condition: Condition of each item, `(n, c)`. None: the scenario has none.
+        empty: Images of the untouched sensor, by the same names, uint8.
+
+    Returns:
+        Images minus those of the untouched sensor, stacked in the channels, `(n, 128, 128, 3 or 6)`, and pose codes and
+        conditions, `(n, 12 + c)`.
     """
     images = [inputs[name] / 255.0 - empty[name] / 255.0 for name in ("visual", "tactile") if name in inputs]
     numbers = [inputs["pose"]] if condition is None else [inputs["pose"], condition]
@@ -100,7 +110,7 @@ def features(inputs: dict[str, Array], condition: Array | None, empty: dict[str,
 
 
 def loss(graphdef: nnx.GraphDef[Network], params: nnx.State, batch: dict[str, Any]) -> Array:
-    """The sum of the images' and the outcome's cross-entropies and the pose's squared error, a mean over the batch."""
+    """Weighted sum of the cross-entropies of images and outcome and the squared error of the pose, batch mean."""
     picture, pose, outcome = nnx.merge(graphdef, params)(*features(batch["inputs"], batch["condition"], batch["empty"]))
     targets = batch["targets"]
     visual, tactile = (
@@ -120,12 +130,12 @@ def fit(
     Args:
         arrays: Training data.
         network: Definition of the network.
-        params: Its initial parameters. Consumed.
+        params: Initial parameters of the network. They cannot be used afterwards.
         seconds: Duration of the training after the first step, which compiles.
         seed: Seed of the order of the batches.
 
     Returns:
-        The parameters and the number of steps.
+        The trained parameters and the number of steps.
     """
     optimiser = optax.chain(optax.clip_by_global_norm(3e3), optax.scale_by_adam(b2=0.99))
 
@@ -150,7 +160,14 @@ def fit(
 def predict(
     graphdef: nnx.GraphDef[Network], params: nnx.State, job: stages.Job, arrays: training.Arrays
 ) -> evaluation.Predicted:
-    """The predicted end of every item."""
+    """Predict the last images, pose and outcome of every item.
+
+    Args:
+        graphdef: Definition of the network.
+        params: Trained parameters of the network.
+        job: The run's training of the state-space model, for its preprocessing.
+        arrays: The items.
+    """
 
     @jax.jit
     def run(batch: dict[str, Any]) -> tuple[Array, ...]:
@@ -164,7 +181,7 @@ def predict(
 
 
 def main(args: Args) -> str:
-    """Train the network on a run's training objects and return the table of its errors on the held-out ones."""
+    """Train the network on a run's training objects, and return the table of its errors on held-out objects."""
     sts.enable_compilation_cache()
     config, sensor = EXPERIMENTS[args.scenario].PRESETS[args.preset], sts.Sensor()
     with _files.lock(args.workdir):

@@ -1,19 +1,21 @@
-"""Pairs of images of a sensor's devices: images of a wrong light, and the rate against the camera's limit.
+"""Rate at which `hardware.STS` reads pairs of images, and the number of images taken under a wrong light.
 
     python -m benchmarks.device --pairs 1000                                                     # about eight minutes
     python -m benchmarks.device --pairs 1000 --out benchmarks/results/hardware/device.txt        # also write the table
     python -m benchmarks.device --pairs 1000 --twin                                              # the digital twin
     python -m benchmarks.device --pairs 10 --lags-ms 15
 
-A controller on a pseudo-terminal and a camera on loopback, in a process of their own, stand for the devices. Their
-images are flat (`instruments/sensor_peer.py`), or with `--twin` those of the digital twin (`instruments/twin_peer.py`),
-whose object is held or released after every ten pairs. The pairs are shared between several lags, which is the time
-from the end of a frame's exposure to its sending. `hardware.STS` measures the settling times itself. The camera's log
-of each frame decides which light an image shows, never the host's label. An image is of a wrong or mixed light if the
-mean light of its exposure differs from the wanted one by more than 0.1 %.
+No hardware is needed. A separate process emulates the LED controller on a pseudo-terminal and the camera on a local
+network port. The emulated images are of one colour (`instruments/sensor_peer.py`). With `--twin` they are images of the
+digital twin (`instruments/twin_peer.py`), whose object is held or released after every ten pairs.
 
-The limit of the camera is one pair in two frame periods and the settling time. A pair has one switch, and the two
-directions alternate, so the settling time is the mean of both.
+The lag of a camera is the time from the end of a frame's exposure to the sending of the frame. The pairs are divided
+equally between several lags, and `hardware.STS` measures its settling times at each of them. The emulated camera logs
+the light during each exposure. By this log, an image has a wrong or mixed light if the mean light of its exposure
+differs from the requested light by more than 0.1 % of the full light.
+
+The camera limits the rate to one pair per two frame periods plus one settling time. A pair needs one switch of the
+light. Every second switch turns the light on, so this settling time is the mean over both directions.
 """
 
 import dataclasses
@@ -34,9 +36,9 @@ from sts_jax import hardware
 SIZE = (640, 480)
 FPS = 60.0
 EXPOSURE_S = 0.016
-MOVE, FINISHED = "move", "finished"  # requests of the host to the process of the devices
-EVERY = 10  # pairs between two of its movements of the twin's object
-LEAST = 0.8  # share of the camera's limit that is required
+MOVE, FINISHED = "move", "finished"  # requests to the process of the emulated devices
+EVERY = 10  # pairs between two movements of the twin's object
+LEAST = 0.8  # least required rate, as a share of the camera's limit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,29 +46,31 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: There are fewer pairs than lags.
+        ValueError: There is no lag, or there are fewer pairs than lags.
     """
 
-    pairs: int = 1000  # of all lags together
-    lags_ms: tuple[float, ...] = (15, 30, 50, 80, 120)
-    twin: bool = False  # images of the digital twin instead of flat ones
-    out: Path | None = None  # file of the table
+    pairs: int = 1000  # number of pairs of images, of all lags together
+    lags_ms: tuple[float, ...] = (15, 30, 50, 80, 120)  # time from the end of an exposure to the sending (ms)
+    twin: bool = False  # use images of the digital twin instead of images of one colour
+    out: Path | None = None  # text file for the table (default: print only)
 
     def __post_init__(self) -> None:
         if not 0 < len(self.lags_ms) <= self.pairs:
-            raise ValueError(f"--pairs is {self.pairs}, but must be at least the {len(self.lags_ms)} lags")
+            raise ValueError(
+                f"--lags-ms must have 1 to {self.pairs} values, at most as many as --pairs, got {len(self.lags_ms)}"
+            )
 
 
 class Measured(NamedTuple):
-    """The findings at one lag."""
+    """The results at one lag."""
 
     lag_ms: float
-    settling: hardware.Settling
+    settling: hardware.Settling  # as `hardware.STS` measured it
     pairs: int
     wrong: int  # images of a wrong or mixed light
-    frames: int  # that the host has fetched
-    discarded: int  # frames that were not proven to be of the wanted light
-    lost: int  # frames that the camera has taken and that the host has not fetched
+    frames: int  # frames that `hardware.STS` fetched from the camera
+    discarded: int  # fetched frames whose light was not proven
+    lost: int  # frames that the camera took and `hardware.STS` did not fetch
     seconds: float
 
     @property
@@ -81,7 +85,16 @@ class Measured(NamedTuple):
 
 
 def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float, twin: bool) -> None:
-    """Run the devices until the host has finished, then hand over the camera's log."""
+    """Run the emulated devices in a process of their own, until the other process has finished.
+
+    Args:
+        link: Connection to the other process, to which the camera's address is sent. The other process then sends MOVE
+            any number of times and FINISHED once. The answer to FINISHED is the camera's log: the light of each frame
+            by the key of its image.
+        path: Link to the port of the controller, which is created.
+        lag_s: Time from the end of an exposure to the sending (s).
+        twin: Use images of the digital twin.
+    """
     make: type[twin_peer.TwinPeer | sensor_peer.SensorPeer] = twin_peer.TwinPeer if twin else sensor_peer.SensorPeer
     peer = make(path, fps=FPS, lag_s=lag_s, exposure_s=EXPOSURE_S, size=SIZE)
     link.send(peer.url)
@@ -93,7 +106,14 @@ def serve(link: multiprocessing.connection.Connection, path: Path, lag_s: float,
 
 
 def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
-    """Read pairs at one lag and judge their images."""
+    """Read pairs at one lag, and count the images of a wrong light.
+
+    Args:
+        lag_ms: Time from the end of an exposure to the sending (ms).
+        pairs: Number of pairs to read.
+        path: Link to the port of the controller, which is created.
+        twin: Use images of the digital twin.
+    """
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=serve, args=(there, path, lag_ms / 1000, twin), daemon=True)
@@ -127,7 +147,7 @@ def measure(lag_ms: float, pairs: int, path: Path, *, twin: bool) -> Measured:
 
 
 def report(found: list[Measured]) -> str:
-    """The table."""
+    """Format the results as a table with a row for each lag."""
     lines = ["lag (ms)  settling off, on (ms)  frames/s  pairs  wrong or mixed  pairs/s  limit  share  discarded  lost"]
     for row in found:
         settled = f"{1000 * row.settling.visual_s:.0f}, {1000 * row.settling.tactile_s:.0f}"
@@ -144,7 +164,7 @@ def report(found: list[Measured]) -> str:
 
 
 def measure_all(args: Args) -> list[Measured]:
-    """Measure all lags, which share the pairs."""
+    """Divide the pairs between the lags, and measure each lag."""
     number = len(args.lags_ms)
     found = []
     with tempfile.TemporaryDirectory() as folder:
@@ -155,7 +175,7 @@ def measure_all(args: Args) -> list[Measured]:
 
 
 def main(args: Args) -> str:
-    """Measure and return the table."""
+    """Measure all lags, write the table to `--out` if given, and return it."""
     found = measure_all(args)
     load = os.getloadavg()[1] if hasattr(os, "getloadavg") else float("nan")
     text = (

@@ -1,17 +1,19 @@
-"""Faults of a sensor's devices while a program reads pairs of images, and the behaviour of `hardware.STS`.
+"""Behaviour of `hardware.STS` when the camera or the LED controller fails while a program reads pairs of images.
 
     python -m benchmarks.faults                                                 # 312 faults, about a quarter of an hour
     python -m benchmarks.faults --out benchmarks/results/hardware/faults.txt    # also write the table
     python -m benchmarks.faults --number 20 --only black                        # one kind of fault
 
-A controller on a pseudo-terminal and a camera on loopback stand for the devices (`instruments/sensor_peer.py`). The
-camera sees the lights of the controller, with a lag and an exposure time that are drawn at random. Before each fault
-the program reads a pair, then the fault begins at a random moment of a read, reads continue while it lasts, and a last
-read follows. The camera's log of each frame decides which light an image shows, never the host's label. An image is
-also counted as wrong if the camera has not taken it, and as old if its exposure began before the read by more than the
-settling time.
+No hardware is needed. The LED controller is emulated on a pseudo-terminal, and the camera on a local network port
+(`instruments/sensor_peer.py`). The emulated camera sees the lights of the controller, with a random lag and a random
+exposure time. Before each fault the program reads a pair. Then the fault begins at a random moment of a read. Reads
+continue while the fault lasts, and until a pair has been read after its end.
 
-In the last kind, the program that reads is a process of its own, and is killed while the light is on.
+The emulated camera logs the light during each exposure. By this log, an image is counted as wrong if it was taken under
+a wrong or mixed light, or if the camera never took it. An image is counted as old if its exposure began more than the
+settling time before the read.
+
+In the last kind of fault, the program that reads runs in a process of its own, which is killed while a light is on.
 """
 
 import contextlib
@@ -36,20 +38,20 @@ from benchmarks.instruments.sensor_peer import SensorPeer
 from sts_jax import hardware
 
 FPS = 60.0
-TIMEOUT_S = 2.0  # of one image
-ANSWER_S = 0.6  # of a request to the controller
-HANDSHAKE_S = 1.0
-RECONNECT_S = 4.0
-CAMERA_S = 1.0  # of one frame
-FROZEN_S = 0.4
+TIMEOUT_S = 2.0  # limit for one image
+ANSWER_S = 0.6  # limit for the controller's answer to one request
+HANDSHAKE_S = 1.0  # limit for the controller's first answer at a port
+RECONNECT_S = 4.0  # limit for finding the controller again
+CAMERA_S = 1.0  # limit for one frame
+FROZEN_S = 0.4  # time after which repeated frames are an error
 WATCHDOG_MS = 500
 REQUEST_S = 2 * (ANSWER_S + 0.3)  # longest time of a request, after a restart of the controller (`hardware.Leds`)
-GRACE_S = 0.5  # for threads that a busy machine does not run in time, and 0.2 s of `STS`
+GRACE_S = 0.5  # slack for threads that a busy machine delays, and for 0.2 s of `STS`
 READ_S = 2 * TIMEOUT_S + REQUEST_S + GRACE_S  # longest time of a read without a reconnection
-RECONNECTED_S = READ_S + RECONNECT_S + 2 * (HANDSHAKE_S + 2 * ANSWER_S)  # with one, which tries at most two ports
-DARK_S = 0.1  # by which lights may go off later than the watchdog's period, for the same reason
-PART = 40  # faults of one sensor
-RETURN_S = 12.0  # longest time of the camera's backoff after a fault of at most 7 s, and of one read
+RECONNECTED_S = READ_S + RECONNECT_S + 2 * (HANDSHAKE_S + 2 * ANSWER_S)  # with a reconnection at up to two ports
+DARK_S = 0.1  # slack for lights that a busy machine turns off later than the watchdog's period
+PART = 40  # faults of one emulated sensor
+RETURN_S = 12.0  # longest wait for a pair after a fault: the camera's backoff after a fault of 7 s, and one read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,12 +62,13 @@ class Args:
         ValueError: `number` or `long` is out of range, or a kind is unknown.
     """
 
-    number: int = 312  # faults
-    seed: int = 0  # of their order, times and lengths
-    long: float = 0.15  # share of the faults that can last for any time and that last longer than a read may, 0 to 1
-    jobs: int = 1  # sensors that are read at the same time, in processes of their own
+    number: int = 312  # number of faults
+    seed: int = 0  # seed of the order, the times and the lengths of the faults
+    # share of the faults of variable length that last 5 to 7 s, longer than the time limit of an image, from 0 to 1
+    long: float = 0.15
+    jobs: int = 1  # number of emulated sensors that are read at the same time, each in a process of its own
     only: tuple[str, ...] = ()  # kinds of faults (default: all)
-    out: Path | None = None  # file of the table
+    out: Path | None = None  # text file for the table (default: print only)
 
     def __post_init__(self) -> None:
         if self.number < 1:
@@ -78,22 +81,22 @@ class Args:
 
 @dataclasses.dataclass
 class Count:
-    """The findings of one kind of fault."""
+    """The results for one kind of fault."""
 
-    injected: int = 0
+    injected: int = 0  # number of faults
     images: int = 0
-    wrong: int = 0  # of a wrong or mixed light, or not taken by the camera
-    old: int = 0
-    errors: dict[str, int] = dataclasses.field(default_factory=dict)  # reads that raised an error, by its name
-    unnamed: int = 0  # reads that raised another error than those of the sensor
-    longest_s: float = 0.0
-    limit_s: float = READ_S
-    recovered: int = 0
-    recovery_s: float = 0.0  # longest time to the next pair, from the end of the read that the fault had hit
+    wrong: int = 0  # images of a wrong or mixed light, or not taken by the camera
+    old: int = 0  # images whose exposure began more than the settling time before the read
+    errors: dict[str, int] = dataclasses.field(default_factory=dict)  # number of reads by the class of their error
+    unnamed: int = 0  # reads that raised any other error than CameraError, LedError and LightError
+    longest_s: float = 0.0  # longest time of a read
+    limit_s: float = READ_S  # allowed time of a read
+    recovered: int = 0  # number of faults after which a pair was read, or the lights went off in time
+    recovery_s: float = 0.0  # longest time from the last read during a fault to the next pair
     lit_s: float = 0.0  # longest time for which a light was on after the program was killed
 
     def add(self, other: "Count") -> None:
-        """Add the findings of other faults."""
+        """Add the results of other faults of the same kind."""
         for name in ("injected", "images", "wrong", "old", "unnamed", "recovered"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name, number in other.errors.items():
@@ -104,7 +107,13 @@ class Count:
 
 
 class Bench:
-    """The devices, and a sensor that reads them."""
+    """The emulated devices, and the sensor that reads them.
+
+    Args:
+        folder: Folder for the links to the controller's ports.
+        draw: Source of all random times, lengths and choices.
+        long: Share of the faults of variable length that last 5 to 7 s.
+    """
 
     def __init__(self, folder: Path, draw: random.Random, long: float):
         self.folder, self.draw, self.long = folder, draw, long
@@ -115,7 +124,7 @@ class Bench:
 
     @contextlib.contextmanager
     def connected(self) -> Iterator[hardware.STS]:
-        """The sensor with its settling times measured."""
+        """Connect a sensor, which measures its settling times, and disconnect it at the end."""
         with unittest.mock.patch("serial.tools.list_ports.comports", side_effect=lambda: self.ports):
             leds = hardware.Leds.connect(
                 self.peer.path, timeout_s=HANDSHAKE_S, answer_s=ANSWER_S, watchdog_ms=WATCHDOG_MS
@@ -136,7 +145,7 @@ class Bench:
         )
 
     def plug_in(self, name: str) -> None:
-        """Plug the controller in at a port of a name."""
+        """Plug the controller in at the port `name` of the folder."""
         self.peer.plug_in(self.folder / name)
         self.ports[:] = [_usb_port(str(self.folder / name))]
 
@@ -148,15 +157,15 @@ def _usb_port(path: str) -> list_ports_common.ListPortInfo:
 
 
 def _length_s(bench: Bench, least_s: float, longest_s: float) -> float:
-    """The length of a fault. A share of the faults last longer than a read may."""
+    """Draw the length of a fault: 5 to 7 s for the share `bench.long` of the faults, else `least_s` to `longest_s`."""
     return bench.draw.uniform(5, 7) if bench.draw.random() < bench.long else bench.draw.uniform(least_s, longest_s)
 
 
-# Each kind of fault lasts for as long as its function runs, in a thread beside the reads.
+# A fault lasts while its function runs. The function runs in a thread of its own, and the main thread reads pairs.
 
 
 def _answers(word: str) -> Callable[[Bench], None]:
-    """Some answers of the controller have a fault."""
+    """Make a function that spoils one to four answers of the controller. `word` is a fault of `led_peer.Peer`."""
 
     def fault(bench: Bench) -> None:
         bench.peer.leds.faults = [word] * bench.draw.randint(1, 4)
@@ -169,7 +178,7 @@ def _answers(word: str) -> Callable[[Bench], None]:
 
 
 def _silent(bench: Bench) -> None:
-    """The controller answers nothing for longer than a request may take."""
+    """Make the controller answer nothing for at least half the time limit of a request."""
     bench.peer.leds.faults = ["lost"] * 1000
     time.sleep(_length_s(bench, 0.5 * ANSWER_S, 2 * ANSWER_S))
     bench.peer.leds.faults = []
@@ -204,7 +213,7 @@ def _renamed(bench: Bench) -> None:
 
 
 def _camera(mode: str, least_s: float = 0.1, longest_s: float = 1.5) -> Callable[[Bench], None]:
-    """The camera is in another mode for a while."""
+    """Make a function that sets a mode of `camera_server.MotionJpeg` for a random time (s)."""
 
     def fault(bench: Bench) -> None:
         bench.peer.camera.mode = mode
@@ -221,7 +230,7 @@ def _gone(bench: Bench) -> None:
 
 
 def _held_reset(bench: Bench) -> None:
-    """The network holds frames back, and the controller restarts meanwhile."""
+    """Hold the camera's frames back in the network, and restart the controller meanwhile."""
     bench.peer.camera.mode = "held"
     time.sleep(bench.draw.uniform(0.02, 0.3))
     bench.peer.leds.restart()
@@ -230,7 +239,7 @@ def _held_reset(bench: Bench) -> None:
 
 
 def _held_unplugged(bench: Bench) -> None:
-    """The network holds frames back, and the controller is unplugged and plugged in again meanwhile."""
+    """Hold the camera's frames back in the network, and meanwhile unplug the controller and plug it in again."""
     bench.peer.camera.mode = "held"
     time.sleep(bench.draw.uniform(0.0, 0.1))
     _unplugged_for(bench, bench.draw.uniform(0.02, 0.1))
@@ -272,7 +281,14 @@ RECONNECTING = (
 
 
 def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
-    """Inject one fault, read pairs until it is over, and read one more."""
+    """Inject one fault, read pairs until the fault is over, and go on reading until a pair arrives.
+
+    Args:
+        bench: The emulated devices.
+        sensor: The connected sensor.
+        kind: Kind of the fault, a name in `KINDS`.
+        count: Results of this kind, which are updated.
+    """
     count.injected += 1
     count.limit_s = RECONNECTED_S if kind in RECONNECTING or kind.startswith(("answer", "request")) else READ_S
     _read(bench, sensor, count)
@@ -295,7 +311,7 @@ def inject(bench: Bench, sensor: hardware.STS, kind: str, count: Count) -> None:
 
 
 def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
-    """Read a pair and judge it. False if there was an error."""
+    """Read a pair and count its wrong and old images. Return False if the read raised an error."""
     begun_s = time.monotonic()
     try:
         pair = sensor.read()
@@ -306,7 +322,7 @@ def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
         return False
     except Exception as error:
         count.unnamed += 1
-        print(f"not an error of the sensor: {error!r}", file=sys.stderr)
+        print(f"a read raised another error than CameraError, LedError or LightError: {error!r}", file=sys.stderr)
         return False
     finally:
         count.longest_s = max(count.longest_s, time.monotonic() - begun_s)
@@ -320,7 +336,14 @@ def _read(bench: Bench, sensor: hardware.STS, count: Count) -> bool:
 
 
 def host(path: str, url: str, width: int, height: int) -> None:
-    """The program that is killed: read pairs without end."""
+    """Read pairs without end, in the process that is killed.
+
+    Args:
+        path: Port of the controller.
+        url: Address of the camera.
+        width: Width of the camera's images (pixels).
+        height: Height of the camera's images (pixels).
+    """
     camera = hardware.CameraConfig(url, width, height, lock=False, buffer=8)
     settled = hardware.Settling(visual_s=0.15, tactile_s=0.15)
     leds = hardware.Leds.connect(path, watchdog_ms=WATCHDOG_MS)
@@ -343,7 +366,10 @@ def kill(bench: Bench, count: Count) -> None:
         wait_s = time.monotonic() + bench.draw.uniform(0, 3)
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
-            raise RuntimeError(f"the program that is to be killed ended with {process.poll()} or set no light")
+            raise RuntimeError(
+                "no light was on when the reading program was to be killed (status of the program: "
+                f"{process.poll()}, None if it still runs)"
+            )
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed_s = time.monotonic()
@@ -365,7 +391,7 @@ def _until(condition: Callable[[], bool], limit_s: float) -> None:
 
 
 def measure(args: Args) -> dict[str, Count]:
-    """Inject the faults in random order, all kinds equally often."""
+    """Inject the faults in random order, all kinds equally often, and return the results by kind."""
     kinds = list(args.only) or [*KINDS, KILLED]
     order = [kinds[i % len(kinds)] for i in range(args.number)]
     random.Random(args.seed).shuffle(order)
@@ -384,7 +410,16 @@ def measure(args: Args) -> dict[str, Count]:
 
 
 def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
-    """Inject some faults into one sensor, whose lag and exposure time are drawn at random."""
+    """Inject faults into one emulated sensor with a random lag and a random exposure time.
+
+    Args:
+        order: Kinds of the faults, in their order. Programs are killed after all other faults.
+        seed: Seed of all random numbers.
+        long: Share of the faults of variable length that last 5 to 7 s.
+
+    Returns:
+        The results by kind.
+    """
     counts = {kind: Count() for kind in order}
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), random.Random(seed), long)
@@ -401,7 +436,7 @@ def measure_part(order: list[str], seed: int, long: float) -> dict[str, Count]:
 
 
 def report(counts: dict[str, Count]) -> str:
-    """The table."""
+    """Format the results as a table with a row for each kind of fault."""
     lines = [
         "fault                 injected  images  wrong  old  longest read (s)  limit (s)  recovered  after (s)  "
         "reads with errors"
@@ -433,7 +468,7 @@ def report(counts: dict[str, Count]) -> str:
 
 
 def main(args: Args) -> str:
-    """Inject the faults and return the table."""
+    """Inject the faults, write the table to `--out` if given, and return it."""
     begun_s = time.monotonic()
     counts = measure(args)
     text = report(counts)

@@ -1,11 +1,11 @@
-"""Waiting times of a new user (first image, another resolution, gradient, simulation) and the rate of `vmap`.
+"""Waiting times of a new user (first image, another resolution, gradient, simulation), and frames/s of `jax.vmap`.
 
     python -m benchmarks.first_hour            # about six minutes on two CPU cores
     python -m benchmarks.first_hour --vmap     # only the rates of `jax.vmap` and `jax.lax.map`
 
-The waiting times are the seconds of each step in two fresh processes. The first process starts with an empty
-compilation cache, and the second one with the cache that the first one left. Rates are medians of seven calls with 32
-poses at 64x64 in this process. Prints two tables and writes no files.
+The waiting times are the seconds of each step in two new processes. The first process starts with an empty compilation
+cache, and the second one with the cache that the first one left. A rate is the number of frames or gradients per
+second, the median of seven calls with 32 poses at 64x64. Prints two tables and writes no files.
 """
 
 import dataclasses
@@ -30,11 +30,11 @@ FRAMES = 32
 class Args:
     """Options of the command line."""
 
-    vmap: bool = False  # print the rates only
+    vmap: bool = False  # print only the rates of `jax.vmap` and `jax.lax.map`
 
 
 def waiting() -> None:
-    """Print the seconds of each step, with an empty and with a kept compilation cache."""
+    """Print the seconds of each step, with an empty compilation cache and with the cache of an earlier process."""
     with tempfile.TemporaryDirectory() as folder:
         runs = [fresh.call("benchmarks.instruments.first_steps.stamps", cache=Path(folder)) for _ in range(2)]
     print(f"{'seconds, each step by itself':<32}{'empty cache':>12}{'kept cache':>12}")

@@ -1,16 +1,19 @@
-"""Known differences between two sets of images, and the distances of `experiments.gap` for them.
+"""Check of `experiments.gap`: its distances between sets of images whose differences are known.
 
     python -m benchmarks.gap                                                  # about ten minutes
     python -m benchmarks.gap --out benchmarks/results/gap/known.txt           # also write the table
 
-No real sensor is measured. The digital twin with its imperfections stands for the device, and the same twin without any
-for the simulation. Both run on a virtual clock with equal seeds, and their logs must show the same poses. Writes
-`WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`, which are sessions for
+No hardware is needed. The digital twin with its default imperfections (noise, vignetting, leaking light, JPEG, fisheye
+lens) takes the place of the real sensor. The same twin with almost no imperfections is the simulation ("clean"). Both
+run on a virtual clock with equal seeds, and the benchmark stops if their logs show different poses. It records two
+sessions, `WORKDIR/device` with its sensor file `WORKDIR/sensor.json`, and `WORKDIR/clean`. `experiments.gap` compares
+them:
 
     python -m experiments.gap --real runs/gap-twin/device --sensor runs/gap-twin --simulated runs/gap-twin/clean
 
-The table adds one imperfection at a time to the images of the clean session and compares them with the images
-themselves. Two rows have no difference: the two halves of the clean session, and two draws of the twin's noise.
+Each row of the table adds one imperfection to the images of the clean session, and has the distances between the
+changed and the clean images. Two further rows compare images that differ by chance only: the two halves of the clean
+session, and two draws of the twin's noise.
 """
 
 import contextlib
@@ -38,10 +41,10 @@ from sts_jax.hardware.twin import photometry
 SIZE = (480, 640)  # height and width of the twin's frames
 ON = (255, 255, 255, 255)
 OFF = (0, 0, 0, 0)
-SETTLE_S = 0.1  # between a switch and a frame
-MOTION_RATE = 0.5  # drawn poses per second of the motion, which nobody looks at
-LONGEST_S = 60.0  # of a motion
-# Without light losses, noise and lens. The rest of the JPEG's error is below a grey level
+SETTLE_S = 0.1  # time between a switch of the light and a frame
+MOTION_RATE = 0.5  # rendered poses per second of the motion. Few, because only images at rest are read
+LONGEST_S = 60.0  # longest time until the object is at rest
+# No leaking light, no vignetting, no noise. The error of this JPEG quality is below one grey level
 CLEAN = twin.Imperfections(leakage=0.0, vignetting=0.0, read_noise=0.0, full_well=1e12, jpeg_quality=100)
 
 
@@ -49,15 +52,21 @@ CLEAN = twin.Imperfections(leakage=0.0, vignetting=0.0, read_noise=0.0, full_wel
 class Args:
     """Options of the command line."""
 
-    workdir: Folder = Path("runs/gap-twin")  # for both sessions
-    trajectories: int = 40
-    resolution: tuple[int, int] = (240, 320)  # height and width at which images are compared, pixels
-    seed: int = 0  # of the object, the trajectories and the noise
-    out: Path | None = None  # text file for the table
+    workdir: Folder = Path("runs/gap-twin")  # folder for both sessions and the sensor file
+    trajectories: int = 40  # number of trajectories in each session
+    resolution: tuple[int, int] = (240, 320)  # height and width at which images are compared (pixels)
+    seed: int = 0  # seed of the object, the trajectories and the noise
+    out: Path | None = None  # text file for the table (default: print only)
 
 
 def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | None) -> twin.Twin:
-    """A twin of a small camera on a virtual clock."""
+    """Make a digital twin on a virtual clock, with an object of the class `camera`.
+
+    Args:
+        seed: Seed of the object, its motion and the noise.
+        imperfections: Imperfections of the twin's images.
+        lens: Fisheye lens of the twin. None: a pinhole.
+    """
     sensor = sts.Sensor()
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(seed), "camera"), resolution=SIZE, motion_rate=MOTION_RATE, seed=seed
@@ -67,7 +76,14 @@ def make(seed: int, imperfections: twin.Imperfections, lens: hardware.Lens | Non
 
 
 def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
-    """Both streams of an object at rest, and its pose from the twin's log."""
+    """Take both images of an object at rest.
+
+    Returns:
+        The visual and the tactile image, and the object's pose (7 numbers) from the twin's log.
+
+    Raises:
+        AssertionError: The light changed during an exposure, or the object moved between both images.
+    """
     shots, poses = [], []
     streams: tuple[tuple[Literal["visual", "tactile"], tuple[int, ...], float], ...] = (
         ("visual", OFF, 0.0),
@@ -78,18 +94,24 @@ def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
         device.step(SETTLE_S)
         truth, image = device.capture()
         if not truth.lowest == truth.highest == light:
-            raise AssertionError(f"the {stream} frame has the light {truth.lowest} to {truth.highest}")
+            raise AssertionError(
+                f"the light of the {stream} frame must be {light} throughout, got {truth.lowest} to {truth.highest}"
+            )
         after = device.ping()
         shots.append(hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s))
         assert truth.pose is not None
         poses.append(truth.pose)
     device.set(OFF)
-    assert poses[0] == poses[1], "the object has moved between both streams"
+    assert poses[0] == poses[1], "the object moved between the visual and the tactile image"
     return hardware.Pair(*shots), poses[0]
 
 
 def release(device: twin.Twin) -> None:
-    """Let the object go, and wait until it is still."""
+    """Let the object go, and wait until it is at rest.
+
+    Raises:
+        AssertionError: The object still moves after `LONGEST_S`.
+    """
     device.command("release")
     until_s = device.now_s + LONGEST_S
     while device.state.phase != twin.Phase.STILL:
@@ -100,7 +122,7 @@ def release(device: twin.Twin) -> None:
 
 @contextlib.contextmanager
 def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
-    """A session of the twin."""
+    """Open a session in a folder, and write all of its images at the end. `note` describes the session."""
     origin = hardware.Origin(note, "TWIN", SIZE[1], SIZE[0], ON)
     with hardware.Session.open(folder, origin) as session:
         yield session
@@ -108,11 +130,27 @@ def recording(folder: Path, note: str) -> Iterator[hardware.Session]:
 
 
 def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> list[tuple[float, ...]]:
-    """Record trajectories. Returns the poses of all pairs, from the twin's log."""
+    """Record trajectories of the twin: one pair of images of the held object, and one at rest.
+
+    Args:
+        device: The twin.
+        folder: Folder of the session.
+        count: Number of trajectories.
+        note: Name of the session, for its description and the progress bar.
+        bar: Progress bar.
+
+    Returns:
+        The poses (7 numbers) of all pairs, from the twin's log.
+
+    Raises:
+        ValueError: The folder has trajectories already.
+    """
     poses = []
     with recording(folder, note) as session:
         if session.confirmed:
-            raise ValueError(f"{folder} has {session.confirmed} trajectories already: delete it, or give --workdir")
+            raise ValueError(
+                f"{folder} has {session.confirmed} trajectories already: delete the folder, or choose another --workdir"
+            )
         for done in range(count):
             bar(note, done, count)
             session.check_ready()
@@ -131,7 +169,11 @@ def record(device: twin.Twin, folder: Path, count: int, note: str, bar: Bar) -> 
 
 
 def sessions(args: Args) -> hardware.Recordings:
-    """Record both sessions and write the sensor file of the device. Returns the clean one."""
+    """Record both sessions, write the sensor file of `device`, and return the recordings of `clean`.
+
+    Raises:
+        AssertionError: The logs of both twins show different poses.
+    """
     lens = hardware.Lens.ideal(SIZE[1], SIZE[0])
     poses = []
     with Bar() as bar:
@@ -139,7 +181,7 @@ def sessions(args: Args) -> hardware.Recordings:
             with make(args.seed, imperfections, own) as device:
                 poses.append(record(device, args.workdir / name, args.trajectories, name, bar))
     if poses[0] != poses[1]:
-        raise AssertionError("the logs of both twins show different poses")
+        raise AssertionError("the logs of the two twins show different poses, although their seeds are equal")
     hardware.Device(
         camera="http://127.0.0.1/camera",
         fps=30.0,
@@ -158,14 +200,14 @@ def sessions(args: Args) -> hardware.Recordings:
 class Difference:
     """A known difference from clean images."""
 
-    name: str
+    name: str  # title of the row in the table
     imperfections: twin.Imperfections = CLEAN
-    lens: bool = False  # the fisheye lens
-    rectified: bool = True  # undo the lens again
+    lens: bool = False  # apply the fisheye lens
+    rectified: bool = True  # rectify the images of the lens
 
 
 def levels(field: str, values: tuple[Any, ...]) -> list[Difference]:
-    """One imperfection with growing values."""
+    """Make a difference for each value of one field of `twin.Imperfections`."""
     return [Difference(f"{field} {value:g}", dataclasses.replace(CLEAN, **{field: value})) for value in values]
 
 
@@ -182,7 +224,14 @@ DIFFERENCES = (
 
 
 def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, int], seed: int) -> gap.Streams:
-    """Images with a known difference from clean ones, at a resolution."""
+    """Change clean images by a known difference.
+
+    Args:
+        clean: Clean images at the size of the camera, uint8.
+        difference: The difference.
+        resolution: Height and width of the result (pixels).
+        seed: Seed of the noise.
+    """
     sensor, (height, width) = sts.Sensor(), clean.visual.shape[1:3]
     lens = hardware.Lens.ideal(width, height)
     blender = photometry.Blender(
@@ -206,12 +255,19 @@ def changed(clean: gap.Streams, difference: Difference, resolution: tuple[int, i
 
 
 def reduced(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """An image of the same aspect ratio at a resolution."""
+    """Resize an image to a smaller resolution (height, width) of the same aspect ratio."""
     return cv2.resize(image, resolution[::-1], interpolation=cv2.INTER_AREA)
 
 
 def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) -> str:
-    """The distances of both streams."""
+    """Format a row of the table: the distances between two sets of images, for both streams.
+
+    Args:
+        name: Name of the row.
+        first: First set.
+        second: Second set.
+        matched: The images of both sets show the same scenes in the same order, so that pixels can be compared.
+    """
     words = [f"{name:36s}"]
     for stream in ("visual", "tactile"):
         one, two = getattr(first, stream), getattr(second, stream)
@@ -226,11 +282,11 @@ def row(name: str, first: gap.Streams, second: gap.Streams, *, matched: bool) ->
 
 
 def table(clean: gap.Streams, resolution: tuple[int, int]) -> Iterator[str]:
-    """The lines of the table.
+    """Compare clean images with changed ones, and yield the lines of the table.
 
     Args:
         clean: Images of the clean session at the size of the camera.
-        resolution: At which images are compared.
+        resolution: Height and width at which images are compared (pixels).
     """
     visual, tactile = (np.stack([reduced(image, resolution) for image in images]) for images in clean[:2])
     shown = gap.Streams(visual, tactile, clean.group)
@@ -251,15 +307,18 @@ def main(args: Args) -> None:
     """Record both sessions, then print the table.
 
     Raises:
-        ValueError: An option is out of range.
+        ValueError: An option is out of range, or the work directory has recorded trajectories.
     """
     if args.trajectories < 2 * gap.FOLDS:
         raise ValueError(
-            f"trajectories must be >= {2 * gap.FOLDS}, so that both halves can be compared, got {args.trajectories}"
+            f"--trajectories must be >= {2 * gap.FOLDS}, so that two halves can be compared, got {args.trajectories}"
         )
     height, width = args.resolution
     if min(args.resolution) < gap.LEAST_SIDE or not math.isclose(width / height, SIZE[1] / SIZE[0]):
-        raise ValueError(f"resolution must be of the aspect {SIZE} and >= {gap.LEAST_SIDE}, got {args.resolution}")
+        raise ValueError(
+            f"--resolution must be of the aspect ratio {SIZE[0]}:{SIZE[1]} (height:width) with sides of at least "
+            f"{gap.LEAST_SIDE} pixels, got {height} x {width}"
+        )
     if args.out is not None:
         output.make_folder(args.out.parent)
     recordings = sessions(args)

@@ -1,22 +1,25 @@
-"""The influence of hidden properties on the outcome, and the information that touch and images give about them.
+"""Influence of hidden properties on the outcome, and the information about them in touch and in images.
 
     python -m benchmarks.hidden                 # the jerked pad, about half an hour on two CPU cores
     python -m benchmarks.hidden outcomes truth  # some of the parts outcomes, truth, pictures, fill
-    python -m benchmarks.hidden --keep FOLDER   # keep starts and outcomes there, and resume from them
+    python -m benchmarks.hidden --keep FOLDER   # keep starts and outcomes in a folder, and resume from it
     python -m benchmarks.hidden outcomes truth --scenario inclined --soaked FOLDER  # starts from `benchmarks.soak`
 
-- `outcomes`: shares of the outcomes, and share of the starts that end differently when only the fill (on the slope, the
-  fill and its direction) is drawn again.
-- `truth`: log loss of a classifier of the outcome that has the exact shape, start and jerk (on the slope, the pose up
-  to `slope_features.SEEN`), and of one that also has a noisy measurement of touch. The gain is the relative decrease of
-  the loss.
-- `pictures`: the same with the measurement that a small network reads from the first uint8 tactile frame. The network
-  is trained on other objects.
-- `fill`: AUC of a small network that separates full from empty objects in frames in the air, in the same frames with
-  the fuller objects painted, and in tactile frames. For the jerked pad only, where containers stand.
+Hidden properties are those that a camera cannot see, such as the fill level of a bottle. The parts are:
 
-Folds and 95 % intervals are by object. Everything is simulated once with the defaults of the scenario, and printed. The
-features of the classifiers are in `benchmarks.instruments`.
+- `outcomes`: the share of each outcome. Also the share of the starts whose outcome changes if only the hidden contents
+  are drawn again, which are the fill level and, on the slope, also the side on which the contents lie.
+- `truth`: the log loss of two classifiers of the outcome. The first one knows the exact shape, the start and the jerk
+  (on the slope, the pose with the noise `slope_features.SEEN`). The second one also has a noisy measurement of touch:
+  the weight on the jerked pad, the centre of pressure on the slope. The gain is the relative decrease of the loss.
+- `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
+  network is trained on other objects.
+- `fill`: the AUC of a small network that separates objects that are more than half full from emptier ones. Its inputs
+  are visual images of objects in the air, the same images with a tint on the fuller objects, or tactile images. This
+  part exists for the jerked pad only, where the containers stand.
+
+Cross-validation folds and 95 % intervals are by object. The starts are simulated with the defaults of the scenario. All
+results are printed. The features of the classifiers are in `benchmarks.instruments`.
 """
 
 import dataclasses
@@ -38,22 +41,22 @@ from sts_jax.evaluation import metrics
 
 Part = Literal["outcomes", "truth", "pictures", "fill"]
 TINT = 0.1  # share of white in the colours of painted objects (linear light)
-OTHERS = 1_000_000  # keys of the objects on which networks are trained begin here
-EXAMPLES = 8  # starts of each of these objects
+OTHERS = 1_000_000  # number of the first object on which networks are trained, far beyond the numbers under study
+EXAMPLES = 8  # starts of each object on which networks are trained
 
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """The study of one scenario."""
+    """The settings of the study of one scenario."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # parts that exist for the scenario
     scenario: physics.Scenario
-    categories: tuple[str, ...]  # categories of the objects, in turn
+    categories: tuple[str, ...]  # classes of the objects, in turn
     reroll: tuple[str, ...]  # fields of `physics.Hidden` that are drawn again
-    touch: Callable[[Starts], np.ndarray]  # (n, k) exact measurement of touch, nan without contact
-    noise: float  # standard deviation of the measurement in each column
-    noise_name: str
-    # Features (n, k), given the scenario, the bodies, their starts and their touch, which may be None.
+    touch: Callable[[Starts], np.ndarray]  # returns the exact measurement of touch (n, k), nan without contact
+    noise: float  # standard deviation of the noise that is added to the measurement
+    noise_name: str  # the noisy measurement in the printed lines
+    # returns the features (n, k) of a classifier from scenario, bodies, starts, and touch (n, k) or None
     features: Callable[[Any, list[objects.Body], Starts, np.ndarray | None], np.ndarray]
 
 
@@ -78,7 +81,7 @@ STUDIES = {
         features=jerk_features.shaken,
     ),
     "inclined": Study(
-        parts=("outcomes", "truth", "pictures"),  # full and empty containers can be compared only where they stand
+        parts=("outcomes", "truth", "pictures"),  # `fill` compares containers that stand
         scenario=physics.Inclined(),
         categories=objects.CATEGORIES,
         reroll=("fill", "up"),
@@ -95,15 +98,15 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: The scenario lacks one of the parts, or an option would be ignored beside `soaked`.
+        ValueError: The scenario lacks one of the parts, or `soaked` is combined with an option that it replaces.
     """
 
-    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # default: all parts of the scenario
-    scenario: Literal["perturbed", "inclined"] = "perturbed"
-    objects: int | None = None  # simulated objects (default: 200)
-    num: int = 16  # simulated starts of each object
-    again: int | None = None  # starts of each object that are simulated again (default: 8)
-    others: int = 800  # objects on which the networks are trained
+    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts to print (default: all parts of the scenario)
+    scenario: Literal["perturbed", "inclined"] = "perturbed"  # the jerked pad, or the slope
+    objects: int | None = None  # number of simulated objects (default: 200)
+    num: int = 16  # number of simulated starts of each object
+    again: int | None = None  # starts of each object that are simulated again with new contents (default: 8)
+    others: int = 800  # number of objects on which the networks are trained
     steps: int = 1500  # training steps of the networks
     keep: Path | None = None  # folder that keeps starts and outcomes, from which the next call resumes
     soaked: Path | None = None  # folder of kept blocks of `benchmarks.soak`, used instead of simulated starts
@@ -111,14 +114,14 @@ class Args:
     def __post_init__(self) -> None:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
-            raise ValueError(f"parts is {' '.join(unknown)}, but the parts of {self.scenario} are {', '.join(known)}")
+            raise ValueError(f"parts of {self.scenario} must be some of {', '.join(known)}, got {' '.join(unknown)}")
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:
             raise ValueError(f"--soaked provides the starts, so leave out {' and '.join(unused)}")
 
 
 def outcomes(study: Study, starts: Starts) -> None:
-    """Print the shares of the outcomes, of unsettled starts, and of starts that end differently with another fill."""
+    """Print the shares of outcomes, of unsettled starts, and of starts whose outcome changes with other contents."""
     share = functools.partial(classifier.interval, classifier.mean, groups=starts.body)
     for outcome in study.scenario.outcomes:
         print(f"{outcome.name.lower():30s} {share(starts.outcome == outcome)}")
@@ -132,14 +135,31 @@ def outcomes(study: Study, starts: Starts) -> None:
 
 
 def losses(study: Study, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Log loss (n,) of the outcomes that a classifier predicts from the true states, and from `touch` if given."""
+    """Log loss of a classifier of the outcome.
+
+    Args:
+        study: The study.
+        items: The objects.
+        starts: Their starts, one row each.
+        touch: Measurement of touch, `(n, k)`, nan without contact. None: the classifier has vision only.
+
+    Returns:
+        The loss of each start, `(n,)`, from a classifier that was fitted to other objects.
+    """
     label = np.searchsorted(np.sort(study.scenario.outcomes), starts.outcome)
     features = study.features(study.scenario, items, starts, touch)
     return metrics.log_loss(classifier.probabilities(features, label, starts.body), label)
 
 
 def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndarray | None) -> None:
-    """Print the log losses of classifiers on true states and, if given, with the touch `read` from images."""
+    """Print the log losses of classifiers without and with touch, and the gain from touch.
+
+    Args:
+        study: The study.
+        items: The objects.
+        starts: Their starts.
+        read: Measurement of touch that a network estimated from images, `(n, k)`. None: omit its lines.
+    """
     exact = study.touch(starts)
     rough = exact + study.noise * np.random.default_rng(0).normal(size=exact.shape)
     interval = functools.partial(classifier.interval, groups=starts.body)
@@ -159,35 +179,71 @@ def gains(study: Study, items: list[objects.Body], starts: Starts, read: np.ndar
 
 
 def lesson(study: Study, items: list[objects.Body], starts: Starts, others: int) -> Lesson:
-    """Simulate the first frames of training objects, and render the tactile frames of these and of the starts."""
+    """Make the training data of the networks, and the images to which the networks are applied.
+
+    Args:
+        study: The study.
+        items: The objects under study.
+        starts: Their starts.
+        others: Number of training objects.
+    """
     rest = bodies(study.categories, others, OTHERS)
     learned = roll(jax.random.key(1), rest, dataclasses.replace(study.scenario, frames=1), EXAMPLES)
     return Lesson(rest, learned, draw(rest, learned)[1], draw(items, starts)[1])
 
 
 def pictures(study: Study, learned: Lesson, starts: Starts, steps: int) -> np.ndarray:
-    """Touch (n, k) as a network reads it from the tactile frames of the starts, nan without contact."""
+    """Estimate touch from tactile images with a network.
+
+    Args:
+        study: The study.
+        learned: Training data of the network, and the images under study.
+        starts: The starts under study.
+        steps: Training steps of the network.
+
+    Returns:
+        The measurement of touch, `(n, k)`, nan without contact.
+    """
     touch = study.touch(learned.starts)
     known = np.isfinite(touch).all(1)
     read = cnn.fit(jax.random.key(0), learned.examples[known], touch[known], steps=steps)(learned.tactile)
-    return np.where(np.isfinite(study.touch(starts)), read, np.nan)  # contact is taken as known
+    return np.where(np.isfinite(study.touch(starts)), read, np.nan)  # the network need not detect missing contact
 
 
 def painted(body: objects.Body) -> objects.Body:
-    """The body with a share TINT of white in its colours."""
+    """Mix the share TINT of white into the colours of a body."""
     return dataclasses.replace(body, colors=(1 - TINT) * body.colors + TINT)
 
 
 def aloft(key: PRNGKeyArray, items: list[objects.Body], num: int) -> tuple[Starts, np.ndarray, np.ndarray]:
-    """Starts of freefall, visual frames of the objects in the air, and these frames with the fuller objects painted."""
-    starts = roll(key, items, physics.Freefall(frames=11), num)  # the fewest in which a fall can end
+    """Render falling objects in the air.
+
+    Args:
+        key: Random key.
+        items: The objects.
+        num: Number of starts of each object.
+
+    Returns:
+        The starts, their visual images, and the same images in which objects that are more than half full are painted,
+        uint8 `(n, 64, 64, 3)` each.
+    """
+    starts = roll(key, items, physics.Freefall(frames=11), num)  # 11 frames are the minimum of the scenario
     plain, _ = draw(items, starts)
     both, _ = draw([painted(body) for body in items], starts)
     return starts, plain, np.where((starts.fill > 0.5)[:, None, None, None], both, plain)
 
 
 def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_out: Starts, steps: int) -> None:
-    """Print the AUC of a network that detects, in frames of held-out objects, which of them are more than half full."""
+    """Print the AUC of a network that detects in images of held-out objects which of them are more than half full.
+
+    Args:
+        name: Name of the images.
+        images: Training images, uint8 `(n, h, w, 3)`.
+        starts: Starts that the training images show.
+        new: Images of held-out objects, uint8 `(m, h, w, 3)`.
+        held_out: Starts that the held-out images show.
+        steps: Training steps of the network.
+    """
     read = cnn.fit(jax.random.key(1), images, starts.fill[:, None] > 0.5, steps=steps)
     label, score = held_out.fill > 0.5, read(new)[:, 0]
     figure = classifier.interval(metrics.auc, label, score, groups=held_out.body)
@@ -195,8 +251,17 @@ def detect(name: str, images: np.ndarray, starts: Starts, new: np.ndarray, held_
 
 
 def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, steps: int) -> None:
-    """Print how well full objects are told from empty ones (AUC): from touch, from pictures of the objects in the air,
-    and from such pictures of objects whose colour shows the fill.
+    """Print the AUCs of networks that separate fuller from emptier objects.
+
+    The networks see tactile images of standing objects, visual images of objects in the air, or such images with a tint
+    on the fuller objects. The last case tests that the network detects a fill that is visible.
+
+    Args:
+        learned: Training data, and the tactile images under study.
+        items: The objects under study.
+        starts: Their starts.
+        num: Number of falls of each object under study.
+        steps: Training steps of the networks.
     """
     detect("touch, standing", learned.examples, learned.starts, learned.tactile, starts, steps)
     flying, plain, tinted = aloft(jax.random.key(2), learned.items, EXAMPLES)
@@ -206,7 +271,7 @@ def fill(learned: Lesson, items: list[objects.Body], starts: Starts, num: int, s
 
 
 def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
-    """The objects and their starts: soaked, kept or simulated now."""
+    """Return the objects and their starts, which are loaded from `--soaked` or `--keep`, or simulated."""
     if args.soaked is not None:
         starts = soak.soaked(args.soaked, args.scenario)
         return bodies(study.categories, int(starts.body.max()) + 1), starts
@@ -221,7 +286,7 @@ def begun(study: Study, args: Args) -> tuple[list[objects.Body], Starts]:
 
 
 def main(args: Args) -> None:
-    """Simulate the necessary starts and print the parts."""
+    """Load or simulate the starts, and print the requested parts."""
     study = STUDIES[args.scenario]
     parts = set(args.parts or study.parts)
     items, starts = begun(study, args)

@@ -1,26 +1,29 @@
-"""Shares of rest poses and outcomes at half the time step, in the mirror, and in C MuJoCo.
+"""Shares of rest poses and outcomes, compared with half the time step, mirrored scenes, and C MuJoCo.
 
     python -m benchmarks.invariance             # 4,000 runs per side, about 50 minutes on two idle cores
     python -m benchmarks.invariance --num 300   # about 5 minutes
     python -m benchmarks.invariance --only jerked-bottles
 
-Prints, for each outcome, its shares on two sides and the interval of their difference, and writes no files. A box and a
-bottle are released 20 mm above the pad in any orientation, and their runs are labelled by the face that is down at the
-end. Bottles on the jerked pad are labelled by outcome. A side is one way to compute the same runs:
+There are three cases. A box and a bottle are released 20 mm above the pad in any orientation, and each run is labelled
+by the face that is down at the end. Bottles on the jerked pad are labelled by outcome. Each case is computed in several
+ways, which are called sides:
 
-- `simulate` in MJX ("ours")
+- "ours": `simulate` with MJX
 - the same with half the time step
 - the same with start, jerk and object mirrored
-- `simulate` in C MuJoCo, with the same two variants
-- C MuJoCo alone, which finds the contacts of the mesh
-- C MuJoCo with every vertex of the hull as a contact point. It uses its own contacts of the mesh at the pad's rims only
-- for jerked bottles, the same with a pad that is driven on slides, under constant gravity
+- `simulate` with C MuJoCo, also with half the time step and mirrored
+- "C MuJoCo": C MuJoCo with a plain model, in which it finds the contacts of the mesh itself
+- "C, every vertex": C MuJoCo with a contact sphere at every vertex of the hull. Its own contacts of the mesh are used
+  at the pad's rims only, where no vertex touches
+- "C, every vertex, driven pad", for jerked bottles only: the same, but the pad is accelerated on slides under constant
+  gravity. On all other sides, the pad is fixed and the jerk is a change of gravity
 
-C MuJoCo keeps four contacts of a mesh that stands on a face. A round base then becomes a square, up to 30 % narrower,
-which rocks and walks more. With every vertex as a contact, C MuJoCo has the same contacts as ours.
+C MuJoCo keeps at most four contacts of a mesh that stands on a face. A round base thus becomes a square that is up to
+30 % narrower, and rocks and walks more. With a contact at every vertex, C MuJoCo has the same contacts as ours.
 
-All sides have the same starts and hidden values, so the interval of a difference is that of paired shares (Agresti and
-Min 2005: 95 %, half a count added to each cell).
+The command prints the share of each label on our side and on each other side, with the 95 % interval of the difference.
+All sides have the same starts and hidden values, so this is the interval for paired shares (Agresti and Min 2005, with
+half a count added to each cell). The command writes no files.
 """
 
 import concurrent.futures
@@ -45,13 +48,13 @@ from sts_jax.physics import scene
 from sts_jax.physics.scenario import Shape, Start
 from sts_jax.sensor import Sensor
 
-MARGIN = 0.05  # largest allowed difference of a share
+MARGIN = 0.05  # limit for the ends of the interval of a difference of shares
 BOX = (0.06, 0.04, 0.025)  # m
-DROP = physics.Freefall(height=0.02, spread=0.02, frames=36)  # m, m. After 1.1 s, few still move
+DROP = physics.Freefall(height=0.02, spread=0.02, frames=36)  # m, m, 1.1 s. Few objects still move at the end
 SHAKE = physics.Perturbed(frames=36)
 POINT = 1e-6  # m, radius of the contact sphere at each vertex
-CARRIAGE = 1e5  # kg, mass of the driven pad, a million times an object's
-MESH_GAP = 0.001  # m, depth from which the mesh pushes beside such vertices: only at rims, where no vertex is
+CARRIAGE = 1e5  # kg, mass of the driven pad, a million times the mass of an object
+MESH_GAP = 0.001  # m, depth from which the mesh itself pushes, if its vertices are contacts: reached only at rims
 UP = math.cos(math.radians(20))  # cosine of the largest lean of an object that rests on a face
 
 
@@ -59,55 +62,55 @@ UP = math.cos(math.radians(20))  # cosine of the largest lean of an object that 
 class Args:
     """Options of the command line."""
 
-    num: int = 4000  # runs per side
-    only: Literal["box", "bottle", "jerked-bottles"] | None = None  # one case (default: all)
+    num: int = 4000  # number of runs of each case on each side
+    only: Literal["box", "bottle", "jerked-bottles"] | None = None  # the only case to compute (default: all)
 
 
 class MirroredFreefall(physics.Freefall):
-    """The mirror image of each fall, for objects from `objects.mirror`."""
+    """Freefall with mirrored starts, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """See `Freefall.start`."""
+        """Mirror the start that `Freefall.start` draws for the unmirrored shape."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
 class MirroredPerturbed(physics.Perturbed):
-    """The mirror image of each start and jerk, for objects from `objects.mirror`."""
+    """Perturbed with mirrored starts and jerks, for objects from `objects.mirror`."""
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """See `Perturbed.start`."""
+        """Mirror the start that `Perturbed.start` draws for the unmirrored shape."""
         return mirror(super().start(key, mirror_shape(shape), pad))
 
 
 def mirror(start: Start) -> Start:
-    """Mirror a start and its condition: y becomes -y."""
+    """Mirror a start and its condition, so that y becomes -y."""
     return start._replace(pose=turn(start.pose, 4), condition=turn_condition(start.condition, 4))
 
 
 def mirror_shape(shape: Shape) -> Shape:
-    """Mirror a shape, as `objects.mirror` does a body."""
+    """Mirror a shape, as `objects.mirror` mirrors a body."""
     flip = np.array([1, -1, 1], np.float32)
     return shape._replace(points=shape.points * flip, rests=shape.rests * flip, coms=shape.coms * flip)
 
 
 class Case(NamedTuple):
-    """A scenario, its bodies, and the labels of the ends of its runs."""
+    """A scenario, its bodies, and the labels of its final states."""
 
     name: str
     scenario: physics.Freefall | physics.Perturbed
-    mirrored: physics.Freefall | physics.Perturbed
+    mirrored: physics.Freefall | physics.Perturbed  # the same scenario with mirrored starts
     bodies: list[objects.Body]
     labels: tuple[str, ...]
     label: Callable[[Float[Array, "7"], Float[Array, "7"]], Array]  # index of the label, from the first and last poses
 
 
 def box() -> objects.Body:
-    """A solid box of 500 kg/m^3."""
+    """Make a solid box of the size BOX and the density 500 kg/m^3."""
     corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), -1).reshape(-1, 3) * np.array(BOX) / 2
     mass = 500 * math.prod(BOX)
     x, y, z = np.square(BOX)
     return dataclasses.replace(
-        objects.make(jax.random.key(0), "fork"),  # solid. Its looks and category do not matter here
+        objects.make(jax.random.key(0), "fork"),  # a solid body, whose hull and mass properties are replaced
         hulls=jnp.asarray(np.concatenate([corners, np.repeat(corners[-1:], 24, 0)])[None], jnp.float32),
         shell_mass=jnp.float32(mass),
         shell_com=jnp.zeros(3),
@@ -116,7 +119,7 @@ def box() -> objects.Body:
 
 
 def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
-    """The axis that is vertical at the end (0, 1 or 2), or 3 if none is, or 4 if the box fell off."""
+    """Label of the box: the axis that is vertical at the end (0, 1 or 2), 3 if no axis is, 4 if the box fell off."""
     del first
     vertical = jnp.abs(geometry.quat_to_matrix(geometry.normalize(last[3:]))[2])
     face = jnp.where(jnp.max(vertical) > UP, jnp.argmax(vertical), 3)
@@ -124,7 +127,7 @@ def box_face(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
 
 
 def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
-    """0 if the bottle stands, 1 if it stands on its head, 2 if it lies, 3 if it fell off."""
+    """Label of the bottle: 0 if it stands, 1 if it stands on its head, 2 if it lies, 3 if it fell off."""
     del first
     up = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2]
     side = jnp.where(up > UP, 0, jnp.where(up < -UP, 1, 2))
@@ -132,7 +135,7 @@ def bottle_side(first: Float[Array, "7"], last: Float[Array, "7"]) -> Array:
 
 
 def cases() -> list[Case]:
-    """The cases: the box, the bottle and the jerked bottles."""
+    """Make the three cases: the box, the bottle and the jerked bottles."""
     bottles = [objects.make(jax.random.key(i), "bottle") for i in range(4)]
     squat = objects.make(jax.random.key(27), "bottle")  # 101 mm high, 44 mm wide
     small, middle, large = (f"on {1e3 * a:.0f} x {1e3 * b:.0f} mm" for a, b in ((BOX[1], BOX[2]), BOX[::2], BOX[:2]))
@@ -155,7 +158,19 @@ def roll(
     seed: int = 0,
     engine: physics.Engine = "mjx",
 ) -> physics.Trajectory:
-    """Simulate `num` runs of a case as NumPy arrays. `bodies` and `scenario` replace those of the case."""
+    """Simulate runs of a case.
+
+    Args:
+        case: The case.
+        num: Number of runs, rounded up to a multiple of the number of bodies.
+        bodies: Bodies that replace the case's bodies.
+        scenario: A scenario that replaces the case's scenario.
+        seed: Seed of starts and hidden values.
+        engine: Engine of `simulate`.
+
+    Returns:
+        The trajectories, as NumPy arrays.
+    """
     items = list(case.bodies if bodies is None else bodies)
     each = -(-num // len(items))
     with tqdm(total=each * len(items), desc=case.name, leave=False, disable=None) as bar:
@@ -172,20 +187,20 @@ def roll(
 
 
 def halved(scenario: physics.Freefall | physics.Perturbed) -> physics.Freefall | physics.Perturbed:
-    """The scenario with half the time step."""
+    """Halve the time step of a scenario."""
     return dataclasses.replace(
         scenario, contact=dataclasses.replace(scenario.contact, timestep=scenario.contact.timestep / 2)
     )
 
 
 def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, driven: bool) -> mujoco.MjModel:
-    """The scene for C MuJoCo.
+    """Compile the scene for C MuJoCo.
 
     Args:
         body: The object.
         contact: Constants of the contact.
         every_vertex: Add a contact sphere at every vertex of the hull. Otherwise C MuJoCo finds the mesh's contacts.
-        driven: Put the pad on two slides. Otherwise it is fixed.
+        driven: Put the pad on two slides, along x and y. Otherwise the pad is fixed.
     """
     gel, parts = Sensor().gel.size, np.asarray(body.hulls)
     xml = scene.scene_xml(parts, (float(gel[0]), float(gel[1])), contact)
@@ -206,10 +221,17 @@ def c_model(body: objects.Body, contact: physics.Contact, every_vertex: bool, dr
 
 
 def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = False, driven: bool = False) -> np.ndarray:
-    """Step trajectories in C MuJoCo from their first frames. Returns the last poses (n, 7) in the pad's frame.
+    """Simulate trajectories in C MuJoCo, from the first frames of given ones.
 
-    Gravity is the scenario's. If the pad is `driven`, gravity stays vertical, and the pad accelerates by the horizontal
-    part of gravity in the opposite direction.
+    Args:
+        case: The case.
+        traj: Trajectories of the case, whose starts and hidden values are used.
+        every_vertex: Add a contact sphere at every vertex of the hull.
+        driven: Keep gravity vertical and accelerate the pad, opposite to the horizontal part of the scenario's gravity.
+            Otherwise the pad is fixed and gravity is the scenario's.
+
+    Returns:
+        The last poses in the pad's frame, `(n, 7)`.
     """
     scenario = case.scenario
     times = np.arange(scenario.steps * (scenario.frames - 1)) * scenario.contact.timestep
@@ -241,7 +263,7 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
             for mass, com, inertia, friction in zip(*properties, hidden.friction, strict=True):
                 models.append(copy.copy(compiled[index]))
                 scene.set_rigid(models[-1], mujoco.MjData(models[-1]), mass, com, inertia, float(friction))
-                if driven:  # the solver converges slowly for masses this far apart
+                if driven:  # the solver converges slowly for the masses of the carriage and of an object
                     models[-1].stat.meaninertia = models[-1].dof_M0[2:].mean()
                     models[-1].opt.iterations, models[-1].opt.tolerance = 100, 1e-12
             starts = (traj.pose[own, 0].astype(np.float64), traj.velocity[own, 0].astype(np.float64))
@@ -251,19 +273,35 @@ def last_in_c(case: Case, traj: physics.Trajectory, *, every_vertex: bool = Fals
 
 
 def named(case: Case, first: Array | np.ndarray, last: Array | np.ndarray) -> np.ndarray:
-    """The index of the label of each run, from its first and last poses (n, 7)."""
+    """Index of the label of each run, `(n,)`, from its first and last poses, `(n, 7)` each."""
     return np.asarray(jax.vmap(case.label)(jnp.asarray(first), jnp.asarray(last)))
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Middle and half width of the 95 % interval of the share of b minus that of a, for the same runs."""
+    """95 % interval of the difference of two shares, for paired runs.
+
+    Args:
+        a: True for the runs that have a label on one side, `(n,)`.
+        b: The same for the other side, `(n,)`.
+
+    Returns:
+        Middle and half width of the interval of the share of b minus the share of a.
+    """
     gained, lost, count = np.sum(b & ~a) + 0.5, np.sum(a & ~b) + 0.5, len(a) + 2
     middle = (gained - lost) / count
     return middle, 1.96 * math.sqrt((gained + lost) / count - middle**2) / math.sqrt(count)
 
 
 def sides(case: Case, num: int) -> dict[str, np.ndarray]:
-    """Simulate all sides. Returns the index of the label of every run on each side, with `simulate` in MJX first."""
+    """Simulate a case on all sides.
+
+    Args:
+        case: The case.
+        num: Number of runs on each side.
+
+    Returns:
+        The index of the label of every run, by name of the side. Our side is the first.
+    """
     other_hand = [objects.mirror(body) for body in case.bodies]
     rolled: dict[str, physics.Trajectory] = {}
     sides_of: dict[str, physics.Engine] = {"ours": "mjx", "simulate in C": "mujoco"}
@@ -289,7 +327,16 @@ def sides(case: Case, num: int) -> dict[str, np.ndarray]:
 
 
 def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float = MARGIN) -> bool:
-    """Print the shares of every outcome on our side and on each other. Returns whether all agree within the margin."""
+    """Print the share of every label on our side and on each other side, with the interval of the difference.
+
+    Args:
+        found: Index of the label of every run, by name of the side, our side first.
+        labels: The labels.
+        margin: Limit for both ends of each interval.
+
+    Returns:
+        True if all intervals lie within the margin.
+    """
     ours, within = found["ours"], True
     for side, theirs in list(found.items())[1:]:
         print(f"    {side}: {100 * np.mean(ours == theirs):.1f} % of the runs end alike")
@@ -307,7 +354,7 @@ def compare(found: dict[str, np.ndarray], labels: Sequence[str], margin: float =
 
 
 def main(args: Args) -> None:
-    """Compare the sides of all cases, or of one."""
+    """Compare the sides of all cases, or of the case `--only`."""
     within = [compare(sides(case, args.num), case.labels) for case in cases() if args.only in (None, case.name)]
     print(f"every interval within {100 * MARGIN:.0f} points: {'yes' if all(within) else 'NO'}")
 

@@ -1,13 +1,16 @@
-"""Seconds of one training step and of one prediction of both models.
+"""Seconds of one training step and of one prediction, for the paper's model and for the state-space model.
 
     python -m benchmarks.learning               # about 3 minutes on two CPU cores
     taskset -c 0 python -m benchmarks.learning  # on one core
 
-The first step is that of the paper's model in freefall at batch 64 (three modalities, touch absent, every subset
-predicts all). It is compared with a plain implementation of the same step, which enumerates all seven subsets and uses
-XLA's convolutions and transposed convolutions. Then follow smaller batches, vision alone, a prediction at batch 1, a
-step of the state-space model as freefall trains it, and its prediction with 16 samples. The figures are medians of
-alternating calls, after one unmeasured call each. Prints a line for each and writes no files.
+The first line is a training step of the paper's model at batch 64, as in freefall: three modalities, of which touch is
+never an input, and a prediction of all modalities from every subset of the inputs. It is compared with a plain
+implementation of the step, which enumerates all seven subsets of the three modalities and uses XLA's convolutions and
+transposed convolutions. The next lines are training steps with smaller batches, a training step with vision alone, and
+a prediction at batch 1. The last lines are a training step of the state-space model in freefall, and its prediction
+with 16 samples.
+
+The figures are medians of alternating calls, after one unmeasured call each. The command writes no files.
 """
 
 from collections.abc import Callable
@@ -37,18 +40,24 @@ LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 
 def plain_conv(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """XLA's convolution, as `nnx.Conv` uses it."""
+    """Convolution of XLA with the arguments of `mvae.networks.conv`, as `nnx.Conv` calls it."""
     return jax.lax.conv_general_dilated(x, kernel, (stride, stride), [(padding,) * 2] * 2, dimension_numbers=LAYOUT)
 
 
 def plain_conv_transpose(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """XLA's transposed convolution, as `nnx.ConvTranspose` uses it."""
+    """Transposed convolution of XLA with the arguments of `mvae.networks.conv_transpose`, as in `nnx.ConvTranspose`."""
     pads = [(len(kernel) - 1 - padding,) * 2] * 2
     return jax.lax.conv_transpose(x, kernel[::-1, ::-1], (stride, stride), pads, dimension_numbers=LAYOUT)
 
 
 def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[[], None]:
-    """A function that runs a compiled training step of an `mvae` model on random data."""
+    """Make a function that runs one compiled training step of an `mvae` model on random data.
+
+    Args:
+        model: The model.
+        size: Batch size.
+        absent: Modalities that are targets and never inputs.
+    """
     rng = np.random.default_rng(0)
     data: dict[str, Any] = {
         m.name: rng.integers(0, 256, (size, *m.shape), dtype=np.uint8)
@@ -73,7 +82,7 @@ def stepper(model: mvae.Config, size: int, absent: tuple[str, ...]) -> Callable[
 
 
 def predictor(size: int) -> Callable[[], None]:
-    """A function that runs a compiled prediction of all modalities from vision."""
+    """Make a function that predicts all modalities of `MODEL` from `size` visual images, in one compiled call."""
     graphdef, params, stats = mvae.init(jax.random.key(0), MODEL)
     state = nnx.merge_state(params, stats)
     run = jax.jit(lambda state, x: mvae.predict(graphdef, state, {"visual": x}))
@@ -82,7 +91,11 @@ def predictor(size: int) -> Callable[[], None]:
 
 
 def state_stepper(size: int) -> Callable[[], None]:
-    """A function that runs a compiled training step of freefall's state-space model on random data."""
+    """Make a function that runs one compiled training step of freefall's state-space model on random data.
+
+    Args:
+        size: Batch size.
+    """
     rng, model = np.random.default_rng(0), statespace.Config()
     config = training.TrainConfig(batch_size=size)
 
@@ -118,7 +131,11 @@ def state_stepper(size: int) -> Callable[[], None]:
 
 
 def state_predictor(num_samples: int) -> Callable[[], None]:
-    """A function that runs a prediction from vision of a state-space model with random weights."""
+    """Make a function that predicts from one visual image with a state-space model of random weights.
+
+    Args:
+        num_samples: Number of samples of each prediction.
+    """
     config = statespace.Config()
     graphdef, params, _ = statespace.init(jax.random.key(0), config)
     view = training.Preprocessing(resolution=(config.input_size, config.input_size))
@@ -131,12 +148,12 @@ def state_predictor(num_samples: int) -> Callable[[], None]:
 
 
 def median_seconds(call: Callable[[], None], repeats: int) -> float:
-    """Median seconds of a call."""
+    """Median seconds of `repeats` calls, after one unmeasured call."""
     return float(np.median(in_turn(call, repeats=repeats)))
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure all steps and predictions, and print a line for each."""
     with mock.patch.multiple(networks, conv=plain_conv, conv_transpose=plain_conv_transpose):
         plain = stepper(MODEL, 64, ())
     ours, enumerated = np.median(in_turn(stepper(MODEL, 64, ("tactile",)), plain, repeats=3), axis=0)

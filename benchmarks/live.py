@@ -1,11 +1,12 @@
-"""Whether the models that come with the library predict how a digital twin's object comes to rest.
+"""Skill of the models that come with the library on images of the digital twin.
 
     python -m benchmarks.live
 
-A hand holds the object in an unstable pose and lets go. Each model predicts the images at rest from the images of the
-held object, as `experiments.live` does. The skill of an image is 0 for the mean image at rest of the other trajectories
-and 1 for the true image, by the mean squared error over all trajectories. The models know neither the twin's noise,
-vignetting and leakage. Only `released` was trained on the scenario `Released` and on objects of this class.
+In the digital twin, a hand holds an object in an unstable pose and lets go. Each model predicts the images at rest from
+the images of the held object, as `experiments.live` does. The command prints the skill of these images, which compares
+mean squared errors over all trajectories. It is 0 for the mean image at rest of the other trajectories, and 1 for the
+true image. No model was trained with the twin's noise, vignetting and leaking light. Only `released` was trained on the
+scenario `Released` and on objects of the class that the twin shows.
 """
 
 import dataclasses
@@ -21,24 +22,29 @@ from sts_jax import hardware
 
 MODELS = ("freefall", "inclined", "perturbed", "released")
 LIT, DARK = (255, 255, 255, 255), (0, 0, 0, 0)
-SETTLED_S = 0.2  # s, after a switch of the light
-MOVES_S = 4.0  # s, from the release to the images at rest
-SIDE = 64  # pixels, at which images are compared
+SETTLED_S = 0.2  # s, time between a switch of the light and an image
+MOVES_S = 4.0  # s, time between the release and the images at rest
+SIDE = 64  # pixels, side of the images that are compared
 
-Pair = tuple[np.ndarray, np.ndarray]  # raw images, visual and tactile
+Pair = tuple[np.ndarray, np.ndarray]  # visual and tactile image of the camera
 
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Number of trajectories."""
+    """Options of the command line."""
 
-    trajectories: int = 100
-    seed: int = 0
+    trajectories: int = 100  # number of trajectories
+    seed: int = 0  # seed of the twin's object, motion and noise
 
 
 def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
-    """The empty pad, and the held and the resting object of each trajectory."""
-    # Poses between both are not needed, so few are rendered.
+    """Record trajectories of the digital twin.
+
+    Returns:
+        A pair of images of the empty pad, and for each trajectory a pair of the held object and a pair of the object at
+        rest.
+    """
+    # The images during the motion are not read, so one pose per second of the motion is rendered.
     with twin.make(twin.Config(motion_rate=1.0, seed=args.seed)) as device:
 
         def pair() -> Pair:
@@ -55,7 +61,7 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
             device.step(SETTLED_S)
             held.append(pair())
             device.command("release")
-            for _ in range(round(MOVES_S / SETTLED_S)):  # within the period of the watchdog
+            for _ in range(round(MOVES_S / SETTLED_S)):  # a ping every 0.2 s keeps the watchdog from firing
                 device.step(SETTLED_S)
                 device.ping()
             rest.append(pair())
@@ -65,7 +71,19 @@ def collect(args: Args) -> tuple[Pair, list[Pair], list[Pair]]:
 def seen(
     views: Views, predictor: sts.Predictor, pairs: list[Pair], index: int, size: tuple[int, int] | None = None
 ) -> np.ndarray:
-    """One stream of some pairs as a model takes it, `(n, height, width, 3)`, reduced to a size by block means."""
+    """Prepare one stream of some pairs for a model.
+
+    Args:
+        views: Conversion from images of the camera to the view of the sensor.
+        predictor: The model.
+        pairs: The pairs, `n` of them.
+        index: 0 for the visual stream, 1 for the tactile stream.
+        size: Height and width of the result, which divide those of the model's inputs. Images are reduced by means of
+            blocks. Default: the size of the model's inputs.
+
+    Returns:
+        Images in [0, 1], `(n, height, width, 3)`.
+    """
     images = np.stack([views.prepared(*pair, predictor.empty)[index] for pair in pairs])
     height, width = size or images.shape[1:3]
     step = images.shape[1] // height
@@ -73,13 +91,21 @@ def seen(
 
 
 def skill(found: np.ndarray, truth: np.ndarray) -> float:
-    """Skill of images `(n, side, side, 3)`."""
+    """Skill of predicted images.
+
+    Args:
+        found: Predicted images, `(n, side, side, 3)`.
+        truth: True images, of the same shape.
+
+    Returns:
+        1 minus the squared error of the predictions over that of the mean of the other true images.
+    """
     others = (truth.sum(0) - truth) / (len(truth) - 1)
     return 1 - float(((found - truth) ** 2).mean() / ((others - truth) ** 2).mean())
 
 
 def main(args: Args) -> None:
-    """Print the table."""
+    """Record the trajectories, and print the skill of every model with both ways to treat the background."""
     empty, held, rest = collect(args)
     pinhole, (height, width) = sts.Sensor().camera, empty[0].shape[:2]
     lens = hardware.Lens.ideal(width, height, distance=float(pinhole.distance), field_of_view=math.radians(160))

@@ -8,16 +8,19 @@
 
 All commands print their results. Only `--scaling` writes files.
 
-- The first command drops one hull of 32 vertices, then hulls of up to 64 vertices from the eight classes. It alternates
-  between MJX and C MuJoCo's batch (`mujoco.rollout`) on all cores, with the same starts.
-- `--engines` measures falls per second of both engines of `simulate`, for this many falls of each of 16 objects.
-- `--pipeline` drops a bottle this many times, renders every frame in both streams as 64x64 uint8 images, and fetches
-  them from the device. It measures seconds and frames per second of physics, rendering and both, where a frame is one
-  world at one time. Like `--engines`, it includes all costs except compilation.
-- `--scaling` steps 1 to 4,096 worlds at once (65,536 on a GPU).
+- Without an option, the command measures steps per second of MJX and of C MuJoCo's batch function (`mujoco.rollout`),
+  both on all cores and with the same starts. It first drops an object with one hull of 32 vertices, then one object of
+  each of the eight classes, with hulls of up to 64 vertices.
+- `--engines N` measures falls per second of both engines of `simulate`, for N falls of each of 16 objects.
+- `--pipeline N` drops a bottle N times, renders every frame in both streams as 64x64 uint8 images, and fetches the
+  images from the device. It measures seconds and frames per second of physics, of rendering and of both together. A
+  frame is one world at one time.
+- `--scaling` measures steps per second of 1 to 4,096 worlds at once (65,536 on a GPU).
 - `--compile` measures the seconds before the first step of each scenario, and counts the compilations for a hundred
-  objects. It uses two fresh processes, the first one with an empty cache of compiled programs, and the second one with
-  the cache that the first one left.
+  objects. It uses two new processes. The first one starts with an empty compilation cache, and the second one with the
+  cache that the first one left.
+
+`--engines` and `--pipeline` include all costs except compilation.
 """
 
 import concurrent.futures
@@ -46,7 +49,7 @@ from sts_jax.dataset.rendering import RENDER_BATCH
 from sts_jax.physics import bodies as physics_bodies
 from sts_jax.physics import contact, scene
 
-# `simulate` has no public way to measure its compiled functions separately. A break shows at these imports.
+# `simulate` has no public way to measure its compiled functions separately. If their names change, these imports fail.
 from sts_jax.physics.draws import draw as draw_starts
 from sts_jax.physics.engines import Worlds, drawn_fields, gravity_at, roll_worlds
 from sts_jax.physics.mass_properties import rigid_of_draws
@@ -62,12 +65,16 @@ SCENARIOS: dict[str, physics.Scenario] = {
     "inclined": physics.Inclined(),
 }
 GPU_BATCH = 4096  # frames rendered at once on a GPU
-TACCEL = 915  # environment steps/s of 4,096 environments on an H100, as published. Our goal is ten times as many
+TACCEL = 915  # environment steps/s of the simulator Taccel, published for 4,096 environments on an H100
 
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line. At most one measurement is chosen."""
+    """Options of the command line.
+
+    Raises:
+        ValueError: More than one of `engines`, `pipeline`, `scaling` and `compile` is given.
+    """
 
     num: int = 8  # drops of each of the eight objects in the comparison with C MuJoCo
     engines: int | None = None  # measure both engines of `simulate`, with this many falls of each object
@@ -79,26 +86,26 @@ class Args:
     def __post_init__(self) -> None:
         chosen = [name for name in ("engines", "pipeline", "scaling", "compile") if getattr(self, name)]
         if len(chosen) > 1:
-            raise ValueError(f"choose one measurement, got {' and '.join(f'--{name}' for name in chosen)}")
+            raise ValueError(f"give at most one of these options, got {' and '.join(f'--{name}' for name in chosen)}")
 
 
 class Speeds(NamedTuple):
-    """Steps per second of a number of worlds."""
+    """Steps per second for a number of worlds."""
 
-    worlds: int
+    worlds: int  # trajectories that are simulated together
     at_once: float  # MJX, one call for all worlds
     in_chunks: float  # MJX, a call for each chunk of worlds, in threads
     in_c: float  # C MuJoCo's batch
 
 
 def rod() -> objects.Body:
-    """A solid rod of 16 sides, 30 mm thick and 100 mm long: one hull of 32 vertices."""
+    """Make a solid rod of 16 sides, 30 mm thick and 100 mm long, with one hull of 32 vertices."""
     turn, mass, radius, length = np.arange(16) * np.pi / 8, 0.05, 0.015, 0.1
     ring = radius * np.stack([np.cos(turn), np.sin(turn)], 1)
     points = np.concatenate([np.c_[ring, np.full(16, z)] for z in (-length / 2, length / 2)])
     across = mass * (radius**2 / 4 + length**2 / 12)
     return dataclasses.replace(
-        objects.make(jax.random.key(0), "fork"),  # solid. Only hull and mass properties matter here
+        objects.make(jax.random.key(0), "fork"),  # a solid body, whose hull and mass properties are replaced
         hulls=jnp.asarray(points[None], jnp.float32),
         shell_mass=jnp.float32(mass),
         shell_com=jnp.zeros(3),
@@ -107,7 +114,16 @@ def rod() -> objects.Body:
 
 
 def in_c(items: list[objects.Body], traj: physics.Trajectory, constants: physics.Contact) -> tuple[list, np.ndarray]:
-    """The model and the first state of each trajectory in C MuJoCo."""
+    """Prepare trajectories for C MuJoCo.
+
+    Args:
+        items: The objects.
+        traj: Trajectories, whose starts and hidden values are used.
+        constants: Constants of the contact.
+
+    Returns:
+        A `mujoco.MjModel` for each trajectory, and the first states, `(n, size)`.
+    """
     gel, models, states = Sensor().gel.size, [], []
     pad = (float(gel[0]), float(gel[1]))
     compiled = [scene.compile_scene(np.asarray(body.hulls), pad, constants) for body in items]
@@ -170,15 +186,23 @@ def engines(num: int) -> None:
 
 
 def grouped(models: list, states: np.ndarray) -> list[tuple[list, np.ndarray]]:
-    """Group models and states by the size of the mesh, because a rollout needs models of one size."""
+    """Group models and states by the number of mesh vertices, because `mujoco.rollout` needs models of one size."""
     sizes = np.array([model.nmeshvert for model in models])
     return [([m for m, n in zip(models, sizes, strict=True) if n == k], states[sizes == k]) for k in np.unique(sizes)]
 
 
 def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
-    """The arguments that `simulate` passes to MJX for drops of the rod from 2 mm."""
+    """Make the arguments that `simulate` passes to MJX for drops of the rod from 2 mm.
+
+    Args:
+        count: Number of worlds. From 256 on, the starts repeat.
+        frames: Frames of each trajectory.
+
+    Returns:
+        The worlds, and the MJX model and data of the scene.
+    """
     scenario, body, gel = physics.Freefall(height=0.002, frames=frames), rod(), Sensor().gel.size
-    pad, some = (float(gel[0]), float(gel[1])), min(count, 256)  # more worlds repeat these starts
+    pad, some = (float(gel[0]), float(gel[1])), min(count, 256)
     index = np.zeros(some, np.int32)
     shapes = physics_bodies.shapes([body], scenario)
     nth = np.arange(some, dtype=np.int32)
@@ -192,7 +216,12 @@ def worlds(count: int, frames: int) -> tuple[Worlds, mjx.Model, mjx.Data]:
 
 
 def scaling(frames: int = 8, chunk: int = 32) -> None:
-    """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS."""
+    """Measure steps per second against the number of worlds, and write a table and a plot to RESULTS.
+
+    Args:
+        frames: Frames of each trajectory.
+        chunk: Worlds of one call, where the worlds are divided between threads.
+    """
     gpu = jax.default_backend() != "cpu"
     counts = [4**k for k in range(9 if gpu else 7)]
     scenario = physics.Freefall(height=0.002, frames=frames)
@@ -228,7 +257,13 @@ def scaling(frames: int = 8, chunk: int = 32) -> None:
 
 
 def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
-    """Write `scaling.md` and `scaling.png` to RESULTS."""
+    """Write `scaling.md` and `scaling.png` to RESULTS.
+
+    Args:
+        rows: Steps per second for each number of worlds.
+        device: Name of the device, for the title.
+        chunk: Worlds of one call, where the worlds are divided between threads.
+    """
     from matplotlib.figure import Figure
 
     names = ("MJX, all at once", f"MJX, {chunk} at a time, {WORKERS} threads", f"C MuJoCo, {os.cpu_count()} threads")
@@ -250,13 +285,14 @@ def write_scaling(rows: Sequence[Speeds], device: str, chunk: int) -> None:
 
 
 def draw(body: objects.Body, traj: physics.Trajectory) -> None:
-    """Render every frame of one object's trajectories in both streams, fetch it to the host and discard it."""
+    """Render every frame of one object's trajectories in both streams, and fetch the images to the host."""
     gpu = jax.default_backend() != "cpu"
     batch, threads = (GPU_BATCH, 1) if gpu else (RENDER_BATCH, os.cpu_count())
     pose, wrench = (np.asarray(x).reshape(-1, x.shape[-1]) for x in (traj.pose, traj.wrench))
 
     def one(begin: int) -> None:
-        rows = np.minimum(np.arange(begin, begin + batch), len(pose) - 1)  # repeat the last to compile only once
+        # Repeats the last frame to fill the last batch, because another batch size would compile another program.
+        rows = np.minimum(np.arange(begin, begin + batch), len(pose) - 1)
         images = dataset.render_uint8(Sensor(), body, pose[rows], wrench[rows], resolution=(64, 64), crop=False)
         jax.device_get(images[:2])
 
@@ -284,11 +320,15 @@ def pipeline(count: int) -> None:
 
 
 def first_call(name: str, count: int) -> dict[str, Any]:
-    """The first call of a scenario, for a fresh process.
+    """Measure the first call of `simulate` in this process, which must be a new one.
+
+    Args:
+        name: Name of the scenario, in SCENARIOS.
+        count: Number of objects whose compilations are counted.
 
     Returns:
-        `seconds`: time before the first step. `objects`: objects that the scenario takes, of `count`. `programs`:
-        compilations of each function of `simulate` for these objects.
+        `seconds`: time of the first call minus that of the second, in seconds. `objects`: number of the objects that
+        the scenario accepts. `programs`: number of compilations for these objects, by function of `simulate`.
     """
     scenario, sensor, items = SCENARIOS[name], Sensor(), bodies(objects.CATEGORIES, count)
     items = [body for body in items if physics.refusal(body, scenario) is None]
@@ -311,7 +351,7 @@ def first_call(name: str, count: int) -> dict[str, Any]:
 
 
 def compilation(count: int = 100) -> None:
-    """Print the seconds of compilation of each scenario, without and with the programs of an earlier process."""
+    """Print the seconds of compilation of each scenario, with an empty and with a filled compilation cache."""
     for name in SCENARIOS:
         with tempfile.TemporaryDirectory() as folder:
             for kind in ("empty cache", "kept cache"):

@@ -1,24 +1,25 @@
-"""Error of our shader for real presses of a ball on a GelSight.
+"""Error of `tactile.phong` on real images of a ball that is pressed into a GelSight sensor.
 
     python -m benchmarks.presses    # about a minute. Writes benchmarks/results/presses/
 
-The wheel of `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm pressed into
-a GelSight, the image without contact (the background), and the centre and radius of each contact. Within the contact
-the skin has the normals of a sphere. `tactile.phong` is fitted to 36 of the presses, and every fourth is held out. An
-image is modelled by
+The package `taxim` 1.4.1 (MIT) contains 48 images (480x640, 0.0295 mm per pixel) of a ball of radius 2 mm that is
+pressed into a GelSight, the image without contact (the background), and the centre and radius of each contact. Within
+the contact, the skin has the normals of a sphere. `tactile.phong` is fitted to 36 of the presses, and every fourth
+press is held out. An image is modelled by
 
-    background (1 + phong(pressed) - phong(flat))
+    image = background (1 + phong(pressed) - phong(flat))
 
-so that the flat sensor gives the background, and the change is proportional to the background's brightness. Values are
-those of the camera, divided by 255. Non-negative least squares selects lights from candidates in rings around the
-image. Gradient descent then fits their positions and colours, the fall-off, the specular share and the shininess. The
-fitted lights explain the images and do not coincide with the LEDs of the sensor: a few end up below the image.
+where `pressed` and `flat` are the normals and points of the pressed and of the flat skin. The image of the flat skin is
+thus the background, and the change is proportional to the brightness of the background. Values are those of the camera,
+divided by 255. Non-negative least squares selects lights from candidates in rings around the image. Gradient descent
+then fits the positions and colours of the lights, the fall-off, the specular share and the shininess. The fitted lights
+explain the images, and need not be at the places of the sensor's LEDs. A few of them end up below the image.
 
-Prints the peak signal-to-noise ratio for the background alone, far lights and near lights, over all pixels of all
-held-out presses within 0.92 of the contacts' radii. `presses.png` has a column for each held-out press: the real image,
-ours, and four times their difference on grey. Outside of the contact the shape of the skin is unknown, and our image is
-the background.
-Candidates, steps and learning rate were chosen on the 36 presses alone.
+The command prints the peak signal-to-noise ratio of the background alone, of a fit with far lights, and of a fit with
+near lights. The ratio is over all pixels of all held-out presses within 0.92 of the radius of the contact.
+`presses.png` has a column for each held-out press: the real image, our image, and four times their difference on grey.
+Outside of the contact the shape of the skin is unknown, and our image is the background. Candidates, number of steps
+and learning rate were chosen on the 36 presses alone.
 """
 
 import dataclasses
@@ -39,12 +40,12 @@ from scipy.optimize import nnls
 
 from sts_jax import tactile
 
-PITCH = 0.0295e-3  # m a pixel (taxim/calib/gelsight/params.json)
-RADIUS = 2e-3  # m, of the ball
-TRUSTED = 0.92  # share of a contact's radius within which its normals are taken as known
-EVERY = 4  # one press in this many is held out: the fourth, the eighth, ...
-STEPS = 1000
-RATE = 0.1
+PITCH = 0.0295e-3  # m per pixel (taxim/calib/gelsight/params.json)
+RADIUS = 2e-3  # m, radius of the ball
+TRUSTED = 0.92  # share of a contact's radius within which the normals of the sphere are used
+EVERY = 4  # one of this many presses is held out: the fourth, the eighth, ...
+STEPS = 1000  # steps of Adam
+RATE = 0.1  # initial learning rate of Adam
 OUT = Path(__file__).parent / "results" / "presses"
 
 
@@ -54,19 +55,19 @@ class Presses:
 
     background: Float[np.ndarray, "h w 3"]
     images: Float[np.ndarray, "n h w 3"]
-    centres: Float[np.ndarray, "n 2"]  # column, row (pixels)
-    radii: Float[np.ndarray, "n"]  # of the contacts (pixels)
+    centres: Float[np.ndarray, "n 2"]  # column and row of the centre of each contact (pixels)
+    radii: Float[np.ndarray, "n"]  # radius of each contact (pixels)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Pixels:
-    """A list of pixels of several presses."""
+    """Pixels of several presses, in one list."""
 
-    normals: Float[Array, "p 3"]  # of the skin, towards the camera
-    points: Float[Array, "p 3"]  # of the skin (m), with the origin in the middle of the image
-    color: Float[Array, "p 3"]
-    background: Float[Array, "p 3"]
+    normals: Float[Array, "p 3"]  # unit normals of the skin, towards the camera
+    points: Float[Array, "p 3"]  # points of the skin (m), with the origin in the middle of the image
+    color: Float[Array, "p 3"]  # colour of the real image, [0, 1]
+    background: Float[Array, "p 3"]  # colour of the image without contact, [0, 1]
 
 
 class Descent(NamedTuple):
@@ -77,7 +78,7 @@ class Descent(NamedTuple):
 
 
 def read() -> Presses:
-    """Read the recordings from the installed package without importing it.
+    """Read the images and contacts from the installed package `taxim`, without importing it.
 
     Raises:
         FileNotFoundError: The package is not installed.
@@ -86,7 +87,8 @@ def read() -> Presses:
     path = Path(spec.origin or "").parent / "calib" / "gelsight" / "dataPack.npz" if spec else None
     if path is None or not path.is_file():
         raise FileNotFoundError(
-            "the presses come with the package taxim 1.4.1. Install it: pip install -e '.[bench]' -c constraints.txt"
+            "the images of the presses are part of the package taxim 1.4.1. Install it: "
+            "pip install -e '.[bench]' -c constraints.txt"
         )
     with np.load(path) as pack:
         background, images = (pack[name][..., ::-1] / np.float32(255) for name in ("f0", "imgs"))  # blue is first
@@ -94,7 +96,7 @@ def read() -> Presses:
 
 
 def held_out(number: int) -> np.ndarray:
-    """Mask of the presses that are never fitted."""
+    """Mask of the held-out presses among `number` presses, bool `(number,)`."""
     return np.arange(number) % EVERY == EVERY - 1
 
 
@@ -104,14 +106,15 @@ def skin_under_ball(
     """Normals and points of the skin where it lies on the ball.
 
     Args:
-        centre: column and row of the contact (pixels).
-        radius: of the contact (pixels).
-        row: of the pixels, within the contact.
-        column: of the pixels.
-        shape: (height, width) of the image.
+        centre: Column and row of the contact's centre (pixels).
+        radius: Radius of the contact (pixels).
+        row: Rows of pixels within the contact, `(p,)`.
+        column: Columns of these pixels, `(p,)`.
+        shape: Height and width of the image (pixels).
 
     Returns:
-        Unit normals towards the camera, and points (m), with the contact's rim in the gel's face.
+        Unit normals towards the camera, and points (m). The origin is in the middle of the image. The rim of the
+        contact lies in the plane z = 0 of the flat skin.
     """
     x, y = PITCH * (column - centre[0]), PITCH * (row - centre[1])
     under = np.sqrt(RADIUS**2 - x**2 - y**2)
@@ -122,7 +125,14 @@ def skin_under_ball(
 
 
 def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float = TRUSTED) -> Pixels:
-    """Pixels within a share of the contacts' radii, in each `every`-th row and column."""
+    """Collect pixels within the contacts of several presses.
+
+    Args:
+        presses: The images and contacts.
+        which: Numbers of the presses.
+        every: Step between the rows, and between the columns, that are used.
+        within: Share of the contact's radius within which pixels are used.
+    """
     shape, found = presses.background.shape[:2], []
     rows, columns = np.meshgrid(np.arange(0, shape[0], every), np.arange(0, shape[1], every), indexing="ij")
     for index in which:
@@ -135,12 +145,16 @@ def pixels(presses: Presses, which: np.ndarray, *, every: int = 1, within: float
 
 
 def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """The library's constants, all in range, from unbounded unknowns.
+    """Convert the unbounded unknowns of the optimisation to constants of the shader, which are all in range.
 
     Args:
-        unknowns: `place` (m, 3) in mm, whose last component is the softplus inverse of the depth below the gel's face,
-            and the softplus inverses of `color` (m, 3), `falloff`, `specular` and `shininess`.
-        near: use LEDs. Otherwise the places are directions of far lights, and the fall-off is ignored.
+        unknowns: Place `place` of each light, `(m, 3)`: x and y in mm, and the softplus inverse of the depth below the
+            gel's face in mm. Also the softplus inverses of `color` `(m, 3)`, `falloff`, `specular` and `shininess`.
+        near: Use near lights (LEDs) at the places. Otherwise the places are directions of far lights, and the fall-off
+            is ignored.
+
+    Returns:
+        The constants of the reflectance, and the lights.
     """
     positive = {k: jax.nn.softplus(v) for k, v in unknowns.items()}
     place = jnp.concatenate([unknowns["place"][:, :2], -positive["place"][:, 2:]], axis=1)
@@ -154,10 +168,17 @@ def shader(unknowns: dict[str, Array], *, near: bool) -> tuple[tactile.Phong, ta
 
 
 def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "m p"]:
-    """The shader's image of the pressed skin less that of the flat skin, for each light alone, in white.
+    """Image of the pressed skin minus image of the flat skin, for each light alone and in white.
 
-    The lights are a batch of one program, because the gradient of the shader's own loop over them takes minutes to
-    compile.
+    The lights are vmapped, because the gradient of the shader's own loop over lights takes minutes to compile.
+
+    Args:
+        constants: Constants of the reflectance.
+        lights: The lights, whose colours are replaced by white.
+        given: The pixels.
+
+    Returns:
+        The change of the image, `(lights, pixels)`.
     """
     flat = jnp.broadcast_to(jnp.array([[0.0, 0, -1]]), given.normals.shape)
     normals = jnp.stack([given.normals, flat])
@@ -178,7 +199,7 @@ def changes(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, giv
 
 @jax.jit
 def draw(constants: tactile.Phong, lights: tactile.Lights | tactile.Leds, given: Pixels) -> Float[Array, "p 3"]:
-    """Our image, on the real background."""
+    """Render our image of the pressed skin, on the real background."""
     return given.background * (1 + changes(constants, lights, given).T @ lights.colors)
 
 
@@ -188,12 +209,12 @@ def psnr(image: Array, truth: Array) -> float:
 
 
 def _inverse(value: float | np.ndarray) -> Array:
-    """The inverse of the softplus."""
+    """Inverse of the softplus."""
     return jnp.log(jnp.expm1(jnp.asarray(value, jnp.float32)))
 
 
 def start(given: Pixels, *, near: bool) -> dict[str, Array]:
-    """Initial unknowns: the lights that least squares selects from candidates in rings around the image."""
+    """Initial unknowns of `shader`, with the lights that least squares selects from rings around the image."""
     rings = [(r, t) for r in ((14, 20, 35) if near else (20,)) for t in (0.2, 0.5, 1.0, 2.0)]
     angles = 2 * np.pi * np.arange(12) / 12
     rows = [[r * np.cos(a + k), r * np.sin(a + k), _inverse(r * t)] for k, (r, t) in enumerate(rings) for a in angles]
@@ -210,7 +231,7 @@ def start(given: Pixels, *, near: bool) -> dict[str, Array]:
 
 @functools.partial(jax.jit, static_argnames=("near", "steps"))
 def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int) -> dict[str, Array]:
-    """Minimise the squared error by Adam with a cosine schedule."""
+    """Minimise the mean squared error of `draw` over the unknowns of `shader`, by Adam with a cosine schedule."""
     optimiser = optax.adam(optax.cosine_decay_schedule(RATE, steps))
 
     def loss(unknowns: dict[str, Array]) -> Array:
@@ -224,22 +245,22 @@ def refine(unknowns: dict[str, Array], given: Pixels, *, near: bool, steps: int)
 
 
 def fit(given: Pixels, *, near: bool, steps: int = STEPS) -> tuple[tactile.Phong, tactile.Lights | tactile.Leds]:
-    """Fit the shader's constants to pixels."""
+    """Fit the constants of the reflectance and the lights to pixels."""
     return shader(refine(start(given, near=near), given, near=near, steps=steps), near=near)
 
 
 def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.Leds, *, half: int = 90) -> np.ndarray:
-    """The real image, ours and their difference around a contact, one below the other.
+    """Draw the real image, our image and their difference around a contact, one below the other.
 
     Args:
-        presses: The recordings.
+        presses: The images and contacts.
         index: Number of the press.
-        constants: Constants of the shader.
+        constants: Fitted constants of the reflectance.
         leds: Fitted lights.
-        half: Half the side of the part around the contact (pixels).
+        half: Half the side of the drawn square around the contact (pixels).
 
     Returns:
-        `(6 * half, 2 * half, 3)`. Outside of the contact, our image is the background.
+        An image in [0, 1], `(6 * half, 2 * half, 3)`. Outside of the contact, our image is the background.
     """
     given = pixels(presses, np.array([index]), within=1.0)
     column, row = (int(v) for v in presses.centres[index])
@@ -256,7 +277,7 @@ def panel(presses: Presses, index: int, constants: tactile.Phong, leds: tactile.
 
 
 def main() -> None:
-    """Fit the lights, print the errors and draw the held-out presses."""
+    """Fit the lights, print the errors and write `presses.png` and `presses.txt`."""
     OUT.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
 

@@ -1,11 +1,11 @@
-"""A picture that tests whether people can match predicted ends with the true ones.
+"""Draw a picture that tests whether people can match predicted images at rest with the true ones.
 
     python -m benchmarks.recognise runs/freefall --out recognise.png           # about a minute
     python -m benchmarks.recognise runs/freefall --given visual pose --first 20
 
-Predicts ten consecutive held-out trajectories and draws one sample of the last visual image of each (A to J), above the
-ten true images in another order (1 to 10). The picture is written to `--out`, and the answers are printed. A person who
-guesses matches one pair on average.
+Predicts ten consecutive held-out trajectories of a run. The upper rows of the picture show one sample of the last
+visual image of each trajectory (A to J). The lower rows show the ten true images in another order (1 to 10). The
+picture is written to `--out`, and the answers are printed. A person who guesses matches one pair on average.
 """
 
 import dataclasses
@@ -29,18 +29,24 @@ class Args:
     """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment with trained models
-    out: Path = Path("recognise.png")  # the picture
+    out: Path = Path("recognise.png")  # file of the picture
     given: tuple[str, ...] = ()  # input modalities (default: all inputs of the model)
-    first: int = 0  # place of the first trajectory in the held-out list
-    seed: int = 0  # of the samples and of the order
+    first: int = 0  # place of the first trajectory in the held-out list, from 0
+    seed: int = 0  # seed of the samples and of the order of the true images
 
 
 def main(args: Args) -> str:
-    """Draw the picture and return the answers."""
+    """Draw the picture and return the answers as text.
+
+    Raises:
+        ValueError: Fewer than ten held-out trajectories begin at `first`.
+    """
     data = dataset.load(args.workdir / "dataset")
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:
-        raise ValueError(f"first is {args.first}: fewer than {NUMBER} held-out trajectories begin there")
+        raise ValueError(
+            f"--first is {args.first}: fewer than {NUMBER} held-out trajectories follow, so give a smaller --first"
+        )
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")
     given = args.given or predictor.modalities

@@ -1,11 +1,12 @@
-"""Time and size of a pair of images of the real sensor on disk.
+"""Time to write a pair of images of the real sensor to disk, and the size of its files.
 
     python -m benchmarks.recording                  # a few seconds
     python -m benchmarks.recording --folder /mnt    # on another disk
 
-Writes pairs as `hardware.Session` does: each image as PNG, then the folder with its checksums, flushed to the disk. The
-images are smooth, with noise of a standard deviation of 1.5 of 255, and without it. Prints the median and the longest
-time of a pair. The files are deleted afterwards.
+Writes pairs as `hardware.Session` does: both images as PNG files, in a folder that also has their checksums, flushed to
+the disk. The images are smooth, without noise or with noise of a standard deviation of 1.5 of 255. Prints, for two
+image sizes, the size of a pair, the median times to encode and to write it, and the longest time of both together. The
+files are deleted afterwards.
 """
 
 import dataclasses
@@ -26,15 +27,15 @@ SIZES = ((640, 480), (1640, 1232))
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options."""
+    """Options of the command line."""
 
-    folder: Path | None = None  # on the disk to measure (default: that of temporary files)
-    pairs: int = 20  # of each size
-    seed: int = 0
+    folder: Path | None = None  # an existing folder on the disk to measure (default: the folder for temporary files)
+    pairs: int = 20  # number of pairs of each size and noise
+    seed: int = 0  # seed of the images
 
 
 def pair(random: np.random.Generator, width: int, height: int, noise: float) -> Pair:
-    """A pair of smooth images with noise."""
+    """Make a pair of smooth images with noise of the standard deviation `noise` (of 255)."""
 
     def shot(stream: recordings.Stream, level: int) -> Shot:
         smooth = cv2.GaussianBlur(random.uniform(0, 1, (height, width, 3)).astype(np.float32), (0, 0), width / 50)
@@ -47,7 +48,7 @@ def pair(random: np.random.Generator, width: int, height: int, noise: float) -> 
 
 
 def main(args: Args) -> None:
-    """Print a table."""
+    """Write pairs of both sizes, without and with noise, and print a table."""
     random = np.random.default_rng(args.seed)
     print("size         noise   MB a pair   ms to encode   ms to write   longest of both")
     for width, height in SIZES:

@@ -1,10 +1,11 @@
-"""Skill of the state-space model against the number of training trajectories and against training time.
+"""Skill of the state-space model for different numbers of training trajectories and of training steps.
 
     python -m benchmarks.scaling runs/freefall --out scaling.png  # a run of --preset default, about 20 minutes
     python -m benchmarks.scaling runs/freefall --shares 1 --steps 3300 --seeds 1 2   # the spread between two more seeds
 
-Takes the dataset of a run, and trains models in `RUN/scaling/`: with several numbers of training objects for the most
-gradient steps, and with all objects for fewer steps. Models that exist there are kept. Prints the errors on the
+Uses the dataset of a run, and trains models in the folder `scaling` of the run. Some models see a share of the training
+objects (`--shares`) and are trained for the largest number of `--steps`. The others see all training objects, and are
+trained for each number of `--steps`. Models that the folder has already are not trained again. Prints the errors on the
 held-out objects, and draws the visual skill with 95 % intervals to `--out`.
 """
 
@@ -34,40 +35,44 @@ class Args:
     """Options of the command line."""
 
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment
-    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"
-    preset: Literal["smoke", "default", "long"] = "default"
-    shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)  # shares of the training objects, each trained for the most steps
-    steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps, each with all training objects
-    seeds: tuple[int, ...] = (0,)  # of the networks and of the order of the batches
-    out: Path = Path("scaling.png")  # the plot
+    scenario: Literal["freefall", "inclined", "perturbed"] = "freefall"  # scenario of the work directory
+    preset: Literal["smoke", "default", "long"] = "default"  # preset of the work directory
+    # shares of the training objects. A model of each share is trained for the largest number of `steps`
+    shares: tuple[float, ...] = (1 / 16, 1 / 4, 1.0)
+    steps: tuple[int, ...] = (400, 800, 1600)  # gradient steps. A model of each number sees all training objects
+    seeds: tuple[int, ...] = (0,)  # seeds of the weights and of the order of the batches
+    out: Path = Path("scaling.png")  # file of the plot, which shows the first seed
 
 
 class Point(NamedTuple):
-    """A trained model and the inputs it is tested with."""
+    """A trained model and the inputs with which it is tested."""
 
     inputs: str
-    trajectories: int
+    trajectories: int  # of the training set
     steps: int
-    minutes: float  # of training
+    minutes: float  # duration of the training
 
 
 def some(part: Part, objects: np.ndarray) -> Part:
-    """The items of some objects."""
+    """Select the items that show one of the given objects."""
     return type(part)(*(leaf[np.isin(part.object, objects)] for leaf in part))
 
 
 def train(
     config: Config, data: dataset.Dataset, folder: Path, share: float, steps: int, seed: int
 ) -> tuple[int, float]:
-    """Train a model unless it exists. Returns its number of trajectories and its minutes of training.
+    """Train a model, unless its folder has one.
 
     Args:
         config: Configuration of the run.
         data: Dataset of the run.
         folder: Folder of the model.
-        share: Share of the training objects.
+        share: Share of the training objects that are used.
         steps: Number of gradient steps.
-        seed: Seed of the network and of the order of the batches.
+        seed: Seed of the weights and of the order of the batches.
+
+    Returns:
+        The number of training trajectories, and the duration of the training in minutes.
     """
     pairs, views = data.pairs(data.members("train")), data.views("train")
     falls = data.ends(data.members("train", rendered=False))
@@ -85,7 +90,7 @@ def train(
 
 
 def best_possible(workdir: Path) -> float | None:
-    """The visual skill of the mean over re-rolls, if the run was evaluated."""
+    """Read the visual skill of the best possible prediction from `metrics.json`, or return None without that record."""
     path = workdir / "metrics.json"
     if not path.exists():
         return None

@@ -1,4 +1,4 @@
-"""Whole frames per second of `sense` beside embree's depth, and the cost of a frame from small to large.
+"""Frames per second of `sense`, compared with embree's depth alone, and the cost of a frame by its size.
 
     python -m benchmarks.sensor             # about 12 minutes on two CPU cores, most of it compilation
     python -m benchmarks.sensor --taxim     # about a minute: tactile images from height maps, compared with taxim
@@ -7,15 +7,19 @@
 
 All commands print their results. Only `--cost` writes a file, the plot benchmarks/results/sensor/cost.png.
 
-The first command draws objects at rest on the pad with the wrench of their weight: the gel's balance, both streams,
-depth and segmentation. In comparison, embree traces the depth alone, of the same faces and poses, in three ways.
-`traced` calls embreex with every ray of an image at once and a scene built beforehand, `built` also builds the scene
-for each pose, as a moving object needs it, and `trimesh` uses the Python interface `mesh.ray`. Each runs in one thread
-and in as many threads as there are cores, because one call of `sense` keeps little more than one core busy and
-`dataset.collect` draws in threads too. On other devices, `sense` draws a batch. The runs alternate, and the figures are
-medians. A ratio is embree's seconds divided by ours, with the same number of threads. A second table has the share of
-each stage in our time and, at 640x480, the speed relative to the paper's code, which takes 0.40 s per frame of this
-size on such a CPU (its renderer and shader without its physics, measured by us elsewhere).
+Without an option, the command renders objects at rest on the pad with `sense`: balance of the gel, both streams, depth
+and segmentation. For comparison, embree traces only the depth of the same faces and poses, in three ways:
+
+- `traced`: one call of embreex with all rays of an image, and a scene that was built beforehand
+- `built`: the same, but the scene is built for each pose, as a moving object needs it
+- `trimesh`: the Python interface `mesh.ray` of trimesh
+
+Everything runs in one thread, and in as many threads as there are cores. One call of `sense` uses little more than one
+core, so `dataset.collect` renders in threads too. On a GPU, `sense` renders a batch instead. The calls alternate, and
+the figures are medians. A ratio is embree's seconds divided by the seconds of `sense`, with the same number of threads.
+
+A second table has the share of each stage in the time of `sense`. At 640x480 it also has the speed relative to the
+paper's code, whose renderer and shader we measured at 0.40 s per frame on such a CPU, without physics.
 """
 
 import concurrent.futures
@@ -46,10 +50,10 @@ from sts_jax import geometry, objects, optics, tactile
 from sts_jax.rendering import drawing, equilibrium
 
 SIZES = {(64, 64): 41, (200, 200): 15, (480, 640): 7}  # image sizes, and how often each is timed
-FACES = (None, 2000, 5000)  # None: as the class generates them
+FACES = (None, 2000, 5000)  # numbers of faces. None: the faces that the class generates
 CATEGORIES = ("bottle", "scissors", "watch")
-POSES = 16  # per object: at rest on the pad, turned about the vertical
-PAPER = 0.40  # s, per frame of 640x480 of the paper's code
+POSES = 16  # poses of each object: at rest on the pad, turned about the vertical
+PAPER = 0.40  # s, time of the paper's code for a frame of 640x480
 COST_SIZES = ((64, 64), (120, 160), (240, 320), (480, 640), (960, 1280), (1232, 1640))
 COST_FACES = (500, 1000, 2000, 5000, 10000, 20000, 50000)
 RESULTS = Path(__file__).parent / "results" / "sensor"
@@ -60,7 +64,11 @@ Works = list[Callable[[], object]]  # one call for each pose
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Options of the command line. At most one measurement is chosen."""
+    """Options of the command line.
+
+    Raises:
+        ValueError: More than one option is given.
+    """
 
     taxim: bool = False  # measure tactile images from height maps, compared with taxim
     cost: bool = False  # measure the cost per pixel and per face, and the memory
@@ -68,57 +76,61 @@ class Args:
 
     def __post_init__(self) -> None:
         if sum((self.taxim, self.cost, self.compile)) > 1:
-            raise ValueError("choose one of --taxim, --cost and --compile")
+            raise ValueError("give at most one of --taxim, --cost and --compile")
 
 
 class Case(NamedTuple):
     """An object at rest, and the size of its images."""
 
-    name: str  # of the row
+    name: str  # first columns of the row in the table
     body: objects.Body
-    inputs: Inputs
-    shape: tuple[int, int]
-    repeats: int  # rounds of measurements
+    inputs: Inputs  # poses (n, 7) and wrenches (n, 6)
+    shape: tuple[int, int]  # height and width (pixels)
+    repeats: int  # number of measurements
 
 
 class Durations(NamedTuple):
     """Median seconds per frame, for whole frames and for parts of them."""
 
-    frame: float
-    gel: float  # the gel alone
+    frame: float  # a whole frame
+    gel: float  # balance of the gel alone
     depth: float  # gel and depth
     visual: float  # gel, depth and visual stream
     tactile: float  # gel, depth and tactile stream
-    at_once: float  # a frame in as many threads as there are cores, or batched
-    embree: np.ndarray  # of depth, for each way to call embree
-    embree_at_once: np.ndarray  # the same in threads
+    at_once: float  # a whole frame in as many threads as there are cores, or in a batch
+    embree: np.ndarray  # depth by embree in one thread, for each of the three ways
+    embree_at_once: np.ndarray  # depth by embree in as many threads as there are cores
 
 
 def finer(body: objects.Body, faces: int | None) -> objects.Body:
-    """The same surface with about this number of faces, by subdivision and decimation."""
+    """Remesh a body to about `faces` faces, by subdivision and decimation. None: return the body unchanged."""
     if faces is None:
         return body
     own = np.asarray(body.faces)
     own = own[np.any(own != own[:, :1], axis=1)]
     mesh = trimesh.Trimesh(np.asarray(body.vertices, float), own)
     longest = mesh.extents.max()
-    while len(mesh.faces) < faces:  # the longest edges first, so that faces become equal in size
+    while len(mesh.faces) < faces:  # divides the longest edges first, so that faces become equal in size
         longest *= 0.8
         mesh = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, longest, max_iter=30))
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about decimation and open meshes
+        warnings.simplefilter("ignore")  # decimation and open meshes
         path = Path(folder) / "finer.ply"
         mesh.export(path)
         return objects.load(path, faces=faces, mass=float(objects.rigid(body, 0.5, 1.0)[0]), hollow=False)
 
 
 def count(body: objects.Body) -> int:
-    """Faces that are not padding."""
+    """Number of faces of a body, without padding."""
     return int(jnp.sum(jnp.any(body.faces != body.faces[:, :1], axis=1)))
 
 
 def resting(body: objects.Body, number: int = POSES) -> Inputs:
-    """Upright poses on the pad, and the wrenches that carry the weight."""
+    """Place a body upright on the pad, turned about the vertical by `number` angles.
+
+    Returns:
+        Poses `(number, 7)`, and the wrenches of the pad that carry the weight, `(number, 6)`.
+    """
     mass, com, _ = objects.rigid(body, 0.5, 1.0)
     angles = jnp.linspace(0, 2 * jnp.pi, number, endpoint=False)
     low = jnp.min(body.vertices[body.faces.ravel(), 2])
@@ -133,7 +145,16 @@ def resting(body: objects.Body, number: int = POSES) -> Inputs:
 
 
 def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict[str, Works]:
-    """Functions that trace the depth of each pose, for each way to call embree."""
+    """Make functions that trace the depth of an object with embree.
+
+    Args:
+        body: The object.
+        poses: Poses of the object, `(n, 7)`.
+        shape: Height and width of the images (pixels).
+
+    Returns:
+        A list with one function for each pose, for each of the ways `traced`, `built` and `trimesh`.
+    """
     camera = sts.Sensor().camera
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
@@ -166,7 +187,7 @@ def embree(body: objects.Body, poses: jax.Array, shape: tuple[int, int]) -> dict
 
 
 def median_seconds(*works: Callable[[], object], repeats: int = 7) -> list[float]:
-    """Median seconds of each function, see `in_turn`."""
+    """Median seconds of each function, from `repeats` alternating calls."""
     return np.median(in_turn(*works, repeats=repeats), axis=0).tolist()
 
 
@@ -179,7 +200,15 @@ def frames(
     fields: tuple[str, ...] = (),
     batched: bool = False,
 ) -> object:
-    """Frames, one after the other or batched. With `fields`, XLA omits the work for all other fields."""
+    """Render frames of an object in one compiled call.
+
+    Args:
+        body: The object.
+        inputs: Poses `(n, 7)` and wrenches `(n, 6)`.
+        shape: Height and width of the images (pixels).
+        fields: Fields of `Frame` to return. XLA omits the work for all other fields. Default: the whole frame.
+        batched: Render all frames with `jax.vmap`. Otherwise, one after the other with `jax.lax.map`.
+    """
 
     def draw(inputs: Inputs) -> object:
         whole = sts.sense(sts.Sensor(), body, *inputs, resolution=shape)
@@ -189,7 +218,7 @@ def frames(
 
 
 def speed() -> None:
-    """Print one row per object and size, then the share of each stage."""
+    """Print the rates of `sense` and embree, with a row for each object and size, then the share of each stage."""
     every = f"{os.cpu_count()} threads" if jax.default_backend() == "cpu" else "batched"
     print(f"frames /s, and embree's seconds over ours: traced, built, trimesh; {jax.devices()[0].device_kind}")
     print(f"{'object':9} {'faces':>6} {'image':>9} | {'one thread':>37} | {every:>37}")
@@ -204,7 +233,7 @@ def speed() -> None:
 
 
 def cases() -> Iterator[Case]:
-    """Every object with every number of faces at every size."""
+    """Yield every object with every number of faces at every size."""
     for category in CATEGORIES:
         for faces in FACES:
             body = finer(objects.make(jax.random.key(0), category), faces)
@@ -215,7 +244,7 @@ def cases() -> Iterator[Case]:
 
 
 def measure(case: Case) -> Durations:
-    """Measure frames and embree, in one thread and in all."""
+    """Measure `sense` and embree, in one thread and in as many threads as there are cores."""
     cores, on_cpu = os.cpu_count() or 1, jax.default_backend() == "cpu"
     pool = concurrent.futures.ThreadPoolExecutor(cores)
 
@@ -241,7 +270,7 @@ def measure(case: Case) -> Durations:
 
 
 def rates(case: Case, found: Durations) -> str:
-    """Frames per second of ours and of embree, and embree's seconds over ours, in one thread and in all."""
+    """Format a row of the first table: frames per second and ratios, in one thread and in all threads."""
     row = [f"{case.name} |"]
     for mine, theirs in ((found.frame, found.embree), (found.at_once, found.embree_at_once)):
         row += [f"{1 / mine:8.1f}  {1 / theirs[0]:6.0f}", *(f"{t / mine:6.2f}" for t in theirs), "|"]
@@ -249,7 +278,7 @@ def rates(case: Case, found: Durations) -> str:
 
 
 def shares(case: Case, found: Durations) -> str:
-    """The share of each stage in the time of a frame and, for the paper's size, the speed relative to its code."""
+    """Format a row of the second table: shares of the stages, and at 640x480 the speed relative to the paper's code."""
     stages = [found.gel, found.depth - found.gel, found.visual - found.depth, found.tactile - found.depth]
     line = " ".join(f"{100 * stage / found.frame:9.0f}" for stage in stages)
     paper = f"   {PAPER / found.at_once:.1f} times the paper's" if case.shape == (480, 640) else ""
@@ -257,21 +286,36 @@ def shares(case: Case, found: Durations) -> str:
 
 
 def ball(shape: tuple[int, int], pitch: float, *, radius: float = 4e-3, depth: float = 1e-3) -> np.ndarray:
-    """Imprint of a ball in the middle of an image (m)."""
+    """Imprint of a ball in the middle of an image.
+
+    Args:
+        shape: Height and width of the image (pixels).
+        pitch: Width of a pixel (m).
+        radius: Radius of the ball (m).
+        depth: Largest depth of the imprint (m).
+
+    Returns:
+        Depth of the imprint (m), `shape`.
+    """
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     square = radius**2 - x[None, :] ** 2 - y[:, None] ** 2
     return np.maximum(np.sqrt(np.maximum(square, 0)) - radius + depth, 0).astype(np.float32)
 
 
 def waves(shape: tuple[int, int], pitch: float, *, depth: float = 1e-3) -> np.ndarray:
-    """An imprint that fills the image (m)."""
+    """Imprint of waves that fills an image. Arguments and result are those of `ball`."""
     y, x = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
     return (depth * (0.6 + 0.2 * np.sin(2e3 * x)[None, :] + 0.2 * np.sin(1.4e3 * y)[:, None])).astype(np.float32)
 
 
 def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3) -> None:
-    """Print the time of each renderer for the tactile image of an imprint."""
-    from taxim import Taxim  # taxim imports JAX itself, and nothing else here needs it
+    """Print the time of `touch` and of taxim for the tactile image of an imprint.
+
+    Args:
+        shape: Height and width of the image (pixels).
+        pitch: Width of a pixel (m).
+    """
+    from taxim import Taxim  # an optional dependency that only this measurement needs
 
     theirs = Taxim(backend="jax")
     window = pitch * jnp.array([-shape[1] / 2, -shape[0] / 2, shape[1], shape[0]])
@@ -303,20 +347,25 @@ def compare_taxim(shape: tuple[int, int] = (480, 640), pitch: float = 0.0295e-3)
 
 
 def cost_of(faces: int, height: int, width: int) -> dict[str, float]:
-    """The cost of a frame, for a fresh process.
+    """Measure the cost of a frame of a bottle in this process, which must be a new one.
+
+    Args:
+        faces: Approximate number of faces.
+        height: Height of the image (pixels).
+        width: Width of the image (pixels).
 
     Returns:
-        `faces`: number of faces. `seconds`: per frame. `bytes`: peak memory of this process.
+        `faces`: number of faces. `seconds`: seconds per frame. `bytes`: peak memory of this process.
     """
     body, shape = finer(objects.make(jax.random.key(0), "bottle"), faces), (height, width)
-    poses, wrenches = resting(body, 1 if shape == COST_SIZES[-1] else 4)  # four of the largest are 0.2 GiB
+    poses, wrenches = resting(body, 1 if shape == COST_SIZES[-1] else 4)  # four frames of this size are 0.2 GiB
     (seconds,) = median_seconds(lambda: frames(body, (poses, wrenches), shape=shape))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {"faces": count(body), "seconds": seconds / len(poses), "bytes": peak}
 
 
 def cost() -> None:
-    """Print and plot the cost of a frame by pixels and by faces, each measured in a fresh process."""
+    """Print and plot the cost of a frame by number of pixels and of faces, each measured in a new process."""
 
     def measured(faces: int, shape: tuple[int, int]) -> dict[str, float]:
         found = fresh.call("benchmarks.sensor.cost_of", faces, *shape)
@@ -347,7 +396,7 @@ def cost() -> None:
 
 
 def compilations(number: int = 100) -> None:
-    """Print how often `sense` compiles for this number of different objects, procedural ones and public meshes."""
+    """Print how often `sense` compiles for `number` different objects, both procedural ones and public meshes."""
     files = sorted(public_meshes().glob("*.obj"))
     bodies = []
     with warnings.catch_warnings():

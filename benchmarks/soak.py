@@ -1,15 +1,17 @@
-"""Endurance: failures, outcomes and accuracy of very many trajectories of each scenario.
+"""Endurance test: failures, outcomes and accuracy of many thousand trajectories of each scenario.
 
     python -m benchmarks.soak                            # 30,000 trajectories, about two hours on two CPU cores
     python -m benchmarks.soak --num 300 --only inclined  # about a minute
-    python -m benchmarks.soak --keep FOLDER              # keep finished blocks there, and resume from them
-    python -m benchmarks.soak --first-block 17           # only blocks 17 to 19 of 20, if others ran elsewhere
+    python -m benchmarks.soak --keep FOLDER              # keep finished blocks in a folder, and resume from it
+    python -m benchmarks.soak --first-block 17           # only blocks 17 to 19, if another machine runs 0 to 16
 
-Every eight trajectories have a new object, of all classes in turn, or a bottle on the jerked pad. The benchmark counts
-trajectories that were discarded and drawn again (only those that are non-finite or deeper in the pad than the limit),
-outcomes and unsettled trajectories. It compares the wrench at rest with the weight, and the energy out of contact with
-that of the start. Blocks have `BLOCK` trajectories, or fewer if fewer are requested. The results are printed.
-`benchmarks.hidden --soaked FOLDER` analyses kept blocks.
+Every eight trajectories have a new object. Its class changes in turn, except on the jerked pad, where all objects are
+bottles. The command counts outcomes, unsettled trajectories, and trajectories that `simulate` discarded and drew again,
+because they were not finite or because the object sank deeper into the pad than the limit. It compares the wrench at
+rest with the weight, and the energy out of contact with the energy at the start. All results are printed.
+
+The trajectories are simulated in blocks of 504, or of fewer if fewer are requested. `benchmarks.hidden --soaked FOLDER`
+analyses the blocks that `--keep FOLDER` has kept.
 """
 
 import dataclasses
@@ -44,30 +46,33 @@ class Args:
     """Options of the command line.
 
     Raises:
-        ValueError: `first_block` is outside of the requested trajectories.
+        ValueError: `first_block` is not the number of a requested block.
     """
 
-    num: int = 10_000  # trajectories of each scenario
-    only: Literal["freefall", "inclined", "perturbed"] | None = None  # one scenario (default: all)
-    first_block: int = 0  # skip earlier blocks of 504 trajectories each
+    num: int = 10_000  # number of trajectories of each scenario
+    only: Literal["freefall", "inclined", "perturbed"] | None = None  # the only scenario to simulate (default: all)
+    first_block: int = 0  # number of the first block, from 0. Earlier blocks are skipped
     keep: Path | None = None  # folder that keeps finished blocks (default: a temporary folder)
 
     def __post_init__(self) -> None:
         if not 0 <= self.first_block * BLOCK < max(self.num, 1):
             last = max(self.num - 1, 0) // BLOCK
-            raise ValueError(f"--first-block is {self.first_block}, but it must be from 0 to {last}")
+            raise ValueError(f"--first-block must be from 0 to {last} for --num {self.num}, got {self.first_block}")
 
 
 def excess_energy(
     rigid: tuple[np.ndarray, np.ndarray, np.ndarray], pose: np.ndarray, velocity: np.ndarray, gravity: np.ndarray
 ) -> np.ndarray:
-    """Kinetic and potential energy of each frame minus that of the first, in units of the weight times 50 mm.
+    """Kinetic and potential energy in each frame, minus their sum in the first frame.
 
     Args:
-        rigid: mass (n,), centre of mass (n, 3), inertia (n, 3, 3).
-        pose: (n, f, 7).
-        velocity: (n, f, 6).
-        gravity: (3,) m/s^2, constant.
+        rigid: Mass (kg), `(n,)`, centre of mass in the mesh frame (m), `(n, 3)`, and inertia (kg m^2), `(n, 3, 3)`.
+        pose: Poses of `n` trajectories of `f` frames, `(n, f, 7)`.
+        velocity: Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), `(n, f, 6)`.
+        gravity: Constant acceleration of gravity (m/s^2), `(3,)`.
+
+    Returns:
+        `(n, f)`, in units of the weight times 50 mm.
     """
     mass, com, inertia = (np.asarray(x, np.float64) for x in rigid)
     rotation = np.asarray(geometry.quat_to_matrix(jnp.asarray(pose[..., 3:])), np.float64)
@@ -80,12 +85,17 @@ def excess_energy(
 
 
 def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
-    """Simulate a block of trajectories of a scenario. Returns arrays (size, ...).
+    """Simulate a block of trajectories of a scenario.
 
     Args:
-        name: One of SCENARIOS.
+        name: Name of the scenario, in SCENARIOS.
         index: Number of the block, from 0.
-        size: Trajectories of the block, a multiple of NUM.
+        size: Number of trajectories, a multiple of NUM.
+
+    Returns:
+        Arrays by name, with a row for each trajectory. `wrench_error` is the error of the force at rest, as a share of
+        the weight, and `excess` the largest energy out of contact, see `excess_energy`. Both are nan where they do not
+        apply.
     """
     scenario = SCENARIOS[name]
     first = index * size // NUM
@@ -121,13 +131,24 @@ def block(name: str, index: int, size: int) -> dict[str, np.ndarray]:
 
 
 def claim(folder: Path, name: str, size: int) -> None:
-    """Write the settings of a scenario's blocks to a folder, or raise an error if it has others (`dataset.claim`)."""
+    """Write the settings of a scenario's blocks to a folder.
+
+    Raises:
+        ValueError: The folder has blocks with other settings. The message names the first that differs.
+    """
     settings = {"scenario": repr(SCENARIOS[name]), "num": NUM, "block": size, "sunk_limit": SUNK_LIMIT}
     dataset.claim(folder / f"{name}.json", settings)
 
 
 def soaked(folder: Path, name: str) -> Starts:
-    """The starts and outcomes of the kept blocks of a scenario. No start was simulated again.
+    """Load the starts and outcomes of the kept blocks of a scenario.
+
+    Args:
+        folder: Folder of a run with `--keep`.
+        name: Name of the scenario, in SCENARIOS.
+
+    Returns:
+        The starts and outcomes. The field `rerolled` is -1 throughout, because no start was simulated again.
 
     Raises:
         FileNotFoundError: The folder has no blocks.
@@ -135,7 +156,9 @@ def soaked(folder: Path, name: str) -> Starts:
     """
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):
-        raise FileNotFoundError(f"{folder} has no block {name}-*.npz: run python -m benchmarks.soak --keep {folder}")
+        raise FileNotFoundError(
+            f"{folder} has no block {name}-*.npz: make blocks with python -m benchmarks.soak --keep {folder}"
+        )
     claim(folder, name, json.loads(claimed.read_text())["block"])
     parts = []
     for path in paths:
@@ -146,7 +169,12 @@ def soaked(folder: Path, name: str) -> Starts:
 
 
 def report(name: str, found: dict[str, np.ndarray]) -> str:
-    """The results of one scenario as lines of text."""
+    """Format the results of one scenario as lines of text.
+
+    Args:
+        name: Name of the scenario.
+        found: Arrays of `block`, of all blocks together.
+    """
     outcome = found["outcome"]
     shares = {o.name.lower(): np.mean(outcome == o) for o in SCENARIOS[name].outcomes}
     lines = [
@@ -171,7 +199,7 @@ def report(name: str, found: dict[str, np.ndarray]) -> str:
 
 
 def main(args: Args, folder: Path) -> None:
-    """Simulate the requested blocks that the folder lacks, then print the results of all requested blocks."""
+    """Simulate the requested blocks that the folder lacks, and print the results of all requested blocks."""
     size = min(BLOCK, -(-args.num // NUM) * NUM)
     for name in [args.only] if args.only else list(SCENARIOS):
         claim(folder, name, size)

@@ -1,11 +1,11 @@
-"""The mass of held-out objects, read from their uint8 tactile frames at rest.
+"""Accuracy of the mass of held-out objects that a regression estimates from their uint8 tactile images at rest.
 
     python -m benchmarks.touch          # about a minute, for the dataset of runs/freefall
     python -m benchmarks.touch FOLDER   # another dataset of procedural objects of all classes
 
-Prints the accuracy of a ridge regression of the log mass on simple image features (sums, sizes, depths), which is
-fitted to training objects. Also prints the share of imprint pixels at 0 or 255. Both use the last frames of settled
-objects on the pad. Writes no files.
+A ridge regression of the logarithm of the mass on simple features of the image (sums, size and depth of the imprint) is
+fitted to the training objects. Prints its accuracy on held-out objects, and the share of imprint pixels that are
+saturated, at 0 or 255. Both use the last images of objects that rest on the pad. Writes no files.
 """
 
 import dataclasses
@@ -22,11 +22,19 @@ from sts_jax import dataset, objects, physics
 class Args:
     """Options of the command line."""
 
-    dataset: tyro.conf.Positional[Path] = Path("runs/freefall/dataset")  # a dataset of procedural objects
+    dataset: tyro.conf.Positional[Path] = Path("runs/freefall/dataset")  # folder of a dataset of procedural objects
 
 
 def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Simple features of tactile images `uint8 (n, h, w, 3)`: sums, size and depth of the imprint."""
+    """Simple features of tactile images: sums, size and depth of the imprint.
+
+    Args:
+        tactile: Tactile images, uint8 `(n, h, w, 3)`.
+        blank: Tactile image of the untouched sensor, uint8 `(h, w, 3)`.
+
+    Returns:
+        Features, `(n, k)`.
+    """
     ratio = np.clip(tactile.astype(np.float64), 1, 255) / blank.astype(np.float64)
     darkness = np.clip(-np.log(ratio).min(-1), 0, None)
     signed = -np.log(ratio).mean(-1)
@@ -40,20 +48,38 @@ def features(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
 
 
 def ridge(x: np.ndarray, y: np.ndarray, x_new: np.ndarray, penalty: float = 1.0) -> np.ndarray:
-    """Predict y at `x_new` by ridge regression on the standardised x."""
+    """Predict `y` at `x_new` by ridge regression on standardised features.
+
+    Args:
+        x: Training features, `(n, k)`.
+        y: Training targets, `(n,)`.
+        x_new: Features of the predictions, `(m, k)`.
+        penalty: Weight of the squared coefficients.
+
+    Returns:
+        The predictions, `(m,)`.
+    """
     centre, scale, level = x.mean(0), x.std(0), y.mean()
     a, b = (x - centre) / scale, (x_new - centre) / scale
     return level + b @ np.linalg.solve(a.T @ a + penalty * np.eye(a.shape[1]), a.T @ (y - level))
 
 
 def saturated(tactile: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """For every imprint pixel of images `uint8 (n, h, w, 3)`, True if one of its channels is 0 or 255."""
+    """Find the saturated pixels of imprints.
+
+    Args:
+        tactile: Tactile images, uint8 `(n, h, w, 3)`.
+        blank: Tactile image of the untouched sensor, uint8 `(h, w, 3)`.
+
+    Returns:
+        For every imprint pixel of all images, True if one of its channels is 0 or 255.
+    """
     touched = np.abs(tactile.astype(int) - blank).max(-1) > 3
     return np.any((tactile == 0) | (tactile == 255), -1)[touched]
 
 
 def main(args: Args) -> None:
-    """Print the share of variance explained and the share of saturated pixels."""
+    """Print the share of the variance that the regression explains, and the share of saturated pixels."""
     data = dataset.load(args.dataset)
     collection = dataset.Collection(num_objects=data.collection["num_objects"], seed=data.collection["seed"])
     bodies = dataset.make_bodies(collection, np.arange(collection.num_objects))

@@ -2,9 +2,10 @@
 
     python -m benchmarks.twin
 
-Prints the time of each step of a frame whose light is on for half of the exposure. Then it prints the frames per second
-that a second process receives through OpenCV, and the frames per second on the virtual clock, both with the light off.
-All values are medians, and all processes run on one CPU core.
+Prints, for each size, the time to render a pose, the time to make a frame with noise whose light is on for half of the
+exposure, and the time to encode it as JPEG. Also prints the frames per second on the virtual clock, and the frames per
+second that a second process receives through OpenCV, both with the light off. All values are medians, and all processes
+run on one CPU core.
 """
 
 import dataclasses
@@ -24,8 +25,8 @@ from sts_jax.hardware import Lens, twin
 from sts_jax.hardware.twin import photometry
 
 SIZES = ((480, 640), (1232, 1640))  # height and width, pixels
-RATE = 200.0  # frames/s of the camera, more than the machine makes
-WINDOW = 10  # frames in one measurement of the rate
+RATE = 200.0  # requested frames/s of the camera, more than the machine can make
+WINDOW = 10  # number of frames over which a rate is measured
 
 # Prints the seconds between the frames that OpenCV reads.
 CLIENT = """
@@ -43,13 +44,13 @@ for _ in range(int(sys.argv[2])):
 
 @dataclasses.dataclass(frozen=True)
 class Args:
-    """Number of frames."""
+    """Options of the command line."""
 
-    frames: int = 200  # of each measurement
+    frames: int = 200  # number of frames in each measurement
 
 
 def timed(call: Callable[[], object], number: int) -> float:
-    """Median time of a call (ms)."""
+    """Median time of `number` calls (ms)."""
     times = []
     for _ in range(number):
         start = time.perf_counter()
@@ -59,7 +60,12 @@ def timed(call: Callable[[], object], number: int) -> float:
 
 
 def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.ObjectScene]:
-    """A twin in which a camera is held, seen through a lens of 160 degrees."""
+    """Make a twin and its scene, with an object of the class `camera` and a lens of 160 degrees.
+
+    Args:
+        size: Height and width of the frames (pixels).
+        exposure_s: Exposure time of a frame (s).
+    """
     sensor = sts.Sensor()
     scene = twin.ObjectScene(sts.objects.make(jax.random.key(0), "camera"), sensor=sensor, resolution=size)
     warp = twin.lens_warp(Lens.ideal(size[1], size[0]), sensor.camera, size)
@@ -68,7 +74,12 @@ def held(size: tuple[int, int], exposure_s: float) -> tuple[twin.Twin, twin.Obje
 
 
 def served(size: tuple[int, int], number: int) -> float:
-    """Rate at which a second process receives frames (frames/s), the median over windows of `WINDOW` frames."""
+    """Rate at which a second process receives frames over HTTP (frames/s), the median over windows of `WINDOW` frames.
+
+    Args:
+        size: Height and width of the frames (pixels).
+        number: Number of frames.
+    """
     device, _ = held(size, 1 / RATE)
     device.scene.prepare("hold", device.blender)
     with device, twin.Served(device) as server:
@@ -82,7 +93,7 @@ def served(size: tuple[int, int], number: int) -> float:
 
 
 def main(args: Args) -> None:
-    """Measure both sizes."""
+    """Measure both sizes on one CPU core, and print a line for each."""
     core = min(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     for size in SIZES:

@@ -1,7 +1,7 @@
-"""Griffe extension: the comment beside a field is its documentation.
+"""Griffe extension that shows the comment beside a field in the API reference.
 
-The fields of the library's dataclasses and named tuples state their unit, shape and source in a comment, on the line of
-the field or in the lines above it. The API reference shows these comments.
+The fields of the library's dataclasses and named tuples have comments with their unit, shape and source, on the line of
+the field or in the lines above it.
 """
 
 import tokenize
@@ -12,10 +12,10 @@ import griffe
 
 
 class FieldComments(griffe.Extension):
-    """Gives every attribute without a docstring the comment beside it."""
+    """Use the comment beside an attribute as its docstring, unless it has a docstring."""
 
     def on_attribute_instance(self, *, attr: griffe.Attribute, **_: Any) -> None:
-        """Called for each attribute that Griffe finds."""
+        """Set the docstring of an attribute. Griffe calls this method for each attribute that it finds."""
         if attr.docstring is not None or attr.lineno is None or not attr.lines_collection:
             return
         lines = attr.lines_collection[attr.filepath]
@@ -30,9 +30,9 @@ class FieldComments(griffe.Extension):
 
 
 def _comment(line: str) -> str:
-    """The comment at the end of a line of code."""
+    """Return the comment at the end of a line of code, or an empty string."""
     try:
         tokens = list(tokenize.generate_tokens(StringIO(line.strip()).readline))
-    except tokenize.TokenError:  # the statement goes on in the next line
+    except tokenize.TokenError:  # the statement continues on the next line
         return ""
     return next((token.string.strip("# ") for token in tokens if token.type == tokenize.COMMENT), "")

@@ -1,7 +1,7 @@
-"""MkDocs hook: serves the pictures, tables and text files of benchmarks/results, which lie outside docs/.
+"""MkDocs hook that adds the pictures, tables and text files of benchmarks/results to the site.
 
-Pages link to them by their path in the repository (`../benchmarks/results/...`), so that the links also work in the
-Markdown files themselves. The hook copies the files into the site and shortens the links accordingly.
+These files lie outside docs/. Pages link to them by their path in the repository (`../benchmarks/results/...`), so the
+links also work in the Markdown files. The hook copies the files into the site and shortens the links accordingly.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ SUFFIXES = (".md", ".png", ".txt")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the results to the site under the path that they have in the repository."""
+    """Add the result files to the site, under their paths in the repository."""
     root = Path(config.docs_dir).parent
     for path in sorted((root / RESULTS).rglob("*")):
         if path.suffix in SUFFIXES:
@@ -24,6 +24,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links that leave docs/ for the results into links within the site."""
+    """Change the links from a page to result files into links within the site."""
     up = "../" * page.file.src_uri.count("/")
     return markdown.replace(f"(../{up}{RESULTS}", f"({up}{RESULTS}")

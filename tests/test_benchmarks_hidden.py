@@ -12,7 +12,7 @@ pytestmark = pytest.mark.slow
     ("options", "reason"),
     [
         ("--soaked a --keep b --objects 200", "--soaked provides the starts, so leave out --objects and --keep"),
-        ("fill --scenario inclined", "parts is fill, but the parts of inclined are outcomes, truth, pictures"),
+        ("fill --scenario inclined", "parts of inclined must be some of outcomes, truth, pictures, got fill"),
     ],
 )
 def test_command_line_rejects_contradictory_options(options, reason):

@@ -1,1 +1,1 @@
-"""Modules that several benchmarks measure with: clocks, fresh processes, reference images, starts and classifiers."""
+"""Tools of the benchmarks: timing, new processes, reference images, starts, classifiers and emulated devices."""

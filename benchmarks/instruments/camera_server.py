@@ -1,4 +1,7 @@
-"""A loopback server of motion JPEG with faults on request. Each frame shows its number in blocks that survive JPEG."""
+"""An emulated camera: a local server of motion JPEG, with faults on request.
+
+Each frame shows its number as dark and light blocks, which can be read after the compression.
+"""
 
 import contextlib
 import http.server
@@ -16,33 +19,56 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 def draw(number: int, size: tuple[int, int] = SIZE) -> Image:
-    """A BGR image that shows a number as 4 x 4 blocks, dark for 0 and light for 1."""
+    """Draw a number as 4 x 4 blocks, one for each bit, dark for 0 and light for 1.
+
+    Args:
+        number: The number, of which the lowest 16 bits are drawn.
+        size: Width and height of the image (pixels).
+
+    Returns:
+        The BGR image.
+    """
     bits = np.array([255 if number >> bit & 1 else 60 for bit in range(_BITS)], np.uint8).reshape(-1, _COLUMNS)
     return np.asarray(cv2.resize(np.repeat(bits[..., None], 3, 2), size, interpolation=cv2.INTER_NEAREST))
 
 
 def number_of(image: Image) -> int:
-    """The number that `draw` has drawn."""
+    """Read the number that an image of `draw` shows."""
     height, width = image.shape[0] // 4, image.shape[1] // 4
     centres = image[height // 2 :: height, width // 2 :: width].mean(-1)[:4, :4].ravel()
     return sum(1 << bit for bit, value in enumerate(centres) if value > 157)
 
 
 def jpeg(image: Image) -> bytes:
-    """The file of a BGR image."""
+    """Encode a BGR image as a JPEG file."""
     return cv2.imencode(".jpg", image)[1].tobytes()
 
 
 class MotionJpeg:
-    """A server of a motion JPEG stream, whose faults `mode` selects.
+    """A server of a motion JPEG stream. Its attribute `mode` selects a fault, and may change at any time.
 
-    These modes apply before each frame. live: it sends numbered frames. skip: it leaves out the numbers in `skipped`.
-    repeat: it sends the last frame again. black: it sends black frames. small: it sends frames of half the width and
-    height. damaged: it sends incomplete frames. stall: it sends nothing and keeps the connection open. held: it keeps
-    the frames back, and sends them all at once when the mode changes. close: it closes the connection.
+    The server reads these modes before each frame:
 
-    These modes apply to requests. hang: it does not answer. missing: it answers with status 404. text: it answers with
-    a text instead of the stream.
+    - `live`: send numbered frames.
+    - `skip`: leave out the numbers in `skipped`.
+    - `repeat`: send the last frame again.
+    - `black`: send black frames.
+    - `small`: send frames of half the width and height.
+    - `damaged`: send incomplete frames.
+    - `stall`: send nothing, and keep the connection open.
+    - `held`: keep the frames back, and send them all at once when the mode changes.
+    - `close`: close the connection.
+
+    It reads these modes at each request:
+
+    - `hang`: send no answer.
+    - `missing`: answer with status 404.
+    - `text`: answer with a text instead of the stream.
+
+    Args:
+        fps: Frames per second.
+        colour: BGR colour of all frames, except for a corner that alternates. None: frames show their numbers.
+        size: Width and height of the frames (pixels).
     """
 
     def __init__(self, fps: float = 50, colour: tuple[int, int, int] | None = None, size: tuple[int, int] = SIZE):
@@ -61,7 +87,7 @@ class MotionJpeg:
         return f"http://127.0.0.1:{self.port}/video"
 
     def start(self) -> None:
-        """Listen, at the port of the last time if there is one."""
+        """Listen for requests. After `stop`, the server listens at the same port as before."""
         server = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -86,7 +112,7 @@ class MotionJpeg:
         self.thread.join()
 
     def answer(self, request: http.server.BaseHTTPRequestHandler) -> None:
-        """Answer a request for the stream."""
+        """Answer a request for the stream, and send frames until the server stops or the mode ends the stream."""
         if self.mode == "hang":
             self._pause("hang")
             return
@@ -127,7 +153,7 @@ class MotionJpeg:
 
     def _frame(self) -> bytes:
         width, height = self.size
-        if self.colour is not None:  # with a corner that changes
+        if self.colour is not None:  # the corner alternates, because identical frames would count as frozen
             image = np.full((height, width, 3), self.colour, np.uint8)
             image[:16, :16] = 60 + self.number % 2 * 100
             return jpeg(image)

@@ -1,6 +1,7 @@
-"""Loss of a classifier on unseen objects, with intervals over objects.
+"""Loss of a classifier on unseen objects, with confidence intervals over objects.
 
-Rows are items (trajectories, frames), and `groups` has the object of each. Folds and intervals never split an object.
+Rows of the arrays are items, such as trajectories or images. `groups` has the number of the object of each item.
+Cross-validation folds and bootstrap samples contain all items of an object or none.
 """
 
 from collections.abc import Callable
@@ -14,8 +15,8 @@ from threadpoolctl import threadpool_limits
 from sts_jax.evaluation import metrics
 
 FOLDS = 5
-SEEDS = 3  # classifiers per fold, whose probabilities are averaged
-FLOOR = 1e-3  # least probability of any class
+SEEDS = 3  # classifiers for each fold, whose probabilities are averaged
+FLOOR = 1e-3  # smallest probability of a class, which bounds the log loss
 
 
 class Interval(NamedTuple):
@@ -30,18 +31,18 @@ class Interval(NamedTuple):
 
 
 def probabilities(x: np.ndarray, y: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Probabilities of the classes of each row, by boosted trees that are fitted to the other groups.
+    """Predict the class of each row by boosted trees that were fitted to rows of other groups.
 
     Args:
-        x: Features, `(n, k)`.
-        y: Classes 0, 1, ..., int `(n,)`.
+        x: Features, `(n, k)`. Entries may be nan.
+        y: Classes, int `(n,)`, from 0.
         groups: The group of each row, `(n,)`.
 
     Returns:
-        `(n, classes)`, at least FLOOR.
+        Probabilities of the classes, `(n, classes)`, at least FLOOR.
     """
     result = np.zeros((len(y), y.max() + 1))
-    # One thread, because trees are small, and threads that wait for each other are slow on a busy machine.
+    # The trees are small, so more threads would only wait for each other on a busy machine.
     with threadpool_limits(1):
         for fitted, held_out in GroupKFold(FOLDS, shuffle=True, random_state=0).split(x, y, groups):
             for seed in range(SEEDS):
@@ -64,21 +65,21 @@ def mean(values: np.ndarray, weight: np.ndarray) -> float:
 
 
 def gain(before: np.ndarray, after: np.ndarray, weight: np.ndarray) -> float:
-    """Share by which the mean loss decreases from `before` to `after`."""
+    """Relative decrease of the weighted mean loss from `before` to `after`, each `(n,)`."""
     return 1 - mean(after, weight) / mean(before, weight)
 
 
 def kept(before: np.ndarray, after: np.ndarray, other: np.ndarray, weight: np.ndarray) -> float:
-    """The gain of `other` divided by that of `after`."""
+    """Gain of the losses `other` over `before`, divided by the gain of `after` over `before`."""
     return gain(before, other, weight) / gain(before, after, weight)
 
 
 def interval(statistic: Callable[..., float], *columns: np.ndarray, groups: np.ndarray) -> Interval:
-    """A statistic with its 95 % interval over groups (bootstrap).
+    """Compute a statistic and its 95 % bootstrap interval over groups.
 
     Args:
-        statistic: A function of the columns and of the weights `(n,)` of the rows, as `mean`.
-        columns: Values, `(n,)` each.
+        statistic: A function of the columns and of the weights of the rows, `(n,)`, such as `mean`.
+        columns: Arguments of the statistic, `(n,)` each.
         groups: The group of each row, `(n,)`.
     """
     draws = metrics.bootstrap(groups, lambda weight: np.asarray(statistic(*columns, weight)))

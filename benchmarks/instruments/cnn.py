@@ -9,16 +9,19 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-CHANNELS = (24, 48, 64)  # after each 3 x 3 convolution
+CHANNELS = (24, 48, 64)  # output channels of the 3 x 3 convolutions
 BATCH = 64
-RATE = 2e-3  # Adam's learning rate, which falls to zero along a cosine
+RATE = 2e-3  # initial learning rate of Adam, which falls to zero along a cosine
 LAYOUT = ("NHWC", "HWIO", "NHWC")
 
 Weights = list[tuple[Array, Array]]
 
 
 def initial(key: PRNGKeyArray, outputs: int) -> Weights:
-    """Weights of three convolutions and two dense layers (He normal, the last one zero)."""
+    """Draw the weights of three convolutions and two dense layers from a He normal distribution.
+
+    The last layer is zero, so the untrained network predicts zero.
+    """
     widths = [12, *CHANNELS]
     shapes = [(3, 3, a, b) for a, b in itertools.pairwise(widths)]
     dense = [(2 * CHANNELS[-1], 64), (64, outputs)]
@@ -31,9 +34,9 @@ def initial(key: PRNGKeyArray, outputs: int) -> Weights:
 
 
 def apply(weights: Weights, x: Float[Array, "n h w 3"]) -> Float[Array, "n k"]:
-    """The network's outputs for images whose sides are multiples of 8.
+    """Apply the network to images whose sides are multiples of 8.
 
-    No convolution has a stride, because XLA's gradients of strided ones are slow on a CPU.
+    The convolutions have no stride, because gradients of strided convolutions are slow on a CPU.
     """
     n, h, w, c = x.shape
     x = x.reshape(n, h // 2, 2, w // 2, 2, c).transpose(0, 1, 3, 2, 4, 5).reshape(n, h // 2, w // 2, 4 * c)
@@ -50,16 +53,18 @@ def apply(weights: Weights, x: Float[Array, "n h w 3"]) -> Float[Array, "n k"]:
 def fit(
     key: PRNGKeyArray, images: np.ndarray, targets: np.ndarray, *, steps: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Train a network to predict `targets` from `images`, and return it as a function of images.
+    """Train a network to predict `targets` from `images`.
 
     Args:
-        key: Consumed.
-        images: uint8 (n, h, w, 3).
-        targets: float (n, k), standardised and learnt by squared error, or bool (n, k), learnt by cross-entropy.
-        steps: Steps of Adam, with BATCH images each.
+        key: Random key.
+        images: Training images, uint8 `(n, h, w, 3)`.
+        targets: Float `(n, k)`, for the squared error of the standardised targets, or bool `(n, k)`, for the
+            cross-entropy.
+        steps: Number of steps of Adam, with BATCH images each.
 
     Returns:
-        Function from images (m, h, w, 3) to predictions (m, k), which are logits if `targets` is bool.
+        A function from images, uint8 `(m, h, w, 3)`, to predictions, `(m, k)`. They are logits if `targets` is bool,
+        and otherwise in the unit of `targets`.
     """
     logits = targets.dtype == bool
     centre, scale = (0.0, 1.0) if logits else (targets.mean(0), targets.std(0))

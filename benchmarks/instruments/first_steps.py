@@ -1,4 +1,4 @@
-"""The first steps of a new user, to be timed in a fresh process."""
+"""The first steps of a new user, timed in a new process."""
 
 import os
 import time
@@ -7,9 +7,12 @@ CLASS = "scissors"
 
 
 def stamps() -> dict[str, float]:
-    """Take the steps, and return the seconds from the beginning to the end of each, by name.
+    """Run the steps one after the other.
 
-    The imports are the first step, and are therefore inside the function.
+    The imports stand inside the function, because they are the first step.
+
+    Returns:
+        Seconds from the call to the end of each step, by name of the step.
     """
     begun = time.perf_counter()
     found: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Call functions in new processes, to measure the time of a first call and the memory of a process."""
+"""Function calls in new processes, which measure the time of a first call or the memory of a process."""
 
 import json
 import os
@@ -14,12 +14,15 @@ def call(function: str, *arguments: Any, cache: Path | None = None) -> Any:
     """Call a function in a new process, and return its result.
 
     Args:
-        function: The function's module and name, as `benchmarks.sensor.cost_of`.
-        arguments: Positional arguments. They and the result travel as JSON.
-        cache: The folder of JAX's persistent compilation cache in that process. Default: as in this process.
+        function: Module and name of the function, such as `benchmarks.sensor.cost_of`.
+        arguments: Positional arguments of the function. Arguments and result must be serialisable as JSON.
+        cache: Folder of JAX's persistent compilation cache in the new process. Default: the setting of this process.
+
+    Returns:
+        The result of the function.
 
     Raises:
-        subprocess.CalledProcessError: The process failed. Its error output appears on this process's.
+        subprocess.CalledProcessError: The process failed. Its error output is that of this process.
     """
     module, name = function.rsplit(".", 1)
     environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}

@@ -1,4 +1,7 @@
-"""Features of lathed objects that stand on the jerked pad, for a classifier: from vision and from weight."""
+"""Features for a classifier of the outcome of lathed objects on the jerked pad, from vision and from weight.
+
+A lathed object is a solid of revolution, such as a bottle.
+"""
 
 from typing import NamedTuple
 
@@ -10,21 +13,22 @@ from sts_jax.physics.perturbed import jerk
 from sts_jax.physics.scenario import G
 from sts_jax.sensor import Sensor
 
-FILLS = np.linspace(0, 1, 17)  # fills at which mass properties are computed for a shape
-NOISE = 0.05  # log kg, standard deviation of the measured mass
+FILLS = np.linspace(0, 1, 17)  # fill levels at which mass properties are computed
+NOISE = 0.05  # standard deviation of the measured log mass, about 5 % of the mass
 
 
 class Sight(NamedTuple):
-    """Exact properties that follow from the shape of each object, one row each."""
+    """Properties that the visible shape determines, with one row for each object."""
 
-    profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radius at seven heights
-    low: np.ndarray  # (b,) m, the lowest point in the mesh frame
-    # (b, FILLS, 3) at each fill: mass (kg), height of the centre of mass over the base (m), inertia across (kg m^2)
+    profile: np.ndarray  # (b, 10) m: radius of the base, height, greatest radius, radii at seven heights
+    low: np.ndarray  # (b,) m, height of the lowest point in the mesh frame
+    # (b, 17, 3) for each of FILLS: mass (kg), height of the centre of mass above the base (m), inertia about a
+    # horizontal axis through the centre of mass (kg m^2)
     rigid: np.ndarray
 
 
 def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
-    """The row of `Sight` of one object."""
+    """Compute the row of `Sight` for one object."""
     points = np.asarray(body.vertices)[np.unique(np.asarray(body.faces))]
     low = float(points[:, 2].min())
     radius, level = np.hypot(points[:, 0], points[:, 1]), (points[:, 2] - low).round(5)
@@ -37,25 +41,27 @@ def look(body: objects.Body) -> tuple[np.ndarray, float, np.ndarray]:
 
 
 def sight(items: list[objects.Body]) -> Sight:
-    """The properties of all objects."""
+    """Compute the visible properties of all objects."""
     return Sight(*map(np.stack, zip(*map(look, items), strict=True)))
 
 
 def weighed(starts: Starts) -> np.ndarray:
-    """The quantity that touch measures, (n, 1): the logarithm of the mass in kg."""
+    """Exact value of the quantity that touch measures: the logarithm of the mass in kg, `(n, 1)`."""
     return np.log(starts.mass)[:, None]
 
 
 def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn or mirror first states by a symmetry of the square pad, so that the push points 0 to 45 degrees from +x.
+    """Rotate or mirror starts by a symmetry of the square pad, so that the push points 0 to 45 degrees from +x.
+
+    The push is the acceleration of the object in the frame of the pad, opposite to the acceleration of the pad.
 
     Args:
-        pose: First poses, (n, 7).
-        condition: (n, 3). The first two columns are the acceleration of the pad (m/s^2), the opposite of the push.
-            The third is not used.
+        pose: First poses, `(n, 7)`.
+        condition: Conditions of `Perturbed`, `(n, 3)`. The first two columns are the acceleration of the pad (m/s^2).
+            The third one is not used.
 
     Returns:
-        Positions on the pad (m) and pushes (m/s^2), (n, 2) each.
+        Positions on the pad (m) and pushes (m/s^2), `(n, 2)` each.
     """
     push = -np.asarray(jerk(condition).acceleration)
     sign = np.where(push < 0, -1, 1)
@@ -65,18 +71,23 @@ def canonical(pose: np.ndarray, condition: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndarray, friction: float) -> np.ndarray:
-    """Two ratios (n, 2) above which a standing object topples about the edge of its base.
+    """Compute two ratios that decide whether a standing object topples over the edge of its base.
 
-    The first ratio is its acceleration over that at which it begins to tip, g b / h. The second one, as a logarithm, is
-    its energy at the end of the push over the energy that lifts its centre of mass over the edge. Friction limits the
-    force, which then lasts longer.
+    The first ratio is the acceleration over g b / h, the acceleration at which the object begins to tip, where b is the
+    radius of the base and h the height of the centre of mass. The second ratio is the energy at the end of the push
+    over the energy that lifts the centre of mass over the edge. Both exceed 1 for an object that topples. Friction
+    limits the force, and the push then acts for a longer time.
 
     Args:
-        rigid: (n, 3) mass (kg), height of the centre of mass (m), inertia across it (kg m^2).
-        base: (n,) m, radius of the base.
-        push: (n,) m/s^2, acceleration.
-        time: (n,) s, duration of the push.
-        friction: A typical coefficient, because the true one is hidden.
+        rigid: Mass (kg), height of the centre of mass (m), and inertia about a horizontal axis through the centre of
+            mass (kg m^2), `(n, 3)`.
+        base: Radius of the base (m), `(n,)`.
+        push: Acceleration (m/s^2), `(n,)`.
+        time: Duration of the push (s), `(n,)`.
+        friction: A typical coefficient of friction, because the true one is hidden.
+
+    Returns:
+        The first ratio and the logarithm of the second ratio, `(n, 2)`.
     """
     mass, height, inertia = rigid.T
     force, lasts = np.minimum(push, friction * G), time * np.maximum(1, push / (friction * G))
@@ -91,13 +102,16 @@ def tipping(rigid: np.ndarray, base: np.ndarray, push: np.ndarray, time: np.ndar
 def shaken(
     scenario: physics.Perturbed, items: list[objects.Body], starts: Starts, touch: np.ndarray | None
 ) -> np.ndarray:
-    """Features (n, k) of jerked starts of lathed objects.
+    """Features of lathed objects on the jerked pad.
 
     Args:
         scenario: The scenario.
         items: The objects.
-        starts: Their starts.
-        touch: (n, 1) logarithm of the mass in kg, or None for features from vision alone.
+        starts: Their starts, one row each.
+        touch: Measured logarithm of the mass in kg, `(n, 1)`. None: return features from vision alone.
+
+    Returns:
+        Features, `(n, k)`.
     """
     seen = sight(items)
     friction = float(np.mean(scenario.friction))

@@ -1,4 +1,4 @@
-"""A LED controller on a pseudo-terminal that injects faults."""
+"""An emulated LED controller on a pseudo-terminal, with faults on request."""
 
 import contextlib
 import os
@@ -12,15 +12,30 @@ from pathlib import Path
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 
-TICK_S = 0.01  # longest wait between two looks at the watchdog
+TICK_S = 0.01  # longest wait between two checks of the watchdog
 
 
 class Peer:
-    """An emulated controller behind `path`, a link to a pseudo-terminal.
+    """An emulated LED controller. Its port is `path`, a symbolic link to a pseudo-terminal.
 
-    `faults` has one word for each of the next requests, and requests are answered without faults after the last one.
-    By default the emulated controller's clock runs at a hundredth of the speed, so that its watchdog does not
-    interfere.
+    The list `faults` has one word for each of the next requests. Further requests are answered without a fault. The
+    words are:
+
+    - `none`: answer as usual.
+    - `deaf`: ignore the request.
+    - `damaged`: damage the request before it is read.
+    - `lost`: execute the request, but send no answer.
+    - `late`: send the answer together with the answer to the next request.
+    - `doubled`: send the answer twice.
+    - `garbled`: flip a bit of the answer.
+    - `cut`: send only the first half of the answer.
+    - `joined`: send the answer twice, the first time without the end of its line.
+    - `noise`: send a line of meaningless bytes before the answer.
+    - `watchdog`: send a line of the watchdog before the answer.
+    - `stale`: send the answer to another request before the answer.
+    - `vanish`: unplug the controller.
+
+    By default, the controller's clock runs at a hundredth of the true speed, so that its watchdog does not interfere.
     """
 
     def __init__(
@@ -32,14 +47,15 @@ class Peer:
         clock: Callable[[], float] = lambda: time.monotonic() / 100,
         make: Callable[..., EmulatedController] = EmulatedController,
     ):
-        """Begin to listen.
+        """Make the port and begin to answer requests.
 
         Args:
-            path: The link that is made.
-            serial_number: Of the controller.
-            talk: Bytes that another device sends, asked or not, instead of any answer.
-            clock: The controller's clock (s).
-            make: Makes the controller, after each boot.
+            path: Symbolic link to the port, which is created or replaced.
+            serial_number: Serial number of the controller.
+            talk: Bytes that are sent instead of any answer, also without a request, as another device would. None:
+                the controller answers requests.
+            clock: The controller's clock, a function that returns seconds.
+            make: Function that makes the emulated controller at each boot.
         """
         self.path = path
         self.clock = clock
@@ -51,8 +67,8 @@ class Peer:
         self.talk = talk
         self._held = b""
         self._pending = b""
-        self._deaf_until_s = 0.0  # on `time.monotonic`, while a controller boots
-        self._lock = threading.Lock()  # guards the controller against faults of other threads
+        self._deaf_until_s = 0.0  # end of the boot on `time.monotonic`, before which requests are ignored
+        self._lock = threading.Lock()  # other threads restart the controller or fire its watchdog
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -63,7 +79,7 @@ class Peer:
         self._thread.start()
 
     def vanish(self) -> None:
-        """Unplug the controller."""
+        """Unplug the controller: stop its thread, close its port and remove the link."""
         self._stop.set()
         self._thread.join()
         for descriptor in (self._master, self._slave):
@@ -72,12 +88,12 @@ class Peer:
         self.path.unlink(missing_ok=True)
 
     def send(self, data: bytes) -> None:
-        """Send bytes, unless the host reads none or the controller has vanished."""
+        """Send bytes to the host. They are lost if the host reads nothing or the controller has vanished."""
         with contextlib.suppress(OSError):
             os.write(self._master, data)
 
     def restart(self, boot_s: float = 0.0) -> None:
-        """Restart the controller, which turns the lights off and answers nothing for a time (s)."""
+        """Restart the controller. The lights go off, and requests are ignored for `boot_s` seconds."""
         with self._lock:
             boot = self.controller.boot + 1
             self.controller = self._make(serial_number=self._serial_number, now_s=self.clock(), boot=boot)
@@ -85,7 +101,7 @@ class Peer:
             self._deaf_until_s = time.monotonic() + boot_s
 
     def fire_watchdog(self) -> None:
-        """Turn the lights off as the watchdog does, although requests have come."""
+        """Turn the lights off and send the line of the watchdog, as if no request had arrived for too long."""
         with self._lock:
             self.controller._valid_s = -float("inf")
             sent = self.controller.tick(self.clock())
@@ -108,9 +124,9 @@ class Peer:
         if time.monotonic() < self._deaf_until_s:
             return b""
         fault = self.faults.pop(0) if self.faults else "none"
-        if fault == "deaf":  # the request is lost
+        if fault == "deaf":
             return b""
-        if fault == "damaged":  # the request is damaged
+        if fault == "damaged":
             line = line.replace(b" ", b"!", 1)
         with self._lock:
             reply = self.controller.receive(line, self.clock())
@@ -118,7 +134,7 @@ class Peer:
         match fault:
             case "lost":
                 return held
-            case "late":  # it comes before the answer to the next request
+            case "late":
                 self._held = reply
                 return held
             case "doubled":
@@ -139,6 +155,6 @@ class Peer:
                 self._stop.set()
                 os.close(self._slave)
                 os.close(self._master)
-                self._master = self._slave = -1  # the numbers may belong to other files soon
+                self._master = self._slave = -1  # the system may give the old numbers to other files
                 return b""
         return held + reply

@@ -5,14 +5,14 @@ from pathlib import Path
 
 
 def public_meshes() -> Path:
-    """The folder of miniworld's meshes (Farama Foundation, Apache 2.0).
+    """Find the folder of the meshes of the package miniworld (Farama Foundation, Apache 2.0).
 
-    Its code is not imported, because that needs a display.
+    The package is not imported, because its code needs a display.
 
     Raises:
         ModuleNotFoundError: miniworld is not installed.
     """
     found = importlib.util.find_spec("miniworld")
     if found is None or found.origin is None:
-        raise ModuleNotFoundError("the meshes come with miniworld. Install it: pip install -e '.[test]'")
+        raise ModuleNotFoundError("the meshes are part of the package miniworld. Install it: pip install -e '.[test]'")
     return Path(found.origin).parent / "meshes"

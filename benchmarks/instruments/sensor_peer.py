@@ -1,7 +1,7 @@
-"""A sensor's devices without a sensor: a controller on a pseudo-terminal and a camera that sees its lights.
+"""An emulated sensor: an LED controller on a pseudo-terminal, and a camera that sees the controller's lights.
 
-Each frame shows the mean light of its exposure, and its number in a corner. The peer logs that light for each
-number, so that images are judged without the host's labels.
+The grey value of a frame is the mean light of its exposure. A corner of the frame shows the frame's number. The camera
+logs the light of each number, so a benchmark can check the light of an image independently of `hardware.STS`.
 """
 
 import dataclasses
@@ -19,24 +19,32 @@ from benchmarks.instruments.shown import Shown
 from sts_jax.hardware import protocol
 from sts_jax.hardware.emulation import EmulatedController
 
-DARK, LIT = 70, 210  # grey values without and with the lights
-CORNER = 32  # pixels, side of the corner with the number
+DARK, LIT = 70, 210  # grey values of a frame with the lights off and fully on
+CORNER = 32  # pixels, side of the corner that shows the number
 
 
 class Lights:
-    """The levels of the controllers that are plugged in, over time."""
+    """The light of the plugged-in controller over time, as a share of the full power."""
 
     def __init__(self) -> None:
-        self._changes = [(0.0, 0.0)]  # time (s) and share of the light from then on
+        self._changes = [(0.0, 0.0)]  # each change: its time (s) and the share of the light from then on
         self._lock = threading.Lock()
 
     def changed(self, levels: protocol.Levels) -> None:
-        """Log the levels that apply from now on."""
+        """Log that the four channels have these levels, 0 to 255, from now on."""
         with self._lock:
             self._changes.append((time.monotonic(), sum(levels) / 1020))
 
     def shares(self, start_s: float, end_s: float) -> tuple[list[float], float]:
-        """The shares of the light that occur in an interval, and their mean."""
+        """Find the light during an interval.
+
+        Args:
+            start_s: Start of the interval on `time.monotonic` (s).
+            end_s: End of the interval (s).
+
+        Returns:
+            The successive shares of the light, and their mean over time.
+        """
         with self._lock:
             changes = self._changes[-1000:]
         found: list[float] = []
@@ -49,14 +57,14 @@ class Lights:
         return found, mean
 
     def off_after(self, time_s: float) -> float | None:
-        """The time after which the lights have been off since, at least a given time. None: they are on."""
+        """Return the time (s) since which the lights have been off, but at least `time_s`. None: the lights are on."""
         with self._lock:
             since_s, share = self._changes[-1]
         return max(since_s, time_s) if share == 0 else None
 
 
 class SeenController(EmulatedController):
-    """A controller whose lights a camera sees."""
+    """An emulated controller that logs its levels in `lights`, where the camera reads them."""
 
     def __init__(self, lights: Lights, **options: object):
         super().__init__(**options)  # type: ignore[arg-type]
@@ -70,27 +78,37 @@ class SeenController(EmulatedController):
 
 @dataclasses.dataclass(frozen=True)
 class Exposure:
-    """One frame as the camera took it."""
+    """The exposure of one frame."""
 
-    shares: list[float]  # shares of the light that occurred during it. A frame of one light has one
-    mean: float  # their mean
-    start_s: float  # on `time.monotonic`
-    end_s: float
+    shares: list[float]  # successive shares of the light during the exposure, only one if the light was constant
+    mean: float  # mean share over the exposure
+    start_s: float  # start of the exposure on `time.monotonic`
+    end_s: float  # end of the exposure on `time.monotonic`
 
 
 class SeenLights(MotionJpeg):
-    """The camera. A frame that is sent at t was exposed from t - lag_s - exposure_s to t - lag_s."""
+    """An emulated camera that sees `lights`.
+
+    A frame that is sent at time t was exposed from t - lag_s - exposure_s to t - lag_s.
+
+    Args:
+        lights: The light over time.
+        fps: Frames per second.
+        lag_s: Time from the end of the exposure to the sending (s).
+        exposure_s: Exposure time (s).
+        size: Width and height of the frames (pixels).
+    """
 
     def __init__(
         self, lights: Lights, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int] = SIZE
     ) -> None:
         self.lights, self.lag_s, self.exposure_s = lights, lag_s, exposure_s
-        self.log: dict[int, Exposure] = {}  # by the number of the frame
-        self.blind = False  # whether the lights change nothing
-        self.numbered = True
-        self.moving = False
+        self.log: dict[int, Exposure] = {}  # exposure of each frame, by the number of the frame
+        self.blind = False  # True: frames do not show the light
+        self.numbered = True  # True: frames show their number
+        self.moving = False  # True: a black disc moves through the frames
         self.spot: tuple[int, int, int] | None = None  # column, row and radius of a dark object (pixels)
-        self.noise = 0.0  # standard deviation of each pixel
+        self.noise = 0.0  # standard deviation of the noise of each pixel (of 255)
         self._random = np.random.default_rng(0)
         super().__init__(fps=fps, size=size)
 
@@ -103,7 +121,8 @@ class SeenLights(MotionJpeg):
         width, height = self.size
         image = np.full((height, width, 3), DARK if self.blind else DARK + mean * (LIT - DARK), np.uint8)
         if self.numbered:
-            image[:CORNER, :CORNER] = 0.3 * draw(self.number, (CORNER, CORNER)) + 110  # faint, the scene is at rest
+            # The blocks are faint, because changes of strong blocks would count as motion of the scene.
+            image[:CORNER, :CORNER] = 0.3 * draw(self.number, (CORNER, CORNER)) + 110
         if self.moving:
             cv2.circle(image, (20 + 7 * self.number % 100, height // 2), 16, (0, 0, 0), -1)
         spot = self.spot
@@ -114,14 +133,22 @@ class SeenLights(MotionJpeg):
         return jpeg(image)
 
     def exposure_of(self, image: Image) -> Exposure | None:
-        """The log of the frame that an image shows, or None if the camera has not taken such a frame."""
+        """Look up the exposure of an image by its number. None: the camera has not taken such an image."""
         if image.shape[1::-1] != self.size or image.max() < DARK / 2:
             return None
         return self.log.get(number_of(image[:CORNER, :CORNER]))
 
 
 class SensorPeer:
-    """Both devices. A host connects to the camera at `url` and to the controller at `path`."""
+    """An emulated camera at the address `url`, and an emulated controller at the port `path`.
+
+    Args:
+        path: Symbolic link to the controller's port, which is created.
+        fps: Frames per second of the camera.
+        lag_s: Time from the end of an exposure to the sending of the frame (s).
+        exposure_s: Exposure time (s).
+        size: Width and height of the frames (pixels).
+    """
 
     def __init__(
         self,
@@ -144,18 +171,18 @@ class SensorPeer:
         return self.camera.url
 
     def plug_in(self, path: Path) -> None:
-        """Plug the controller in, which boots. The watchdog's clock is real."""
+        """Plug the controller in at the port `path`, where it boots. Its watchdog runs on the true clock."""
         self._boots += 1
         self.leds = Peer(path, clock=time.monotonic, make=functools.partial(SeenController, self.lights))
         self.leds.controller.boot = self._boots
 
     def unplug(self) -> None:
-        """Unplug the controller, whose lights go off."""
+        """Unplug the controller. Its lights go off."""
         self.leds.vanish()
         self.lights.changed(protocol.DARK)
 
     def judged(self, image: Image, *, lit: bool) -> bool:
-        """Whether the camera has taken an image, with its lights on, or off, during all of its exposure."""
+        """Return whether the camera took an image while all lights were on (`lit`) or off for the whole exposure."""
         found = self.camera.exposure_of(image)
         return found is not None and found.shares == [1.0 if lit else 0.0]
 
@@ -165,10 +192,10 @@ class SensorPeer:
         self.leds.vanish()
 
     def shown(self) -> dict[int, Shown]:
-        """The light of each frame, by `key` of its image."""
+        """Return the light of each frame, by the `key` of its image."""
         return {number: Shown(number, exposure.mean) for number, exposure in self.camera.log.items()}
 
 
 def key(image: Image) -> int:
-    """The number of the frame that an image shows, from its corner."""
+    """Read the number of a frame from the corner of its image."""
     return number_of(image[:CORNER, :CORNER])

@@ -1,18 +1,18 @@
-"""The light that a frame of simulated devices shows, by the camera's own log."""
+"""The light under which an emulated camera took a frame, from the camera's own log."""
 
 from typing import NamedTuple
 
-_TOLERANCE = (
-    1e-3  # of the lights' power. The twin's read noise is 1.5e-3, and its light approaches a new level for ever
-)
+# Share of the lights' full power. The twin's LEDs approach a new level exponentially, so a tolerance is needed. It is
+# below the twin's read noise of 1.5e-3.
+_TOLERANCE = 1e-3
 
 
 class Shown(NamedTuple):
     """The light of one frame."""
 
-    number: int  # of the frame
-    light: float  # mean share of the lights' power during the exposure
+    number: int  # number of the frame
+    light: float  # mean light during the exposure, as a share of the full power
 
     def is_of(self, share: float) -> bool:
-        """Whether the light had this share during the exposure."""
+        """Return whether the mean light during the exposure was this share of the full power."""
         return abs(self.light - share) <= _TOLERANCE

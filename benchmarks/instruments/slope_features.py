@@ -1,6 +1,7 @@
-"""Features of objects laid on the slope, for a classifier: statics from vision and from the centre of pressure.
+"""Features for a classifier of the outcome on the slope, from vision and from the centre of pressure.
 
-Downhill is +y.
+The features are results of statics: the support polygon of the object, and the place at which its weight acts. Downhill
+is +y.
 """
 
 import math
@@ -16,29 +17,42 @@ from sts_jax import geometry, objects, physics
 from sts_jax.sensor import Sensor
 
 NOISE = 0.001  # m, standard deviation of the measured centre of pressure
-SEEN = (0.0001, 0.0017)  # m, rad, standard deviations of a pose from vision
-DRAWS = 128  # draws of the hidden contents for the features of a start
+SEEN = (0.0001, 0.0017)  # m and rad, standard deviations of position and orientation from vision
+DRAWS = 128  # random draws of the hidden contents for the features of a start
 FRICTIONS = 8  # coefficients of friction that are combined with each draw
-LEVELS = (0.0001, 0.001)  # m, heights over the lowest point up to which points support at once, or after rocking
-SNAP = 0.9986  # cosine of 3 degrees. An object that leans less from a stable face is taken to lie on it
+# m, heights above the lowest point. Points up to the first height support the object, up to the second after it rocks
+LEVELS = (0.0001, 0.001)
+SNAP = 0.9986  # cosine of 3 degrees. An object that leans less than this from a stable face lies on the face
 
 
 def support(points: np.ndarray, level: float) -> np.ndarray:
-    """Corners (k, 2), in order, of the support polygon of the points (n, 3) within `level` (m) of the lowest one."""
+    """Compute the support polygon of an object.
+
+    Args:
+        points: Points of the object (m), `(n, 3)`, with z upwards.
+        level: Height above the lowest point up to which points support the object (m).
+
+    Returns:
+        Corners of the polygon in counter-clockwise order (m), `(k, 2)`. Two corners if the points lie on a line.
+    """
     low = np.unique(points[points[:, 2] < points[:, 2].min() + level, :2].round(7), axis=0)
     try:
         return low[ConvexHull(low).vertices]
-    except (QhullError, ValueError):  # an edge or a corner
+    except (QhullError, ValueError):  # the object stands on an edge or a corner
         far = low @ np.array([0.3, 1.0])
         return low[[far.argmin(), far.argmax()]]
 
 
 def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
-    """Stability margins of a place (2,) in a support polygon (k, 2), positive inside.
+    """Distances of a point from the edges of a support polygon.
+
+    Args:
+        corners: Corners of the polygon (m), `(k, 2)`.
+        place: The point (m), `(2,)`.
 
     Returns:
-        Distance (m) from the nearest edge, distance (m) from the nearest downhill edge, length (m) of that edge, and y
-        component of its outward unit normal.
+        Distance from the nearest edge (m), distance from the nearest downhill edge (m), length of this downhill edge
+        (m), and y component of its outward unit normal. Distances are positive inside of the polygon.
     """
     along = np.roll(corners, -1, 0) - corners
     length = np.linalg.norm(along, axis=1) + 1e-9
@@ -52,17 +66,17 @@ def margins(corners: np.ndarray, place: np.ndarray) -> list[float]:
 def balance(
     corners: np.ndarray, centre: np.ndarray, friction: np.ndarray, slope: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Motion and centre of pressure of a body on the slope by statics, for different hidden values.
+    """Predict by statics how a body on the slope moves, and where it presses on the pad, for several hidden values.
 
     Args:
-        corners: (k, 2) m, corners of the support polygon.
-        centre: (m, 3) m, centres of mass, with z above the pad.
-        friction: (m,) coefficients of friction.
-        slope: rad, towards +y.
+        corners: Corners of the support polygon (m), `(k, 2)`.
+        centre: Centres of mass (m), `(m, 3)`, with z above the pad.
+        friction: Coefficients of friction, `(m,)`.
+        slope: Angle of the slope (rad).
 
     Returns:
-        Motion (m,), which is 0 for tipping, 1 for sliding and 2 for sticking, and centre of pressure (m, 2) in m. A
-        body that tips presses on the edge over which it tips.
+        The motion, `(m,)`, which is 0 for tipping, 1 for sliding and 2 for sticking, and the centre of pressure (m),
+        `(m, 2)`. A body that tips presses on the edge over which it tips.
     """
     grip = np.minimum(friction, math.tan(slope))
     pressure = centre[:, :2] + (centre[:, 2] * grip)[:, None] * np.array([0.0, 1.0])
@@ -77,7 +91,7 @@ def balance(
 
 
 def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
-    """Centres of mass (DRAWS, 3) in m, mesh frame, of a body with draws of its hidden contents."""
+    """Centres of mass of a body for random draws of its hidden contents, in the mesh frame (m), `(DRAWS, 3)`."""
     if not body.contents_density:
         return np.tile(np.asarray(body.shell_com), (DRAWS, 1))
     hidden = jax.vmap(scenario.hidden)(jax.random.split(jax.random.key(0), DRAWS))
@@ -85,7 +99,15 @@ def drawn_centres(body: objects.Body, scenario: physics.Inclined) -> np.ndarray:
 
 
 def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
-    """Snap a rotation (3, 3) to the nearest one with one of the object's directions (k, 3) up, if that is near."""
+    """Rotate an object that lies almost on a stable face until it lies on the face exactly.
+
+    Args:
+        rotation: Rotation of the object, `(3, 3)`.
+        ups: Directions in the mesh frame that point up when the object lies on a stable face, `(k, 3)`.
+
+    Returns:
+        The corrected rotation, or `rotation` itself if no direction is within 3 degrees of the vertical.
+    """
     up = rotation @ ups[(ups @ rotation[2]).argmax()]
     if up[2] < SNAP:
         return rotation
@@ -93,23 +115,31 @@ def levelled(rotation: np.ndarray, ups: np.ndarray) -> np.ndarray:
 
 
 def pressed(starts: Starts) -> np.ndarray:
-    """The quantity that touch measures, (n, 2): the centre of pressure `(-My, Mx) / Fz` in m, nan without contact."""
+    """Exact value of the quantity that touch measures: the centre of pressure.
+
+    Returns:
+        `(-My, Mx) / Fz` of the wrench (m), `(n, 2)`, nan without contact.
+    """
     force = np.where(starts.wrench[:, 2] > 0, starts.wrench[:, 2], np.nan)
     return np.stack([-starts.wrench[:, 4], starts.wrench[:, 3]], 1) / force[:, None]
 
 
 def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, touch: np.ndarray | None) -> np.ndarray:
-    """Features (n, k) of starts on the slope, for objects of any shape.
+    """Features of starts on the slope, for objects of any shape.
 
-    They include the results of `balance` for `DRAWS` random draws of the hidden contents. From vision, all of these
-    draws are equally likely. Touch weighs them by their likelihood. Noise with the standard deviations `SEEN` is added
-    to the pose, because an exact pose would reveal by micrometres which objects have begun to slip.
+    The features include the mean results of `balance` for `DRAWS` random draws of the hidden contents. From vision
+    alone, all draws have equal weights. With touch, their weights are the likelihoods of the measured centre of
+    pressure. Noise with the standard deviations `SEEN` is added to the pose. An exact pose would reveal which objects
+    have already slipped by some micrometres.
 
     Args:
         scenario: The scenario.
         items: The objects.
-        starts: Their starts.
-        touch: (n, 2) centre of pressure in m, or None for features from vision alone.
+        starts: Their starts, one row each.
+        touch: Measured centre of pressure (m), `(n, 2)`, nan without contact. None: return features from vision alone.
+
+    Returns:
+        Features, `(n, k)`.
     """
     centres = [np.tile(drawn_centres(body, scenario), (FRICTIONS, 1)) for body in items]
     friction = np.repeat(np.linspace(*scenario.friction, 2 * FRICTIONS + 1)[1::2], DRAWS)
@@ -129,7 +159,7 @@ def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, 
         columns = [*pose[:2], *low[:2], *high, high[2] - low[2], pad / 2 - pose[1] - high[1]]
         columns += [int(body.category), body.shell_mass, body.contents_density, *np.ptp(face, axis=0), len(face)]
         columns += [*np.ptp(wide, axis=0), *rotation[2], *np.abs(rotation[:, 2]), np.abs(rotation[1]).max()]
-        columns += list((turn @ rotation.T)[:2, 2])  # its lean from the face at the start
+        columns += list((turn @ rotation.T)[:2, 2])  # lean of the object from the stable face
         felt = None if touch is None else touch[row] - pose[:2]
         (end, pressure), (rocked, _) = (
             balance(corners, centres[index] @ rotation.T - [0, 0, low[2]], friction, scenario.slope)
@@ -141,7 +171,7 @@ def laid(scenario: physics.Inclined, items: list[objects.Body], starts: Starts, 
         columns += [*np.bincount(end, likely, 3) / likely.sum(), *np.bincount(rocked, likely, 3) / likely.sum()]
         for com in (body.shell_com, full[index]):
             centre = rotation @ com
-            beneath = centre[:2] + (centre[2] - low[2]) * downhill  # where its weight meets the pad
+            beneath = centre[:2] + (centre[2] - low[2]) * downhill  # where gravity points to on the pad
             columns += [*margins(face, beneath), *margins(wide, beneath), centre[2] - low[2]]
             if felt is not None:
                 columns += list(felt - beneath)

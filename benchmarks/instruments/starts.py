@@ -1,4 +1,4 @@
-"""Objects by number, the starts and outcomes of their trajectories, and images of the starts."""
+"""Numbered objects, starts and outcomes of their trajectories, and images of the starts."""
 
 import concurrent.futures
 import os
@@ -15,42 +15,61 @@ from tqdm import tqdm
 from sts_jax import dataset, objects, physics
 from sts_jax.sensor import Sensor
 
-# Mass, centre of mass and inertia of one body with several fills, shell scales and directions of the contents.
+# Mass, centre of mass and inertia of one body for several fills, shell scales and directions of the contents.
 rigid = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))
-_settled = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))  # along +z
+_settled = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0)))  # the same for contents that settled along +z
 
 
 class Starts(NamedTuple):
-    """Starts and outcomes of trajectories, one row each."""
+    """Starts and outcomes of trajectories, with one row for each trajectory."""
 
     body: np.ndarray  # (n,) index of the object
-    pose: np.ndarray  # (n, 7) of the first frame
-    wrench: np.ndarray  # (n, 6) of the first frame
-    condition: np.ndarray  # (n, c)
-    fill: np.ndarray  # (n,)
-    mass: np.ndarray  # (n,) kg
-    settled: np.ndarray  # (n,) bool
-    outcome: np.ndarray  # (n,) Outcome
-    rerolled: np.ndarray  # (n,) Outcome with other contents, -1 for starts that were not simulated again
+    pose: np.ndarray  # (n, 7) pose in the first frame
+    wrench: np.ndarray  # (n, 6) wrench in the first frame
+    condition: np.ndarray  # (n, c) condition of the scenario
+    fill: np.ndarray  # (n,) filled share of the interior's volume
+    mass: np.ndarray  # (n,) kg, mass of shell and contents
+    settled: np.ndarray  # (n,) bool, True if the object is at rest at the end
+    outcome: np.ndarray  # (n,) `physics.Outcome`
+    rerolled: np.ndarray  # (n,) outcome of the same start with other contents, -1 if it was not simulated again
 
 
 def bodies(categories: tuple[str, ...], count: int, first: int = 0) -> list[objects.Body]:
-    """Objects of the given categories in turn. The number of an object is the seed of its key."""
+    """Make objects of the given classes in turn.
+
+    Args:
+        categories: Classes of the objects.
+        count: Number of objects.
+        first: Number of the first object. The number of an object is the seed of its random key, and selects its class.
+    """
     numbers = range(first, first + count)
     return [objects.make(jax.random.key(i), categories[i % len(categories)]) for i in numbers]
 
 
 def filled(body: objects.Body, fill: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass (k,) in kg, centre of mass (k, 3) in m and inertia (k, 3, 3) of a body at several fills (k,).
+    """Mass properties of a body with several fill levels, a nominal shell, and contents that settled along +z.
 
-    The shell is nominal, and the contents have settled along +z.
+    Args:
+        body: The body.
+        fill: Filled shares of the interior's volume, `(k,)`.
+
+    Returns:
+        Mass (kg), `(k,)`, centre of mass in the mesh frame (m), `(k, 3)`, and inertia (kg m^2), `(k, 3, 3)`.
     """
     mass, com, inertia = _settled(body, jnp.asarray(fill, jnp.float32), jnp.ones(len(fill)))
     return np.asarray(mass), np.asarray(com), np.asarray(inertia)
 
 
 def rigid_of(items: list[objects.Body], traj: physics.Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass (n,) in kg, centre of mass (n, 3) in m and inertia (n, 3, 3) of body-major trajectories."""
+    """Mass properties of the objects of trajectories, which must be sorted by object.
+
+    Args:
+        items: The objects.
+        traj: The trajectories.
+
+    Returns:
+        Mass (kg), `(n,)`, centre of mass in the mesh frame (m), `(n, 3)`, and inertia (kg m^2), `(n, 3, 3)`.
+    """
     owner, parts = np.asarray(traj.body), []
     for index, body in enumerate(items):
         own = jax.tree.map(lambda x, mine=owner == index: x[mine], traj.hidden)
@@ -68,15 +87,15 @@ def roll(
     again: int = 0,
     reroll: tuple[str, ...] = (),
 ) -> Starts:
-    """Simulate `num` starts of each object, and the first `again` of each once more with other contents.
+    """Simulate starts of each object, and some of these starts a second time with other contents.
 
     Args:
-        key: Consumed.
+        key: Random key.
         items: The objects.
         scenario: The scenario.
         num: Number of starts of each object.
-        again: Number of these starts that are simulated again.
-        reroll: Fields of `physics.Hidden` that are then drawn anew.
+        again: Number of starts of each object that are simulated a second time.
+        reroll: Fields of `physics.Hidden` that are drawn again for the second time.
     """
     key, fresh = jax.random.split(key)
     with tqdm(total=len(items) * num, unit="starts") as bar:
@@ -108,7 +127,15 @@ def roll(
 
 
 def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndarray]:
-    """Render visual and tactile first frames, uint8 (n, 64, 64, 3). The rows must be sorted by object."""
+    """Render the first frames of starts.
+
+    Args:
+        items: The objects.
+        starts: Their starts, which must be sorted by object.
+
+    Returns:
+        Visual and tactile images, uint8 `(n, 64, 64, 3)` each.
+    """
 
     def one(index: int) -> tuple[np.ndarray, ...]:
         own = starts.body == index
@@ -123,7 +150,13 @@ def draw(items: list[objects.Body], starts: Starts) -> tuple[np.ndarray, np.ndar
 
 
 def kept(folder: Path | None, name: str, make: Callable[[], Starts]) -> Starts:
-    """Load the starts that a folder keeps under a name, or make and keep them."""
+    """Load starts from a file, or make them and write the file.
+
+    Args:
+        folder: Folder of the file. None: make the starts and write nothing.
+        name: Name of the file, without `.npz`.
+        make: Function that makes the starts.
+    """
     path = None if folder is None else folder / f"{name}.npz"
     if path is not None and path.exists():
         with np.load(path) as file:

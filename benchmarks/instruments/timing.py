@@ -1,4 +1,4 @@
-"""Durations of calls that are compared with each other."""
+"""Durations of function calls that are compared with each other."""
 
 import time
 from collections.abc import Callable
@@ -8,9 +8,16 @@ import numpy as np
 
 
 def in_turn(*calls: Callable[[], object], repeats: int = 5) -> np.ndarray:
-    """Seconds `(repeats, calls)` of calls that alternate, so that a busy machine slows all of them alike.
+    """Measure functions in alternation, so that a busy machine slows all of them alike.
 
-    A call ends when its arrays are ready. The first round, which compiles, is not counted.
+    Each function is called once before the measurement, which compiles it. A call ends when its arrays are ready.
+
+    Args:
+        calls: Functions without arguments.
+        repeats: Number of measured calls of each function.
+
+    Returns:
+        Seconds of each call, `(repeats, len(calls))`.
     """
     seconds = np.empty((repeats + 1, len(calls)))
     for row in seconds:

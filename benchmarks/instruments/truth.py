@@ -1,4 +1,4 @@
-"""Depth images traced by embree, as the truth for rendered depth."""
+"""Depth images that embree traces, with which rendered depth is compared."""
 
 import jax
 import numpy as np
@@ -11,7 +11,12 @@ from sts_jax import objects
 
 
 def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
-    """The body's triangles in the sensor frame, in float64."""
+    """Make the mesh of a body in the sensor frame, in float64.
+
+    Args:
+        body: The body.
+        pose: Pose of the body, `(7,)`.
+    """
     faces = np.asarray(body.faces)
     faces = faces[np.any(faces != faces[:, :1], axis=1)]
     turn = trimesh.transformations.quaternion_matrix(np.asarray(pose[3:], float))[:3, :3]
@@ -22,7 +27,7 @@ def body_mesh(body: objects.Body, pose: jax.Array) -> trimesh.Trimesh:
 def embree(
     mesh: trimesh.Trimesh, camera: sts.optics.Camera, shape: tuple[int, int], *, two_sided: bool = False
 ) -> np.ndarray:
-    """Depth along the optical axis of the nearest triangle that faces the camera, `inf` where there is none.
+    """Trace the depth of the nearest triangle that faces the camera.
 
     Args:
         mesh: The triangles in the sensor frame.
@@ -31,7 +36,7 @@ def embree(
         two_sided: Include triangles that face away from the camera.
 
     Returns:
-        Metres, float64, `shape`.
+        Depth along the optical axis (m), float64, `shape`, infinite where a ray hits no triangle.
     """
     towards = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0] + [0, 0, camera.distance]) < 0
     scene = EmbreeScene()
@@ -49,13 +54,29 @@ def embree(
 
 
 def interior(depth: np.ndarray, *, span: float = 1e-3) -> np.ndarray:
-    """Pixels whose 3x3 neighbourhood is hit throughout and spans less than `span` of depth (m)."""
+    """Find the pixels whose 3x3 neighbourhood is hit everywhere and varies in depth by less than `span`.
+
+    Args:
+        depth: Depth image (m), `(h, w)`, infinite where nothing is hit.
+        span: Limit for the difference of depths in the neighbourhood (m).
+
+    Returns:
+        True for interior pixels, `(h, w)`.
+    """
     around = neighbours(np.where(np.isfinite(depth), depth, 1e9), 1e9)
     return (around.max(0) < 1e8) & (around.max(0) - around.min(0) < span)
 
 
 def neighbours(image: np.ndarray, beyond: float | None = None) -> np.ndarray:
-    """The 3x3 neighbourhood of every pixel, (9, h, w). Outside, the image is `beyond`, or repeats its edge if None."""
+    """Stack the 3x3 neighbourhood of every pixel.
+
+    Args:
+        image: The image, `(h, w)`.
+        beyond: Value outside of the image. None: the image repeats its edge.
+
+    Returns:
+        `(9, h, w)`.
+    """
     height, width = image.shape
     fill = {"mode": "edge"} if beyond is None else {"constant_values": beyond}
     padded = np.pad(image, 1, **fill)

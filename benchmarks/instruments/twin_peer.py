@@ -1,4 +1,4 @@
-"""The digital twin as a sensor's devices, with the light of each frame by its own log."""
+"""The digital twin in place of a real sensor, with the light of each frame from the twin's own log."""
 
 import math
 import zlib
@@ -13,15 +13,26 @@ from benchmarks.instruments.shown import Shown
 from sts_jax.hardware import Lens, twin
 from sts_jax.hardware.twin import photometry
 
-FIELD_OF_VIEW = math.radians(160)  # of the lens, across the diagonal
-_START = b"\xff\xd8\xff"  # of a JPEG image
+FIELD_OF_VIEW = math.radians(160)  # rad, field of view of the lens across the diagonal
+_START = b"\xff\xd8\xff"  # first bytes of a JPEG image
 
 
 class TwinPeer:
-    """A served twin whose object is held and released in turn. Its log and record lie beside the port's link."""
+    """A digital twin with a camera at the address `url` and an LED controller at a port.
+
+    Its log (`.jsonl`) and the record of its frames (`.mjpeg`) lie beside the link to the port.
+    """
 
     def __init__(self, path: Path, *, fps: float, lag_s: float, exposure_s: float, size: tuple[int, int]) -> None:
-        """Render the first images, and serve. `path` becomes the link to the LED controller's port."""
+        """Render the first images, and start the camera and the controller.
+
+        Args:
+            path: Symbolic link to the controller's port, which is created.
+            fps: Frames per second of the camera.
+            lag_s: Time from the end of an exposure to the sending of the frame (s).
+            exposure_s: Exposure time (s).
+            size: Width and height of the frames (pixels).
+        """
         width, height = size
         sensor = sts.Sensor()
         scene = twin.ObjectScene(
@@ -52,12 +63,12 @@ class TwinPeer:
         self.twin.close()
 
     def shown(self) -> dict[int, Shown]:
-        """The light of each frame, by `key` of its image."""
+        """Return the light of each frame, by the `key` of its image."""
         _, *parts = self._record.read_bytes().split(_START)
         frames = zip(parts, twin.read_log(self._log), strict=True)
         return {key(photometry.decode(_START + part)): Shown(frame.index, frame.light) for part, frame in frames}
 
 
 def key(image: UInt8[np.ndarray, "height width 3"]) -> int:
-    """The checksum of an image's pixels. No two frames with noise have the same."""
+    """Checksum of an image's pixels. Frames differ in their noise, so their checksums differ too."""
     return zlib.crc32(image.tobytes())

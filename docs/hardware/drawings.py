@@ -1,6 +1,8 @@
-"""Draws wiring.svg and side.svg of building.md. Run in the repository: `python docs/hardware/drawings.py`.
+"""Draw wiring.svg and side.svg for building.md.
 
-The dimensions come from `sts_jax.Sensor()`, the pins from the firmware's source.
+    python docs/hardware/drawings.py    # in the root folder of the repository
+
+The dimensions are those of `sts_jax.Sensor()`, and the pins those of the firmware's source.
 """
 
 import math
@@ -22,25 +24,25 @@ MM = 3.2  # pixels per millimetre of the side view
 
 
 def pins() -> dict[int, str]:
-    """Arduino pin of each channel, from the comment at the head of the firmware."""
+    """Read the Arduino pin of each channel from the comment at the head of the firmware."""
     rows = re.findall(r"^   (\d)\s+(D\d+)\s+P[BD]\d\s+OC\w+$", FIRMWARE.read_text(encoding="utf-8"), re.MULTILINE)
     return {int(channel): pin for channel, pin in rows}
 
 
 def text(x: float, y: float, words: str, *, size: int = 14, anchor: str = "start", bold: bool = False) -> str:
-    """A line of text."""
+    """Draw a line of text at (x, y)."""
     weight = ' font-weight="bold"' if bold else ""
     return f'<text x="{x:g}" y="{y:g}" font-size="{size}" text-anchor="{anchor}"{weight}>{words}</text>'
 
 
 def line(*points: tuple[float, float], colour: str = "#222", width: float = 1.6, extra: str = "") -> str:
-    """Connected lines."""
+    """Draw a line through several points."""
     path = " ".join(f"{x:g},{y:g}" for x, y in points)
     return f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="{width}"{extra}/>'
 
 
 def box(x: float, y: float, width: float, height: float, *, fill: str = "#fff", colour: str = "#222") -> str:
-    """A rectangle."""
+    """Draw a rectangle whose upper left corner is at (x, y)."""
     return (
         f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="3" fill="{fill}" stroke="{colour}" '
         'stroke-width="1.6"/>'
@@ -48,17 +50,17 @@ def box(x: float, y: float, width: float, height: float, *, fill: str = "#fff", 
 
 
 def dot(x: float, y: float) -> str:
-    """A junction of wires."""
+    """Draw a junction of wires at (x, y)."""
     return f'<circle cx="{x:g}" cy="{y:g}" r="3.4" fill="#222"/>'
 
 
 def ground(x: float, y: float) -> str:
-    """The symbol of ground below a wire that ends at (x, y)."""
+    """Draw the ground symbol below a wire that ends at (x, y)."""
     return "".join(line((x - w, y + 4 * i), (x + w, y + 4 * i)) for i, w in enumerate((10, 6, 2)))
 
 
 def page(width: float, height: float, title: str, parts: list[str]) -> str:
-    """A drawing on a white ground, which is readable in the dark mode of the site too."""
+    """Make the SVG file of a drawing. Its white background keeps it readable in the dark mode of the site."""
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" width="{width:g}" '
         f'height="{height:g}" font-family="sans-serif" fill="#222" role="img"><title>{title}</title>\n'
@@ -67,7 +69,14 @@ def page(width: float, height: float, title: str, parts: list[str]) -> str:
 
 
 def channel(number: int, pin: str, y: float, rail: float) -> list[str]:
-    """A row: pin, gate resistor, pull-down, transistor, strip."""
+    """Draw the row of a channel: pin, gate resistor, pull-down resistor, transistor and LEDs.
+
+    Args:
+        number: Number of the channel.
+        pin: Name of the Arduino pin.
+        y: Height of the row in the drawing (pixels).
+        rail: x of the supply's wire (pixels).
+    """
     side, colour, ohms, stroke = STRIPS[number]
     parts = [text(312, y + 5, pin, anchor="end", bold=True), text(196, y + 5, f"channel {number}", size=12)]
     parts += [line((320, y), (350, y)), box(350, y - 9, 52, 18), text(376, y + 5, GATE, size=12, anchor="middle")]
@@ -79,7 +88,7 @@ def channel(number: int, pin: str, y: float, rail: float) -> list[str]:
     parts += [text(535, y + 20, "S", size=11, anchor="end")]
     parts += [line((540, y + 15), (562, y + 15), (562, y + 42)), ground(562, y + 42)]
     parts += [line((540, y - 15), (rail, y - 15), colour=stroke, width=2.2), dot(rail, y - 15)]
-    for k in range(3):  # LEDs, whose cathodes (bars) point to the drain
+    for k in range(3):  # LEDs, whose cathodes (bars) are on the side of the drain
         x = 625 + 45 * k
         triangle = f"{x},{y - 15} {x + 18},{y - 25} {x + 18},{y - 5}"
         parts.append(f'<polygon points="{triangle}" fill="{stroke}" stroke="{stroke}"/>')
@@ -90,7 +99,7 @@ def channel(number: int, pin: str, y: float, rail: float) -> list[str]:
 
 
 def wiring() -> str:
-    """Computer, board, four channels, supply."""
+    """Make the drawing of the wiring: computer, board, four channels and supply."""
     rail, rows = 880.0, {number: 130 + 105 * number for number in pins()}
     parts = [text(20, 34, "Wiring of the lights", size=18, bold=True)]
     parts += [box(20, 110, 110, 60, fill="#eef2f7"), text(75, 145, "computer", anchor="middle")]
@@ -117,12 +126,12 @@ def wiring() -> str:
 
 
 def arrow(x1: float, y1: float, x2: float, y2: float) -> str:
-    """A dimension line with an arrow head at each end."""
+    """Draw a dimension line with an arrow head at each end."""
     return line((x1, y1), (x2, y2), width=1.2, extra=' marker-start="url(#a)" marker-end="url(#a)"')
 
 
 def side_view() -> str:
-    """Gel, lights and camera in a cut through the middle of the pad, to scale."""
+    """Make the side view: gel, lights and camera in a section through the middle of the pad, to scale."""
     sensor, leds = sts.Sensor(), sts.tactile.Leds()
     width, thick = 1e3 * float(sensor.gel.size[0]), 1e3 * float(sensor.gel.thickness)
     distance, fov = 1e3 * float(sensor.camera.distance), float(sensor.camera.fov)
