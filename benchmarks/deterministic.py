@@ -191,7 +191,7 @@ def main(args: Args) -> str:
     train, given = data.pairs(rows["train"]), data.pairs(rows["test"])
     job = next(stages.jobs(config, sensor, train))
     assert isinstance(job.model, statespace.Config)
-    held_out = training.state_moments(given, job.model, scenario, job.preprocessing, job.empty)
+    held_out = training.state_arrays(given, job.model, scenario, job.preprocessing, job.empty)
     numbers = 12 + len(job.preprocessing.condition_scale)
     images = len([name for name in ("visual", "tactile") if name in job.arrays.inputs])
     network, params = nnx.split(Network(images, numbers, len(scenario.outcomes), nnx.Rngs(args.seed)))

@@ -14,7 +14,7 @@ from typing import Any
 import filelock
 
 
-class TornFileError(OSError):
+class DamagedFileError(OSError):
     """A file that exists but is incomplete or damaged. The message names the file and the remedy."""
 
 
@@ -95,14 +95,14 @@ def read_json(path: Path, remedy: str) -> Any:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        TornFileError: The file cannot be read or is not JSON.
+        DamagedFileError: The file cannot be read or is not JSON.
     """
     try:
         return json.loads(path.read_bytes().decode())
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:  # ValueError: invalid UTF-8 or JSON, or an integer of thousands of digits
-        raise TornFileError(f"{path} cannot be read as JSON ({error}): {remedy}.") from error
+        raise DamagedFileError(f"{path} cannot be read as JSON ({error}): {remedy}.") from error
 
 
 def claim(path: Path, content: dict) -> None:
@@ -115,7 +115,7 @@ def claim(path: Path, content: dict) -> None:
     Raises:
         ValueError: The existing content differs. The message names all fields that differ, both values of the first
             three, and the remedy.
-        TornFileError: The existing file cannot be read or is not JSON.
+        DamagedFileError: The existing file cannot be read or is not JSON.
         OSError: The file cannot be written.
     """
     content = json.loads(json.dumps(content))

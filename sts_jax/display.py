@@ -12,7 +12,7 @@ from jaxtyping import ArrayLike
 from matplotlib.figure import Figure
 from PIL import Image
 
-from sts_jax._files import TornFileError, write_bytes
+from sts_jax._files import DamagedFileError, write_bytes
 from sts_jax.evaluation.views import outside
 from sts_jax.frame import Frame
 from sts_jax.objects import Body
@@ -168,7 +168,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The path is a folder, or its suffix is not `.npz`.
-        TornFileError: (An `OSError`.) The file is damaged, or was not written by this version of `save`.
+        DamagedFileError: (An `OSError`.) The file is damaged, or was not written by this version of `save`.
     """
     path = Path(path)
     if not path.exists():
@@ -184,7 +184,9 @@ def load(path: str | os.PathLike[str]) -> Any:
         return _built(kind, {key: jnp.asarray(value) for key, value in arrays.items()})
     except Exception as error:  # A damaged zip file raises exceptions of many types.
         reason = f"{type(error).__name__}: {error}"
-        raise TornFileError(f"{path} is damaged or was not written by sts.save ({reason}). Save it again.") from error
+        raise DamagedFileError(
+            f"{path} is damaged or was not written by sts.save ({reason}). Save it again."
+        ) from error
 
 
 def _built(kind: type, arrays: dict[str, Any]) -> Any:

@@ -127,7 +127,7 @@ class Sensor:
 
         Raises:
             FileNotFoundError: The file does not exist.
-            OSError: The file cannot be read, is damaged or is not JSON (`TornFileError`).
+            OSError: The file cannot be read, is damaged or is not JSON (`DamagedFileError`).
             ValueError: A field is missing, unknown, of another shape or out of range (see `check`).
         """
         values = read_json(Path(path), "write it again with Sensor.save")

@@ -202,9 +202,9 @@ def swap(one, other):
 def test_swapped_shards_are_refused(copied, endings, message):
     for ending in endings:
         swap(*(copied / f"{name}{ending}" for name in SHARDS))
-    with pytest.raises(dataset.TornFileError, match=message):
+    with pytest.raises(dataset.DamagedFileError, match=message):
         dataset.load(copied)
-    with pytest.raises(dataset.TornFileError, match=message):
+    with pytest.raises(dataset.DamagedFileError, match=message):
         dataset.collect(SMALL, sts.Sensor(), copied)
 
 
@@ -212,12 +212,12 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
     one, other = (copied / f"{name}.array_record" for name in SHARDS)
     whole = one.read_bytes()
     one.write_bytes(other.read_bytes())
-    with pytest.raises(dataset.TornFileError, match=r"00000.*is damaged or belongs to another shard"):
+    with pytest.raises(dataset.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
         dataset.load(copied)
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4
     one.write_bytes(flipped)
-    with pytest.raises(dataset.TornFileError, match=r"00000.*is damaged or belongs to another shard"):
+    with pytest.raises(dataset.DamagedFileError, match=r"00000.*is damaged or belongs to another shard"):
         dataset.load(copied)
     one.write_bytes(whole)
     assert dataset.load(copied).identity
@@ -243,7 +243,7 @@ def test_an_invalid_split_is_refused(copied, change, message):
     split = json.loads(path.read_text())
     change(split)
     path.write_text(json.dumps(split))
-    with pytest.raises(dataset.TornFileError, match=rf"split\.json.*{message}"):
+    with pytest.raises(dataset.DamagedFileError, match=rf"split\.json.*{message}"):
         dataset.load(copied)
 
 
@@ -279,7 +279,7 @@ def test_a_description_that_was_changed_afterwards_is_named(copied):
     path.write_text(json.dumps(content, indent=7))  # the layout does not matter
     assert dataset.load(copied).collection == content
     path.write_text(json.dumps({**content, "resolution": [32, 64]}))
-    with pytest.raises(dataset.TornFileError, match=r"was made with another collection\.json"):
+    with pytest.raises(dataset.DamagedFileError, match=r"was made with another collection\.json"):
         dataset.load(copied)
 
 

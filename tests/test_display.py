@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import sts_jax as sts
-from sts_jax._files import TornFileError
+from sts_jax._files import DamagedFileError
 
 RNG = np.random.default_rng(0)
 FRAME = sts.Frame(
@@ -72,17 +72,17 @@ def test_a_damaged_file_raises_an_error_unless_the_damage_is_outside_the_arrays(
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 16]) + whole[position + 1 :])
         try:
             same(sts.load(path), FRAME)
-        except TornFileError:
+        except DamagedFileError:
             refused += 1
     assert refused > 20
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(TornFileError, match=r"frame\.npz is damaged or was not written by sts\.save"):
+    with pytest.raises(DamagedFileError, match=r"frame\.npz is damaged or was not written by sts\.save"):
         sts.load(path)
 
 
 def test_a_file_of_another_format_raises_an_error(tmp_path):
     np.savez(tmp_path / "x.npz", kind=np.array("Frame"), format=np.array(99))
-    with pytest.raises(TornFileError, match="format 99"):
+    with pytest.raises(DamagedFileError, match="format 99"):
         sts.load(tmp_path / "x.npz")
     with pytest.raises(FileNotFoundError, match="no such file"):
         sts.load(tmp_path / "none.npz")

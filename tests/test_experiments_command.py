@@ -331,7 +331,7 @@ def test_a_second_run_keeps_the_listing_of_the_first(folder, tmp_path):
 
 def test_a_damaged_log_of_a_training_is_named(tmp_path):
     (tmp_path / "metrics.jsonl").write_bytes(b'{"step": 1}\n{"st')
-    with pytest.raises(dataset.TornFileError, match=r"metrics\.jsonl is damaged .*delete .* and train again"):
+    with pytest.raises(dataset.DamagedFileError, match=r"metrics\.jsonl is damaged .*delete .* and train again"):
         judging.read_log(tmp_path)
     assert judging.read_log(tmp_path / "none") == []
 

@@ -92,16 +92,16 @@ def test_reading_inverts_writing(tmp_path):
 def test_damaged_json_is_named_with_the_remedy(tmp_path, content):
     path = tmp_path / "a.json"
     path.write_bytes(content)
-    with pytest.raises(_files.TornFileError, match=r"a\.json cannot be read as JSON .*: delete it\.$"):
+    with pytest.raises(_files.DamagedFileError, match=r"a\.json cannot be read as JSON .*: delete it\.$"):
         _files.read_json(path, "delete it")
-    with pytest.raises(_files.TornFileError, match=r"a\.json"):
+    with pytest.raises(_files.DamagedFileError, match=r"a\.json"):
         _files.claim(path, {"seed": 0})
     assert path.read_bytes() == content
 
 
 def test_a_folder_instead_of_a_file_is_named(tmp_path):
     (tmp_path / "a.json").mkdir()
-    with pytest.raises(_files.TornFileError, match=r"a\.json.*delete it"):
+    with pytest.raises(_files.DamagedFileError, match=r"a\.json.*delete it"):
         _files.read_json(tmp_path / "a.json", "delete it")
 
 

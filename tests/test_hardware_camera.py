@@ -219,7 +219,7 @@ def test_frames_that_a_network_held_back_are_known():
     times = [*0.1 * np.arange(10), *(1.52 + 0.002 * np.arange(6)), 1.6, 1.7, 1.9, 2.0]
     for time_s in times:
         pace.arrived(time_s)
-        held.append(pace.held_back)
+        held.append(pace.delayed)
     assert held == [10 <= i < 16 for i in range(20)]
 
 
@@ -229,7 +229,7 @@ def test_jitter_is_not_counted_as_loss():
     times[50:53] = [5.16, 5.2, 5.25]  # late, and made up for
     for time_s in times:
         pace.arrived(time_s)
-        assert not pace.held_back
+        assert not pace.delayed
     assert pace.dropped == 0
     for time_s in times[-1] + [0.2, 0.3, 0.4]:  # one frame is missing
         pace.arrived(time_s)

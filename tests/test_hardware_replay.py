@@ -16,7 +16,7 @@ from test_experiments_real import sensor_file
 
 from benchmarks.instruments.sensor_peer import SensorPeer
 from sts_jax import hardware
-from sts_jax._files import TornFileError
+from sts_jax._files import DamagedFileError
 
 FAST = 50.0  # recorded seconds in a second
 
@@ -281,22 +281,22 @@ def test_damaged_recordings_are_named(folder, tmp_path):
 
     (folder / "tactile.mkv").write_bytes(video[:-20_000])
     refused(
-        TornFileError, r"tactile.mkv is truncated: it has [345] images, but .* lists 6.*remove the last [123] lines"
+        DamagedFileError, r"tactile.mkv is truncated: it has [345] images, but .* lists 6.*remove the last [123] lines"
     )
     (folder / "tactile.mkv").unlink()
     refused(FileNotFoundError, r"tactile.mkv cannot be read .*, but frames.jsonl lists 6 images of it")
     changed = bytearray(video)
     changed[-100] ^= 1
     (folder / "tactile.mkv").write_bytes(changed)
-    refused(TornFileError, "image 12 of .* is damaged, because its checksum differs")
+    refused(DamagedFileError, "image 12 of .* is damaged, because its checksum differs")
     (folder / "tactile.mkv").write_bytes(video)
 
     damaged(folder / "frames.jsonl", b'"sequence": 9,', b'"sequenc')
-    refused(TornFileError, "frames.jsonl, line 4, is damaged .*or remove this line")
+    refused(DamagedFileError, "frames.jsonl, line 4, is damaged .*or remove this line")
     (folder / "frames.jsonl").write_text(lines.replace('"time_s": 100.2', '"time_s": NaN', 1))
-    refused(TornFileError, "line 5, is damaged .*time_s is nan")
+    refused(DamagedFileError, "line 5, is damaged .*time_s is nan")
     (folder / "frames.jsonl").write_text(lines.replace('"time_s": 100.2', '"time_s": 10.2', 1))
-    refused(TornFileError, "line 5, has an earlier time")
+    refused(DamagedFileError, "line 5, has an earlier time")
     (folder / "frames.jsonl").write_text("")
     refused(ValueError, "lists no image")
     (folder / "frames.jsonl").unlink()
@@ -307,7 +307,7 @@ def test_damaged_recordings_are_named(folder, tmp_path):
     (folder / "recording.json").write_text(json.dumps({**head, "format": 9}))
     refused(ValueError, "has format 9, but this version of sts_jax reads format 1")
     (folder / "recording.json").write_text("{")
-    refused(TornFileError, r"recording.json cannot be read as JSON .*copy the recording again")
+    refused(DamagedFileError, r"recording.json cannot be read as JSON .*copy the recording again")
 
 
 @pytest.mark.parametrize("value", [0, -1, math.nan, math.inf])

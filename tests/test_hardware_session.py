@@ -145,7 +145,7 @@ def test_damage_is_named_with_the_remedy(tmp_path, name, damage):
     else:
         path.write_bytes(damage(path.read_bytes()))
     read = hardware.load_recordings(tmp_path)
-    with pytest.raises(_files.TornFileError, match=rf"{path.name}.*discard trajectory 0"):
+    with pytest.raises(_files.DamagedFileError, match=rf"{path.name}.*discard trajectory 0"):
         read[0]
     assert read[1].number == 1
     hardware.discard_recording(tmp_path, 0)

@@ -1,4 +1,4 @@
-"""Views and moments of recorded trajectories."""
+"""Views and images of recorded trajectories."""
 
 import dataclasses
 
@@ -27,11 +27,11 @@ def test_a_raw_pair_becomes_the_views_that_it_was_made_from():
     assert np.abs(found.visual - tactile / 255).mean() > 0.008
 
 
-def test_moments_are_in_the_order_of_the_trajectories(tmp_path):
+def test_recorded_images_are_in_the_order_of_the_trajectories(tmp_path):
     places = record(tmp_path / "work", 3)
     hardware.discard_recording(tmp_path / "work" / "dataset", 1)
     seen = []
-    found = hardware.moments(
+    found = hardware.recorded_images(
         hardware.load_recordings(tmp_path / "work" / "dataset"),
         LENS,
         CAMERA,
@@ -64,7 +64,7 @@ def test_images_of_another_size_than_the_lens_are_refused(tmp_path):
     record(tmp_path / "work", 1)
     lens = dataclasses.replace(LENS, width=640, height=480)
     with pytest.raises(ValueError, match="images of 128x96 pixels, but the lens belongs to images of 640x480"):
-        hardware.moments(hardware.load_recordings(tmp_path / "work" / "dataset"), lens, CAMERA)
+        hardware.recorded_images(hardware.load_recordings(tmp_path / "work" / "dataset"), lens, CAMERA)
 
 
 def test_a_view_is_relit_by_the_ratio_of_the_empty_pads():

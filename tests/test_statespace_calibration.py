@@ -196,7 +196,7 @@ def test_damaged_calibration_is_named(calibrated):
     whole = path.read_text()
     for damaged in (whole[:-30], whole.replace('"variance": ', '"variance": 1', 1), "[]"):
         path.write_text(damaged)
-        with pytest.raises(_files.TornFileError, match=r"calibration\.json.*calibrate again"):
+        with pytest.raises(_files.DamagedFileError, match=r"calibration\.json.*calibrate again"):
             training.load(calibrated)
     path.unlink()
     assert training.load(calibrated).calibration is None

@@ -53,26 +53,26 @@ def test_views_and_falls_are_taken_by_rows_of_their_own_and_change_the_checksum(
     assert arrays().checksum() == data.checksum()
 
 
-def test_image_moments_are_first_inputs_and_last_targets_and_mask_first_touches_without_contact():
+def test_image_arrays_are_first_inputs_and_last_targets_and_mask_first_touches_without_contact():
     random = np.random.default_rng(0)
     visual = random.integers(0, 256, (3, 2, 64, 64, 3)).astype(np.uint8)
     blank = np.full((64, 64, 3), 100, np.uint8)
     tactile = np.broadcast_to(blank, visual.shape).copy()
     tactile[1, 0, 10:20, 10:20] = 200
     tactile[2, 1, 10:20, 10:20] = 200
-    arrays, own = training.image_moments(visual, tactile, ("visual", "tactile"), training.Preprocessing(), blank)
+    arrays, own = training.image_arrays(visual, tactile, ("visual", "tactile"), training.Preprocessing(), blank)
     np.testing.assert_array_equal(arrays.inputs["visual"], visual[:, 0])
     np.testing.assert_array_equal(arrays.targets["tactile"], tactile[:, 1])
     np.testing.assert_array_equal(arrays.present["tactile"], [False, True, False])
     assert own.absent == ()
-    alone, _ = training.image_moments(visual, tactile, ("visual",), training.Preprocessing(), blank)
+    alone, _ = training.image_arrays(visual, tactile, ("visual",), training.Preprocessing(), blank)
     assert set(alone.inputs) == set(alone.targets) == {"visual"}
     assert alone.present == {}
 
 
-def test_image_moments_refuse_poses_and_other_shapes():
+def test_image_arrays_refuse_poses_and_other_shapes():
     images, blank = np.zeros((3, 2, 64, 64, 3), np.uint8), np.zeros((64, 64, 3), np.uint8)
     with pytest.raises(ValueError, match="modalities must be one or both of visual, tactile"):
-        training.image_moments(images, images, ("visual", "pose"), training.Preprocessing(), blank)
+        training.image_arrays(images, images, ("visual", "pose"), training.Preprocessing(), blank)
     with pytest.raises(ValueError, match="visual is uint8 of shape"):
-        training.image_moments(images, images, ("visual",), training.Preprocessing((32, 32)), blank)
+        training.image_arrays(images, images, ("visual",), training.Preprocessing((32, 32)), blank)

@@ -20,7 +20,7 @@ MAIN_SUBSETS = (
 )
 
 
-class Moments(NamedTuple):
+class SplitPairs(NamedTuple):
     """The first and last frames of a split.
 
     `validation` and `given` have the resolution that the models require as inputs. `train` and `test` have images of
@@ -59,14 +59,14 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         return table.read_text()
     if done.exists() or table.exists():
         say(f"evaluate: again, because {reason}")
-    moments, scenario = _moments(config, data, split), config.collection.scenario
-    judge = evaluation.scorer(scenario, moments.train)
-    test, times, num = moments.test, config.rerolls, config.num_rerolled
+    pairs, scenario = _pairs_of_split(config, data, split), config.collection.scenario
+    judge = evaluation.scorer(scenario, pairs.train)
+    test, times, num = pairs.test, config.rerolls, config.num_rerolled
     possible = ceilings(workdir, suffix, config.collection, sensor, data, test, times=times, num=num, judge=judge)
-    references = evaluation.baselines(scenario, moments.train, test)
+    references = evaluation.baselines(scenario, pairs.train, test)
     scores = {**possible.scores, **{title: judge(row, test) for title, row in references.items()}}
     with Bar() as bar:
-        own, shown = _scored(config, workdir, split, moments, judge, bar)
+        own, shown = _scored(config, workdir, split, pairs, judge, bar)
         scores |= own
         summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
         bar("evaluate", len(own), len(own), "intervals done")
@@ -80,7 +80,7 @@ def evaluate(config: Config, data: dataset.Dataset, workdir: Path, sensor: sts.S
         pictures.draw_strip(drawn[-1], config.collection, sensor, data)
 
     title, notes = (
-        f"{workdir.name}: the last moment predicted from the first, held out by {split}",
+        f"{workdir.name}: the last frame predicted from the first, held out by {split}",
         _notes(config, logs),
     )
     notes += _gains(TITLES[main_model(config)], scores, test)
@@ -99,15 +99,15 @@ def _inputs(config: Config, data: dataset.Dataset, workdir: Path, split: str) ->
     return inputs
 
 
-def _moments(config: Config, data: dataset.Dataset, split: str) -> Moments:
-    """Load the first and last frames of a split, in the resolutions that `Moments` describes."""
+def _pairs_of_split(config: Config, data: dataset.Dataset, split: str) -> SplitPairs:
+    """Load the first and last frames of a split, in the resolutions that `SplitPairs` describes."""
     rows = evaluation.rows_of(data, split)
     train = dataset.reduced(data.pairs(rows["train"], symmetries=True), config.image_size)
     validation, given = data.pairs(rows["validation"]), data.pairs(rows["test"])
     test = dataset.reduced(given, config.image_size)
     if config.model == "paper":
         validation, given = dataset.reduced(validation, config.image_size), test
-    return Moments(train, validation, given, test)
+    return SplitPairs(train, validation, given, test)
 
 
 def queries(config: Config, workdir: Path, split: str) -> Iterator[tuple[str, sts.Predictor, tuple[str, ...]]]:
@@ -127,7 +127,7 @@ def _scored(
     config: Config,
     workdir: Path,
     split: str,
-    moments: Moments,
+    pairs: SplitPairs,
     judge: Callable[[evaluation.Predicted, dataset.Pairs], evaluation.Scores],
     bar: Bar,
 ) -> tuple[dict[str, evaluation.Scores], dict[str, evaluation.Predicted]]:
@@ -145,13 +145,13 @@ def _scored(
         row = evaluation.predict(
             predictor,
             subset,
-            moments.given,
+            pairs.given,
             config.collection.scenario,
-            validation=moments.validation,
+            validation=pairs.validation,
             blank=blank,
             num_samples=num_samples,
         )
-        scores[title] = judge(row, moments.test)
+        scores[title] = judge(row, pairs.test)
         shown[title] = evaluation.first(row, config.num_shown)
     return scores, shown
 
@@ -196,7 +196,7 @@ def read_log(folder: Path) -> list[dict[str, float]]:
     """Read the training log of a model. Without a log, the list is empty.
 
     Raises:
-        TornFileError: The log is damaged.
+        DamagedFileError: The log is damaged.
     """
     path = folder / "metrics.jsonl"
     try:
@@ -204,4 +204,4 @@ def read_log(folder: Path) -> list[dict[str, float]]:
     except FileNotFoundError:
         return []
     except ValueError as error:  # invalid UTF-8 or no JSON
-        raise dataset.TornFileError(f"{path} is damaged ({error}): delete {folder} and train again.") from error
+        raise dataset.DamagedFileError(f"{path} is damaged ({error}): delete {folder} and train again.") from error

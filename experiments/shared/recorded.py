@@ -45,8 +45,8 @@ class Config:
 class Recorded(NamedTuple):
     """Recorded trajectories and images of the empty pad, all in the view of the sensor."""
 
-    train: hardware.Moments  # training trajectories
-    validation: hardware.Moments  # validation trajectories
+    train: hardware.RecordedImages  # training trajectories
+    validation: hardware.RecordedImages  # validation trajectories
     empty: dict[str, np.ndarray]  # image of the empty pad for each stream, uint8 (size, size, 3)
     identity: str  # checksum of the trajectories and the sensor file
     source: str  # description of the sensor, for titles
@@ -94,7 +94,7 @@ def read(config: Config, workdir: Path) -> Recorded:
         )
     size = (config.image_size, config.image_size)
     with Bar() as bar:
-        found = hardware.moments(
+        found = hardware.recorded_images(
             recordings,
             device.lens,
             sensor.camera,
@@ -108,7 +108,7 @@ def read(config: Config, workdir: Path) -> Recorded:
     order = np.random.default_rng(config.seed).permutation(len(recordings))
     cut = min(max(round((1 - config.held_out) * len(order)), 1), len(order) - 1)
     train, validation = (
-        hardware.Moments(*(leaf[np.sort(rows)] for leaf in found)) for rows in (order[:cut], order[cut:])
+        hardware.RecordedImages(*(leaf[np.sort(rows)] for leaf in found)) for rows in (order[:cut], order[cut:])
     )
     source = "a digital twin" if is_twin(recordings) else f"the sensor {recordings.session['camera']}"
     return Recorded(train, validation, empty, identity(workdir, recordings), source)
@@ -179,7 +179,7 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
     visual, tactile = (augmented(config, getattr(data.train, name), data.empty[name]) for name in ("visual", "tactile"))
     for number, name in enumerate(NAMES):
         modalities = MODELS["paper"][name]
-        arrays, own = training.image_moments(visual, tactile, modalities, preprocessing, blank)
+        arrays, own = training.image_arrays(visual, tactile, modalities, preprocessing, blank)
         if own.absent:
             raise ValueError(
                 "no first tactile image of the training trajectories shows a contact: draw the images with `python -m "

@@ -46,7 +46,7 @@ def stale(path: Path, inputs: Mapping[str, str]) -> str | None:
         record = _files.read_json(path, "it will be written again")
     except FileNotFoundError:
         return f"{path.name} is missing"
-    except _files.TornFileError:
+    except _files.DamagedFileError:
         return f"{path.name} is damaged"
     if not isinstance(record, dict) or "checksum" not in record:
         return f"{path.name} has no record of its inputs"

@@ -134,13 +134,13 @@ def jobs(
     empty = {"visual": frame.visual, "tactile": frame.tactile}
     if config.model == "statespace":
         state, own = training.state_model(pairs, sensor, scenario, preprocessing, empty, image_size=config.image_size)
-        arrays = training.state_moments(pairs, state, scenario, own, empty, views=views, falls=falls)
+        arrays = training.state_arrays(pairs, state, scenario, own, empty, views=views, falls=falls)
         del pairs  # frees memory, because `arrays` contains copies of the same size
         yield Job("statespace", config.state_training, state, arrays, own, empty)
         return
     pairs, empty = dataset.reduced(pairs, config.image_size), dataset.reduced_images(empty, config.image_size)
     for number, (name, modalities) in enumerate(MODELS["paper"].items()):
-        arrays, own = training.moments(pairs, modalities, preprocessing, empty["tactile"])
+        arrays, own = training.frame_arrays(pairs, modalities, preprocessing, empty["tactile"])
         schedule = config.training
         if config.steps is not None:
             schedule = dataclasses.replace(schedule, steps=config.steps[number])
@@ -211,7 +211,7 @@ def calibrate(job: Job, model: statespace.Config, folder: Path, config: Config, 
         config: Configuration of the experiment.
         validation: First and last frames of the validation trajectories.
     """
-    arrays = training.state_moments(validation, model, config.collection.scenario, job.preprocessing, job.empty)
+    arrays = training.state_arrays(validation, model, config.collection.scenario, job.preprocessing, job.empty)
     training.calibrate(folder, arrays)
 
 

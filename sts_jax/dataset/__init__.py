@@ -1,7 +1,7 @@
 """Datasets on disk: `collect` simulates, renders and writes them, and `load` reads them as arrays."""
 
+from sts_jax._files import DamagedFileError as DamagedFileError
 from sts_jax._files import LockedError as LockedError
-from sts_jax._files import TornFileError as TornFileError
 from sts_jax._files import claim as claim
 from sts_jax.dataset.collecting import Collected as Collected
 from sts_jax.dataset.collecting import Progress as Progress
@@ -30,6 +30,7 @@ from sts_jax.dataset.rendering import render_uint8 as render_uint8
 __all__ = [
     "Collected",
     "Collection",
+    "DamagedFileError",
     "Dataset",
     "Ends",
     "Images",
@@ -37,7 +38,6 @@ __all__ = [
     "Meshes",
     "Pairs",
     "Progress",
-    "TornFileError",
     "Views",
     "claim",
     "class_names",

@@ -71,7 +71,7 @@ def collect(
             dataset of another collection, sensor or format. The message names the constant, the field or the file.
         ImportError: `collection.parts` or a mesh file needs a package that is not installed.
         LockedError: Another process collects into the folder.
-        TornFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.
+        DamagedFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.
         OSError: The disk is full, or the folder cannot be written to.
     """
     sensor.check()

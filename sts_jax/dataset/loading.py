@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from sts_jax._files import TornFileError, digest, read_json, sha256
+from sts_jax._files import DamagedFileError, digest, read_json, sha256
 from sts_jax.dataset import records
 from sts_jax.dataset.collection import PARTS
 from sts_jax.dataset.symmetry import turn, turn_condition
@@ -134,7 +134,7 @@ class Dataset:
 
         Raises:
             FileNotFoundError: A shard is missing.
-            TornFileError: A shard is damaged. The message names it.
+            DamagedFileError: A shard is damaged. The message names it.
         """
         height, width = self.collection["resolution"]
         out = records.Images(
@@ -224,7 +224,7 @@ class Dataset:
         Raises:
             ValueError: `part` is another name.
             FileNotFoundError: A shard is missing.
-            TornFileError: A shard is damaged. The message names it.
+            DamagedFileError: A shard is damaged. The message names it.
         """
         rows = np.flatnonzero(np.isin(self.view["body"], self._part(part)))
         height, width = self.collection["resolution"]
@@ -264,7 +264,7 @@ class Dataset:
         Raises:
             ValueError: An index is not a whole number or is out of range, or its trajectory has no images.
             FileNotFoundError: A shard is missing.
-            TornFileError: A shard is damaged. The message names it.
+            DamagedFileError: A shard is damaged. The message names it.
         """
         trajectories = self._checked(trajectories)
         without = trajectories[~np.isin(trajectories, self.rendered())]
@@ -313,7 +313,7 @@ def load(folder: str | Path) -> Dataset:
         FileNotFoundError: The folder or one of its files is missing, or the collection is not finished. The message
             names the file.
         NotADirectoryError: `folder` is a file.
-        TornFileError: A file is damaged, or belongs to another dataset or shard. The message names it.
+        DamagedFileError: A file is damaged, or belongs to another dataset or shard. The message names it.
         ValueError: Another version of the library wrote the dataset in another format.
     """
     folder = Path(folder)
@@ -371,7 +371,7 @@ def _whole_number(collection: dict, name: str, path: Path) -> int:
     """A field of `collection.json`, which must be a whole number of at least 1."""
     value = collection.get(name)
     if type(value) is not int or value < 1:
-        raise TornFileError(
+        raise DamagedFileError(
             f"{path}: {name} must be a whole number of at least 1, got {value!r}: "
             f"delete {path.parent} and collect again."
         )
@@ -384,20 +384,20 @@ def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
     content = _read(path, remedy)
     if not isinstance(content, dict) or set(content) != set(PARTS):
         parts = ", ".join(map(repr, content)) if isinstance(content, dict) else f"a {type(content).__name__}"
-        raise TornFileError(f"{path} must have the parts {', '.join(PARTS)}, got {parts}: {remedy}.")
+        raise DamagedFileError(f"{path} must have the parts {', '.join(PARTS)}, got {parts}: {remedy}.")
     for name, part in content.items():
         if not isinstance(part, list) or not all(type(i) is int for i in part):
-            raise TornFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}: {remedy}.")
+            raise DamagedFileError(f"{path}: {name} must be a list of whole numbers, got {part!r:.60}: {remedy}.")
         outside = [i for i in part if not 0 <= i < num_objects]
         if outside:
-            raise TornFileError(
+            raise DamagedFileError(
                 f"{path}: {name} contains object {outside[0]}, but the objects are 0 to {num_objects - 1}: {remedy}."
             )
     named = np.array([i for part in content.values() for i in part], np.int64)
     times = np.bincount(named, minlength=num_objects)
     if (times != 1).any():
         number = int(np.flatnonzero(times != 1)[0])
-        raise TornFileError(
+        raise DamagedFileError(
             f"{path}: object {number} must be in one part, but it occurs {times[number]} times: {remedy}."
         )
     return {name: np.array(part, np.int64) for name, part in content.items()}

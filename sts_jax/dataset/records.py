@@ -18,7 +18,7 @@ import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sts_jax import physics
-from sts_jax._files import TornFileError, sha256, write_bytes, write_whole
+from sts_jax._files import DamagedFileError, sha256, write_bytes, write_whole
 
 FORMAT = 4  # format of a dataset's files, incremented when older files can no longer be read
 ARRAYS = {  # names of the arrays in a shard's .npz, apart from its identity
@@ -62,11 +62,11 @@ def check_format(content: Any, folder: Path) -> None:
         folder: The folder of the dataset, for messages.
 
     Raises:
-        TornFileError: The content is not the description of a collection.
+        DamagedFileError: The content is not the description of a collection.
         ValueError: The dataset was written by an older or newer version.
     """
     if not isinstance(content, dict):
-        raise TornFileError(
+        raise DamagedFileError(
             f"{folder / 'collection.json'} does not describe a collection: delete {folder} and collect again."
         )
     written = content.get("format", 1)  # the first format had no number
@@ -108,7 +108,7 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
 
     Raises:
         FileNotFoundError: A file is missing. The message names it.
-        TornFileError: A file is damaged, or belongs to another shard or dataset. The message names it.
+        DamagedFileError: A file is damaged, or belongs to another shard or dataset. The message names it.
     """
     small = path.with_suffix(".npz")
     arrays = read_arrays(small)
@@ -116,20 +116,20 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
-        raise TornFileError(f"{small} lacks {', '.join(lacking)}: {again}.")
+        raise DamagedFileError(f"{small} lacks {', '.join(lacking)}: {again}.")
     there = {name.partition("/")[2]: arrays.pop(name).item() for name in names}
     if there["shard"] != identity.shard:
-        raise TornFileError(f"{small} is shard {there['shard']} instead of shard {identity.shard}: {again}.")
+        raise DamagedFileError(f"{small} is shard {there['shard']} instead of shard {identity.shard}: {again}.")
     for name in ("collection", "sensor"):
         if there[name] != getattr(identity, name):
-            raise TornFileError(
+            raise DamagedFileError(
                 f"{small} was made with another {name}.json than the one beside it: put the right {name}.json back, "
                 f"or {again}."
             )
     if not path.is_file():
         raise _missing(path)
     if sha256(path) != there["images"]:
-        raise TornFileError(
+        raise DamagedFileError(
             f"{path} is damaged or belongs to another shard (its SHA-256 is not that in {small.name}): {again}."
         )
     return arrays
@@ -177,7 +177,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        TornFileError: The file is not a complete `.npz` file. The message names it.
+        DamagedFileError: The file is not a complete `.npz` file. The message names it.
     """
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
@@ -185,7 +185,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise
     except Exception as error:  # np.load raises errors of five types for damaged files
-        raise TornFileError(f"{path} is damaged ({error}): delete it and start the collection again.") from error
+        raise DamagedFileError(f"{path} is damaged ({error}): delete it and start the collection again.") from error
 
 
 def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> Images:
@@ -202,7 +202,7 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
     Raises:
         FileNotFoundError: The file does not exist.
-        TornFileError: The file is truncated or has another number of records.
+        DamagedFileError: The file is truncated or has another number of records.
     """
     height, width = resolution
     size = height * width * 3
@@ -232,9 +232,9 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
         records = reader.read([int(i) for i in indices]) if count == total and len(indices) else []
         reader.close()
     except (RuntimeError, ValueError, IndexError) as error:
-        raise TornFileError(f"{path} is damaged ({error}): {again}.") from error
+        raise DamagedFileError(f"{path} is damaged ({error}): {again}.") from error
     if count != total:
-        raise TornFileError(f"{path} is damaged, because it has {count} records instead of {total}: {again}.")
+        raise DamagedFileError(f"{path} is damaged, because it has {count} records instead of {total}: {again}.")
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(records), -1)
 
 

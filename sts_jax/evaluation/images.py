@@ -14,7 +14,7 @@ STREAMS = ("visual", "tactile")
 
 @runtime_checkable
 class Streams(Protocol):
-    """First and last images of n trajectories, such as `hardware.Moments` or `dataset.Pairs`."""
+    """First and last images of n trajectories, such as `hardware.RecordedImages` or `dataset.Pairs`."""
 
     @property
     def visual(self) -> np.ndarray:

@@ -66,7 +66,7 @@ from sts_jax.hardware.session import Origin, Session, SessionError
 from sts_jax.hardware.settling import NoContrastError, Settling
 from sts_jax.hardware.shots import LightError, NotStillError, Pair, Shot
 from sts_jax.hardware.sts import STS, FoundSensors, find_sensors
-from sts_jax.hardware.views import Moments, SensorView, moments, relit, sensor_view
+from sts_jax.hardware.views import RecordedImages, SensorView, recorded_images, relit, sensor_view
 
 __all__ = [
     "STS",
@@ -107,7 +107,6 @@ __all__ = [
     "Lens",
     "LightError",
     "Lit",
-    "Moments",
     "NoContrastError",
     "NotALedControllerError",
     "NotStillError",
@@ -120,6 +119,7 @@ __all__ = [
     "PortInUseError",
     "PortNotFoundError",
     "PortPermissionError",
+    "RecordedImages",
     "RecordedTrajectory",
     "Recorder",
     "Recordings",
@@ -155,9 +155,9 @@ __all__ = [
     "known_pad",
     "list_recordings",
     "load_recordings",
-    "moments",
     "next_recording",
     "project",
+    "recorded_images",
     "rectification",
     "rectified",
     "relit",

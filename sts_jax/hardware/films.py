@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sts_jax import _files
-from sts_jax._files import TornFileError
+from sts_jax._files import DamagedFileError
 from sts_jax.hardware import protocol
 from sts_jax.hardware.camera_config import CameraConfig
 from sts_jax.hardware.camera_errors import CameraOpenError
@@ -78,7 +78,7 @@ class RecordedFilm(Film):
         Raises:
             FileNotFoundError: The folder contains no recording, or a file of the recording is missing.
             OSError: A file cannot be read.
-            TornFileError: A file is damaged or truncated.
+            DamagedFileError: A file is damaged or truncated.
             ValueError: The recording has no image, or has another version of the format.
         """
         self._folder = folder
@@ -123,7 +123,7 @@ class RecordedFilm(Film):
         size = path.stat().st_size
         there = sum(place.offset + place.size <= size for place in places)
         if there < len(places):
-            raise TornFileError(
+            raise DamagedFileError(
                 f"{path} is truncated: it has {there} images, but {FRAMES} lists {len(places)}. {_AGAIN.capitalize()}, "
                 f"or remove the last {len(places) - there} lines of the {stream} stream from {FRAMES}."
             )
@@ -135,14 +135,14 @@ class RecordedFilm(Film):
             index: Position of the image in `stills`.
 
         Raises:
-            TornFileError: The image is damaged.
+            DamagedFileError: The image is damaged.
         """
         still, place = self.stills[index], self._places[index]
         file = self._files[still.stream]
         file.seek(place.offset)
         data = file.read(place.size)
         if zlib.crc32(data) != place.crc32:
-            raise TornFileError(
+            raise DamagedFileError(
                 f"image {index + 1} of {self._folder} is damaged, because its checksum differs: {_AGAIN}, or remove "
                 f"line {index + 1} of {FRAMES}."
             )
@@ -170,11 +170,11 @@ def _lines(path: Path) -> list[tuple[Still, _Place]]:
             values = json.loads(line)
             found.append((_still(values), _Place(values["offset"], values["bytes"], values["crc32"])))
         except (ValueError, KeyError, TypeError) as error:
-            raise TornFileError(
+            raise DamagedFileError(
                 f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): {_AGAIN}, or remove this line."
             ) from error
         if number > 1 and found[-1][0].time_s < found[-2][0].time_s:
-            raise TornFileError(f"{path}, line {number}, has an earlier time than the line before: {_AGAIN}.")
+            raise DamagedFileError(f"{path}, line {number}, has an earlier time than the line before: {_AGAIN}.")
     if not found:
         raise ValueError(f"{path} lists no image: make a new recording.")
     return found

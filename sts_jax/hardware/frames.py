@@ -31,7 +31,7 @@ class Captured:
     dropped: int  # frames lost just before this frame, estimated from the times, or skipped in a video file
     repeats: int  # number of frames just before this frame that are identical to it
     black: bool  # True if no value of the image exceeds 8 of 255
-    held_back: bool = False  # True if the frame was delayed, so it may have been exposed long before it arrived
+    delayed: bool = False  # True if the frame was delayed, so it may have been exposed long before it arrived
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Pace:
         self._gap: _Gap | None = None
         self._intervals: collections.deque[float] = collections.deque(maxlen=_INTERVALS)
         self.dropped = 0
-        self.held_back = False  # True if the last frame was delayed
+        self.delayed = False  # True if the last frame was delayed
 
     @property
     def rate(self) -> float | None:
@@ -109,7 +109,7 @@ class Pace:
         if period is None:
             return 0
         periods = (time_s - last) / period
-        self.held_back = periods > _LONG or (self.held_back and periods < _SHORT)
+        self.delayed = periods > _LONG or (self.delayed and periods < _SHORT)
         missing = max(round((time_s - last) / period) - 1, 0)
         if missing:
             self._gap = _Gap(last, 1, missing, missing + _MADE_UP)
@@ -127,4 +127,4 @@ class Pace:
 
     def interrupted(self) -> None:
         """Forget the last frame. Call this after an interruption of the connection."""
-        self._last, self._gap, self.held_back = None, None, False
+        self._last, self._gap, self.delayed = None, None, False

@@ -318,10 +318,10 @@ class Grabber:
                 if playback is None:
                     stamp = capture.stamp()
                     dropped = self._pace.arrived(stamp or time_s)
-                    held_back = self._pace.held_back and not stamp
+                    delayed = self._pace.delayed and not stamp
                     self._counts = dataclasses.replace(self._counts, dropped=self._pace.dropped)
                 else:
-                    dropped, held_back = 0, False
+                    dropped, delayed = 0, False
                     self._pace.arrived(time_s)
             if playback is not None:
                 while playback.late() and capture.grab():
@@ -360,7 +360,7 @@ class Grabber:
                 )
                 continue
             image.flags.writeable = False
-            self._publish(Captured(image, time_s, sequence, self._epoch, dropped, repeats, black, held_back))
+            self._publish(Captured(image, time_s, sequence, self._epoch, dropped, repeats, black, delayed))
             self._settle_now(capture)
             self._expose_now(capture)
         return False

@@ -225,7 +225,7 @@ class ProvenFrames:
                 self._departed = (self._departed * self._in_order(frame) + 1) * self._shows(frame, stream)
             self._previous = frame
             late_s = frame.time_s - max(lit.acknowledged_s + settled_s, after_s)
-            if self._departed >= 2 and late_s >= 0 and not spoilt and not frame.held_back:
+            if self._departed >= 2 and late_s >= 0 and not spoilt and not frame.delayed:
                 return lit, frame
             self.discarded += 1
             if self._departed == 0 and late_s >= 0 and time.monotonic() >= checked_s + _CHECK_S:

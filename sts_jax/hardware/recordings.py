@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sts_jax import _files
-from sts_jax._files import TornFileError
+from sts_jax._files import DamagedFileError
 from sts_jax.hardware.guide import End
 from sts_jax.hardware.leds import Lit
 from sts_jax.hardware.settling import Settling
@@ -114,7 +114,7 @@ class Recordings:
         Raises:
             IndexError: The index is out of range.
             FileNotFoundError: The trajectory has been discarded meanwhile.
-            TornFileError: A file of the trajectory is missing or damaged.
+            DamagedFileError: A file of the trajectory is missing or damaged.
         """
         return read_trajectory(self.folder, self.numbers[index])
 
@@ -134,7 +134,7 @@ class Recordings:
             Four arrays, one for each stream of the initial and of the final pairs.
 
         Raises:
-            TornFileError: A file is missing or damaged.
+            DamagedFileError: A file is missing or damaged.
             ValueError: There is no confirmed trajectory.
         """
         if not self.numbers:
@@ -162,7 +162,7 @@ def load_recordings(folder: str | os.PathLike) -> Recordings:
 
     Raises:
         FileNotFoundError: There is no session in the folder.
-        TornFileError: `session.json` is damaged.
+        DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
     """
     return Recordings(folder)
@@ -197,7 +197,7 @@ def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") ->
     Raises:
         LockedError: Another process is using the folder.
         FileNotFoundError: There is no such session or trajectory, or a pair is missing.
-        TornFileError: `session.json` is damaged.
+        DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
     """
     with _locked(folder) as session:
@@ -215,7 +215,7 @@ def discard_recording(folder: str | os.PathLike, number: int) -> None:
         LockedError: Another process is using the folder.
         FileNotFoundError: There is no such session or trajectory.
         FileExistsError: There is a discarded trajectory of the same number.
-        TornFileError: `session.json` is damaged.
+        DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
     """
     with _locked(folder) as session:
@@ -233,7 +233,7 @@ def restore_recording(folder: str | os.PathLike, number: int) -> None:
         LockedError: Another process is using the folder.
         FileNotFoundError: There is no such session or discarded trajectory.
         FileExistsError: There is another trajectory of the same number.
-        TornFileError: `session.json` is damaged.
+        DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
     """
     with _locked(folder) as session:
@@ -265,7 +265,7 @@ def list_recordings(folder: str | os.PathLike) -> list[Entry]:
 
     Raises:
         FileNotFoundError: There is no session in the folder.
-        TornFileError: `session.json` is damaged.
+        DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
     """
     folder = Path(folder)
@@ -418,7 +418,7 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
 
     Raises:
         FileNotFoundError: There is no such confirmed trajectory.
-        TornFileError: A file is missing or damaged.
+        DamagedFileError: A file is missing or damaged.
     """
     path = trajectory_folder(folder, number)
     file = path / CONFIRMED
@@ -429,9 +429,9 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
     content = _files.read_json(file, _remedy(number))
     checksum = content.pop("checksum", None) if isinstance(content, dict) else None
     if checksum != _files.digest(content):
-        raise TornFileError(f"{file} is damaged, because its checksum differs: {_remedy(number)}.")
+        raise DamagedFileError(f"{file} is damaged, because its checksum differs: {_remedy(number)}.")
     if content["number"] != number:
-        raise TornFileError(
+        raise DamagedFileError(
             f"{file} belongs to trajectory {content['number']}, not to trajectory {number}: rename the folder to "
             f"{content['number']:05d}, or discard trajectory {number}."
         )
@@ -448,7 +448,7 @@ def read_pair(path: Path, number: int, checksum: str | None = None) -> Pair:
         checksum: Expected SHA-256 of `pair.json`. None: not compared.
 
     Raises:
-        TornFileError: A file is missing or damaged.
+        DamagedFileError: A file is missing or damaged.
     """
     content = json.loads(_checked(path / PAIR, checksum, number))
     shots = {}
@@ -467,9 +467,9 @@ def _checked(path: Path, checksum: str | None, number: int) -> bytes:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise TornFileError(f"{path} cannot be read ({error}): {_remedy(number)}.") from error
+        raise DamagedFileError(f"{path} cannot be read ({error}): {_remedy(number)}.") from error
     if checksum is not None and hashlib.sha256(data).hexdigest() != checksum:
-        raise TornFileError(f"{path} is damaged, because its checksum differs: {_remedy(number)}.")
+        raise DamagedFileError(f"{path} is damaged, because its checksum differs: {_remedy(number)}.")
     return data
 
 

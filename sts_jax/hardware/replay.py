@@ -114,7 +114,7 @@ class Replay:
 
         Raises:
             FileNotFoundError: There is no recording, or one of its files is missing.
-            TornFileError: A file of the recording is damaged or truncated.
+            DamagedFileError: A file of the recording is damaged or truncated.
             CameraError: A video cannot be read.
             ValueError: `warmup_s` or `fps` is out of range, the recording is empty or of another format, or the two
                 videos have different lengths.
@@ -162,7 +162,7 @@ class Replay:
             LightError: No pair becomes available in time.
             EndOfVideoError: There are no more pairs.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
-            TornFileError: An image of the recording is damaged.
+            DamagedFileError: An image of the recording is damaged.
         """
         self._opened()
         limit_s = _limit_s(timeout_ms)
@@ -188,7 +188,7 @@ class Replay:
             LightError: No pair becomes available in time.
             EndOfVideoError: There are no more pairs.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
-            TornFileError: An image of the recording is damaged.
+            DamagedFileError: An image of the recording is damaged.
         """
         self._opened()
         limit_s = _limit_s(timeout_ms)
@@ -212,7 +212,7 @@ class Replay:
             StaleFrameError: The newest pair is older than `max_age_ms`, or no pair is available yet.
             EndOfVideoError: The newest pair is older than `max_age_ms`, and there are no more pairs.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
-            TornFileError: An image of the recording is damaged.
+            DamagedFileError: An image of the recording is damaged.
         """
         if not max_age_ms > 0:
             raise ValueError(f"max_age_ms must be > 0, got {max_age_ms}")

@@ -123,7 +123,7 @@ class Session:
         Raises:
             LockedError: Another process is using the folder.
             ValueError: The session has another origin. The message states both values.
-            TornFileError: `session.json` is damaged.
+            DamagedFileError: `session.json` is damaged.
             OSError: The folder cannot be written to.
         """
         folder = Path(folder)

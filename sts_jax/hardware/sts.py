@@ -502,8 +502,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
             break
     raise NotStillError(
         f"the view was not still for {window_s:g} s within {timeout_s:g} s: one block of the last image differs by "
-        f"{change:.0f} of 255 from an image before it (at most {allowed:.0f} counts as still). Keep the scene at rest, raise timeout_s, or check whether the "
-        "light of the room changes."
+        f"{change:.0f} of 255 from an image before it (at most {allowed:.0f} counts as still). Keep the scene at rest, "
+        "raise timeout_s, or check whether the light of the room changes."
     )
 
 

@@ -19,7 +19,7 @@ class SensorView(NamedTuple):
     tactile: Float[np.ndarray, "height width 3"]  # tactile image, RGB, float32 in [0, 1]
 
 
-class Moments(NamedTuple):
+class RecordedImages(NamedTuple):
     """Rectified initial and final images of n recorded trajectories."""
 
     visual: UInt8[np.ndarray, "n 2 height width 3"]  # visual images, RGB. The second axis is initial, final
@@ -86,14 +86,14 @@ def relit(view: SensorView, background: SensorView, empty: SensorView) -> Sensor
     )
 
 
-def moments(
+def recorded_images(
     recordings: Recordings,
     lens: Lens,
     pinhole: Pinhole,
     resolution: tuple[int, int] = (64, 64),
     *,
     progress: Progress | None = None,
-) -> Moments:
+) -> RecordedImages:
     """Read and rectify the initial and final images of all confirmed trajectories.
 
     Args:
@@ -109,7 +109,7 @@ def moments(
 
     Raises:
         ValueError: There is no confirmed trajectory, or the images have another size than the lens.
-        TornFileError: A file is missing or damaged.
+        DamagedFileError: A file is missing or damaged.
     """
     width, height = recordings.session["width"], recordings.session["height"]
     if (width, height) != (lens.width, lens.height):
@@ -129,4 +129,4 @@ def moments(
         tactile.append([rectified(lens, pinhole, pair.tactile.image, resolution) for pair in ends])
         if progress is not None:
             progress(done, len(recordings))
-    return Moments(np.array(visual), np.array(tactile), np.array(recordings.numbers))
+    return RecordedImages(np.array(visual), np.array(tactile), np.array(recordings.numbers))

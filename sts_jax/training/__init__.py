@@ -18,12 +18,12 @@ from sts_jax.training.preprocess import (
 )
 from sts_jax.training.shifts import shifted
 from sts_jax.training.trajectories import (
-    image_moments,
-    moments,
+    frame_arrays,
+    image_arrays,
     paper_model,
+    state_arrays,
     state_codes,
     state_model,
-    state_moments,
 )
 
 __all__ = [
@@ -36,12 +36,12 @@ __all__ = [
     "TrainState",
     "Weights",
     "calibrate",
-    "image_moments",
+    "frame_arrays",
+    "image_arrays",
     "initial",
     "learner",
     "load",
     "load_blank",
-    "moments",
     "optimiser",
     "order",
     "paper_model",
@@ -52,9 +52,9 @@ __all__ = [
     "save_calibration",
     "seal",
     "shifted",
+    "state_arrays",
     "state_codes",
     "state_model",
-    "state_moments",
     "step",
     "touch_of_noisy_images",
     "train",

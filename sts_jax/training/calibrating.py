@@ -20,7 +20,7 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
 
     Args:
         workdir: Folder of the model.
-        arrays: Trajectories of objects that the model was not trained on, from `state_moments`.
+        arrays: Trajectories of objects that the model was not trained on, from `state_arrays`.
 
     Returns:
         The model with its calibration.

@@ -48,7 +48,7 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
         the folder has no calibration, or if the model's files changed after the fit.
 
     Raises:
-        TornFileError: The file is damaged, or was written by another version of sts_jax.
+        DamagedFileError: The file is damaged, or was written by another version of sts_jax.
     """
     path = folder / NAME
     remedy = "restore it from a copy, or delete it and calibrate again (--only train, or training.calibrate)"
@@ -56,9 +56,9 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
         return None
     content: Any = _files.read_json(path, remedy)
     if not isinstance(content, dict) or content.pop("checksum", None) != _files.digest(content):
-        raise _files.TornFileError(f"{path} was changed or damaged (its checksum differs): {remedy}.")
+        raise _files.DamagedFileError(f"{path} was changed or damaged (its checksum differs): {remedy}.")
     if content["format"] != _FORMAT:
-        raise _files.TornFileError(f"{path} was written by another version of sts_jax: {remedy}.")
+        raise _files.DamagedFileError(f"{path} was written by another version of sts_jax: {remedy}.")
     if content["weights"] != _weights(folder):
         return None
     rows = [[row[name] for name in statespace.Calibration._fields] for row in content["subsets"].values()]

@@ -106,7 +106,7 @@ def restore(folder: Path, like: State) -> State | None:
         A state of the same structure, or None if the folder has no checkpoint.
 
     Raises:
-        TornFileError: A file is damaged, missing or not listed in the manifest.
+        DamagedFileError: A file is damaged, missing or not listed in the manifest.
         ValueError: The checkpoint was written for another model or optimiser, or has no manifest.
     """
     path = verified(folder)
@@ -123,7 +123,7 @@ def verified(folder: Path) -> Path | None:
         The folder of the current checkpoint, or None if there is no checkpoint.
 
     Raises:
-        TornFileError: A file is damaged, missing or not listed in the manifest.
+        DamagedFileError: A file is damaged, missing or not listed in the manifest.
         ValueError: The folder has a checkpoint but no manifest.
     """
     listed = _manifest(folder)

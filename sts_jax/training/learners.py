@@ -114,7 +114,7 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         if found != expected[kind]:
             raise ValueError(
                 f"{kind} has samples of the shapes {found}, but the model needs {expected[kind]}: make the arrays with "
-                "training.state_moments"
+                "training.state_arrays"
             )
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
         raise ValueError(
@@ -131,7 +131,7 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
             shapes = {name: x.shape for name, x in values.items()}
             raise ValueError(
                 f"{kind} has arrays of the shapes {shapes}, but it must have samples of the shapes {further[kind]}, "
-                "equally many in all arrays: make them with training.state_moments"
+                "equally many in all arrays: make them with training.state_arrays"
             )
     for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:

@@ -31,14 +31,14 @@ def read(folder: Path) -> Manifest | None:
     """Read the manifest in the folder of a model, or return None if there is no manifest.
 
     Raises:
-        TornFileError: The manifest is damaged, or was written by another version of sts_jax.
+        DamagedFileError: The manifest is damaged, or was written by another version of sts_jax.
     """
     path, remedy = folder / NAME, _remedy(folder)
     if not path.exists():
         return None
     content = _files.read_json(path, remedy)
     if not _is_manifest(content):
-        raise _files.TornFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
+        raise _files.DamagedFileError(f"{path} is damaged, or was written by another version of sts_jax: {remedy}.")
     return Manifest(content["step"], content["files"])
 
 
@@ -56,7 +56,7 @@ def write(folder: Path, step: int | None) -> Manifest:
         The new manifest.
 
     Raises:
-        TornFileError: The previous manifest is damaged.
+        DamagedFileError: The previous manifest is damaged.
         OSError: The manifest cannot be written.
     """
     old = read(folder)
@@ -91,12 +91,12 @@ def verify(folder: Path, manifest: Manifest) -> None:
         manifest: Manifest of the folder.
 
     Raises:
-        TornFileError: A file has changed, is missing or is not listed. The message names the file and the remedy.
+        DamagedFileError: A file has changed, is missing or is not listed. The message names the file and the remedy.
     """
     remedy = _remedy(folder)
     for name in _there(folder, manifest.step):
         if name not in manifest.files:
-            raise _files.TornFileError(
+            raise _files.DamagedFileError(
                 f"{folder / name} is not listed in {NAME}: the file does not belong to this model. Move it elsewhere, "
                 f"or {remedy}."
             )
@@ -105,12 +105,12 @@ def verify(folder: Path, manifest: Manifest) -> None:
         try:
             found = _files.sha256(path)
         except FileNotFoundError:
-            raise _files.TornFileError(f"{path} is missing, but {NAME} lists it: {remedy}.") from None
+            raise _files.DamagedFileError(f"{path} is missing, but {NAME} lists it: {remedy}.") from None
         except (OSError, ValueError) as error:  # ValueError: a damaged manifest may list a name with a null byte
-            raise _files.TornFileError(f"{path} cannot be read ({error}): {remedy}.") from error
+            raise _files.DamagedFileError(f"{path} cannot be read ({error}): {remedy}.") from error
         if found != digest:
             again = " or delete this file and start the training again" if name == "blank.npz" else ""
-            raise _files.TornFileError(
+            raise _files.DamagedFileError(
                 f"{path} is not the file that {NAME} lists (its SHA-256 differs) because it was edited, exchanged or "
                 f"damaged: {remedy}{again}."
             )

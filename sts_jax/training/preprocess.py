@@ -209,7 +209,7 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         FileNotFoundError: The file is missing.
-        TornFileError: The file is damaged.
+        DamagedFileError: The file is damaged.
     """
     path = folder / "blank.npz"
     if not path.exists():
@@ -220,7 +220,7 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         if any(image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 for image in images):
             raise ValueError(f"images of {images[0].dtype} {images[0].shape} and {images[1].dtype} {images[1].shape}")
     except Exception as error:  # zipfile, zlib and NumPy raise many types for damaged archives
-        raise _files.TornFileError(
+        raise _files.DamagedFileError(
             f"{path} is damaged ({type(error).__name__}: {error}): delete it and start the training again, which "
             "writes it anew."
         ) from error

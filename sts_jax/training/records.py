@@ -37,7 +37,7 @@ def read(path: Path, last: int) -> list[Record]:
         The records in the order of the file.
 
     Raises:
-        TornFileError: A line other than the last is damaged.
+        DamagedFileError: A line other than the last is damaged.
         OSError: The file cannot be read.
     """
     try:
@@ -54,7 +54,7 @@ def read(path: Path, last: int) -> list[Record]:
         except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
             if number == len(lines):  # the process was killed while it wrote this line
                 break
-            raise _files.TornFileError(
+            raise _files.DamagedFileError(
                 f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): delete this line, or the "
                 "file, to continue without these records."
             ) from error

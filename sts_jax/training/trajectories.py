@@ -16,7 +16,7 @@ from sts_jax.training.preprocess import Preprocessing
 SOME = 512  # number of items that are encoded at once
 
 
-def moments(
+def frame_arrays(
     pairs: Pairs, modalities: tuple[str, ...], preprocessing: Preprocessing, blank: np.ndarray
 ) -> tuple[Arrays, Preprocessing]:
     """Make the training arrays of an `mvae` model: inputs from first frames, targets from last frames.
@@ -34,10 +34,10 @@ def moments(
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
     condition = np.asarray(preprocessing.encode_condition(jnp.asarray(pairs.condition)))
-    return _moments(found, modalities, preprocessing, blank, condition if condition.shape[1] else None)
+    return _arrays(found, modalities, preprocessing, blank, condition if condition.shape[1] else None)
 
 
-def image_moments(
+def image_arrays(
     visual: UInt8[np.ndarray, "n 2 h w 3"],
     tactile: UInt8[np.ndarray, "n 2 h w 3"],
     modalities: tuple[str, ...],
@@ -47,7 +47,7 @@ def image_moments(
     """Make the training arrays of an `mvae` model from images without poses, as from a real sensor.
 
     Args:
-        visual: First and last visual image of each trajectory, for example from `hardware.moments`.
+        visual: First and last visual image of each trajectory, for example from `hardware.recorded_images`.
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
         preprocessing: Preprocessing with the criterion for a contact, see `touch_of_noisy_images`. First tactile images
@@ -55,7 +55,7 @@ def image_moments(
         blank: Tactile image of the empty sensor.
 
     Returns:
-        The arrays, and the preprocessing with a new field `absent`, as from `moments`.
+        The arrays, and the preprocessing with a new field `absent`, as from `frame_arrays`.
 
     Raises:
         ValueError: `modalities` has another name or none, or the images have another type or shape than
@@ -70,10 +70,10 @@ def image_moments(
                 f"{name} is {images.dtype} of shape {images.shape}, but visual and tactile must be uint8 of shape (n, "
                 f"{', '.join(map(str, shape))}) with the same n >= 1"
             )
-    return _moments(found, modalities, preprocessing, blank, None)
+    return _arrays(found, modalities, preprocessing, blank, None)
 
 
-def _moments(
+def _arrays(
     found: dict[str, np.ndarray],
     modalities: tuple[str, ...],
     preprocessing: Preprocessing,
@@ -109,7 +109,7 @@ def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mv
     return mvae.Config(kept, condition=len(preprocessing.condition_scale))
 
 
-def state_moments(
+def state_arrays(
     pairs: Pairs,
     model: statespace.Config,
     scenario: physics.Scenario,
