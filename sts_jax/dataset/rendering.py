@@ -53,7 +53,7 @@ def render(
         report: Function that is called with the number of finished images.
 
     Yields:
-        Batches of images: `Images` of the frames, then tuples `(visual,)` of the views.
+        Batches of images, which are first `Images` of the frames, then tuples `(visual,)` of the views.
     """
     size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
     turned = {
@@ -130,7 +130,8 @@ def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
         collection: The description of the dataset.
 
     Returns:
-        Images without the leading axis: visual and tactile `(height, width, 3)`, segmentation `(height, width)`.
+        Images without the leading axis, which are visual and tactile `(height, width, 3)`, segmentation `(height,
+        width)`.
     """
     body = make_bodies(collection, np.array([0]))[0]
     gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])

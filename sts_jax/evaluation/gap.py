@@ -95,7 +95,7 @@ def features(images: np.ndarray) -> np.ndarray:
         images: Images, uint8 `(n, height, width, 3)`, at least `LEAST_SIDE` pixels high and wide.
 
     Returns:
-        Features in [0, 1], `(n, 240)`: 48 colours, then 64 gradients of each scale from fine to coarse.
+        Features in [0, 1], `(n, 240)`, which are 48 colours, then 64 gradients of each scale from fine to coarse.
 
     Raises:
         ValueError: The images are not uint8 or too small.

@@ -44,8 +44,8 @@ def summarise(
         - `outcomes`: Number of items with each true outcome, by the name of the outcome.
         - `scored`: Number of items that were scored, by the name of the predictor.
         - `predictors`: The metrics, by the names of predictor and metric.
-        - `differences`: The metrics of a predictor minus those of a baseline, by the names of predictor, baseline and
-          metric. Baselines and ceilings are not among these predictors.
+        - `differences`: The metrics of a predictor minus those of a baseline, by their names. These predictors are the
+            models, not the baselines and ceilings.
 
     Raises:
         ValueError: Two metrics have the same name, or `scores` lacks a baseline.

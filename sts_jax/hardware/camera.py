@@ -144,7 +144,7 @@ class Camera:
             exposure: New exposure, > 0, in the driver's unit (V4L2: 0.1 ms).
 
         Returns:
-            The exposure that the device has now. Drivers round and limit the given value. None: the driver does not
+            The exposure that the device has now. Drivers round and limit the given value. None if the driver does not
             support a manual exposure.
 
         Raises:

@@ -102,7 +102,7 @@ def loss(
         absent: Names of modalities that no sample has as an input.
 
     Returns:
-        The loss, and a pair: the new running batch statistics, with the structure of `stats`, and the parts of the
+        The loss, and a pair of the new running batch statistics, with the structure of `stats`, and the parts of the
         loss.
 
     Raises:
@@ -194,8 +194,8 @@ def decode(
         condition: Numbers that are appended to each latent, `(*batch, condition)`. None if `config.condition` is 0.
 
     Returns:
-        The predictions by modality, `(*batch, *shape)`. An image is given by logits: `jax.nn.sigmoid` returns values in
-        [0, 1].
+        The predictions by modality, `(*batch, *shape)`. An image is given by logits, of which `jax.nn.sigmoid` returns
+        values in [0, 1].
 
     Raises:
         ValueError: `condition` has another width than the model needs.

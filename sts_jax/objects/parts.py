@@ -70,7 +70,7 @@ def decompose(body: Body) -> Body:
         body: One body.
 
     Returns:
-        The body with the parts as `hulls`: at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each. If
+        The body with the parts as `hulls`, at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each. If
         a single part is enough, the body is returned unchanged.
 
     Raises:

@@ -72,7 +72,7 @@ class Shape(NamedTuple):
             height: z of the lowest point (m). The gel's face is at 0.
 
         Returns:
-            Mesh frame in the sensor frame, (7,): position (m), quaternion.
+            Mesh frame in the sensor frame, (7,), as position (m) and quaternion.
         """
         lowest = jnp.min(self.points @ geometry.quat_to_matrix(quat)[2])
         return jnp.concatenate([place, jnp.stack([height - lowest]), quat])

@@ -79,7 +79,7 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
         counts: A mask for each of these inputs. True means that the item has the input.
 
     Returns:
-        The belief: a Gaussian over the state code and the appearance code.
+        The belief, which is a Gaussian over the state code and the appearance code.
     """
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
@@ -210,9 +210,9 @@ def loss(
         beta: Weight of the divergence of the appearance code.
 
     Returns:
-        The loss, and its terms by name: means over the items that have the input or the target, before they are
-        weighted. `state` is in squared units of the code, and all other terms are in nats. `state`, `doubt` and `first`
-        are sums over the input images, and `covered` is a sum over the first and the last frame.
+        The loss, and its terms by name, which are means over the items that have the input or the target, before they
+        are weighted. `state` is in squared units of the code, and all other terms are in nats. `state`, `doubt` and
+        `first` are sums over the input images, and `covered` is a sum over the first and the last frame.
     """
     model = nnx.merge(graphdef, params)
     config = model.config

@@ -39,7 +39,7 @@ class Loss(Protocol):
                 steps.
 
         Returns:
-            The loss, and a pair: the new running batch statistics (`stats` if the loss does not change them), and
+            The loss, and a pair of the new running batch statistics (`stats` if the loss does not change them), and
             scalars by name for the training log. One of the scalars must be `loss`. The training stops with an error if
             it is not finite.
         """

@@ -346,7 +346,8 @@ class Twin:
         """Advance the virtual clock until the next frame is delivered.
 
         Returns:
-            The ground truth of the frame, and its image: uint8 RGB of shape (height, width, 3), decoded from its JPEG.
+            The ground truth of the frame, and its image as uint8 RGB of shape (height, width, 3), decoded from its
+            JPEG.
 
         Raises:
             RuntimeError: The twin runs on the real clock.
