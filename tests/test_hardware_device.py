@@ -188,7 +188,7 @@ def test_repeated_frames_are_not_returned_as_new(peer):
         assert sensor.read().visual.sequence > pair.tactile.sequence
 
 
-def test_frames_that_are_held_back_do_not_pass_as_those_of_another_light(peer, sensor):
+def test_delayed_frames_do_not_pass_as_those_of_another_light(peer, sensor):
     for _ in range(3):
         sensor.read()
         peer.camera.mode = "held"
@@ -265,6 +265,25 @@ def test_a_controller_that_returns_is_found_again(tmp_path, peer, sensor):
     peer.unplug()
     threading.Timer(0.5, lambda: peer.plug_in(tmp_path / "leds")).start()
     assert all(judged(peer, shot) for shot in _both(sensor.read()))
+
+
+def test_a_reconnection_extends_the_limit_of_both_images(tmp_path, peer):
+    given = config(peer.url, frozen_after_s=None)
+    with hardware.STS(camera=given, leds=peer.path, settling=SETTLING, timeout_s=1.0).connect(0.2) as sensor:
+        sensor.read()
+        peer.unplug()
+        threading.Timer(2.5, lambda: peer.plug_in(tmp_path / "leds")).start()
+        began_s = time.monotonic()
+        assert all(judged(peer, shot) for shot in _both(sensor.read()))
+        assert time.monotonic() - began_s > 2  # longer than the limit of a pair without a reconnection
+
+
+def test_a_sensor_of_an_open_controller_connects_again(peer):
+    leds = hardware.Leds.connect(peer.path)
+    sensor = hardware.STS(camera=config(peer.url, frozen_after_s=None), leds=leds, settling=SETTLING)
+    for _ in range(2):
+        with sensor.connect(0.2):
+            assert all(judged(peer, shot) for shot in _both(sensor.read()))
 
 
 def test_async_read_and_read_latest(peer, sensor):

@@ -121,6 +121,12 @@ def changed(params, path, change):
     return new
 
 
+@pytest.mark.parametrize("drawn", [0, 3])
+def test_number_of_rendered_samples_is_checked(model, empty, drawn):
+    with pytest.raises(ValueError, match=rf"drawn must be from 1 to num \(2\), got {drawn}"):
+        statespace.sample(*model, jax.random.key(0), {}, {}, empty, num=2, drawn=drawn)
+
+
 def test_excess_equals_the_metric_and_is_zero_at_the_target():
     rng = np.random.default_rng(0)
     image, target = (rng.uniform(0.01, 0.99, (2, 8, 8, 3)).astype(np.float32) for _ in range(2))
