@@ -687,7 +687,7 @@ def test_the_exposure_of_a_device_is_set_between_frames_and_again_after_a_loss(d
 
 
 def test_the_exposure_of_a_stream_is_left_to_its_server(server):
-    with connected(server) as camera, pytest.raises(CameraError, match="set it at its server"):
+    with connected(server) as camera, pytest.raises(CameraError, match="set it at the server of the stream"):
         camera.set_exposure(80)
 
 

@@ -284,7 +284,7 @@ def test_damaged_recordings_are_named(folder, tmp_path):
         DamagedFileError, r"tactile.mkv is truncated: it has [345] images, but .* lists 6.*remove the last [123] lines"
     )
     (folder / "tactile.mkv").unlink()
-    refused(FileNotFoundError, r"tactile.mkv cannot be read .*, but frames.jsonl lists 6 images of it")
+    refused(FileNotFoundError, r"tactile.mkv cannot be read .*, but frames.jsonl lists 6 images of this file")
     changed = bytearray(video)
     changed[-100] ^= 1
     (folder / "tactile.mkv").write_bytes(changed)
@@ -294,7 +294,7 @@ def test_damaged_recordings_are_named(folder, tmp_path):
     damaged(folder / "frames.jsonl", b'"sequence": 9,', b'"sequenc')
     refused(DamagedFileError, "frames.jsonl, line 4, is damaged .*or remove this line")
     (folder / "frames.jsonl").write_text(lines.replace('"time_s": 100.2', '"time_s": NaN', 1))
-    refused(DamagedFileError, "line 5, is damaged .*time_s is nan")
+    refused(DamagedFileError, "line 5, is damaged .*time_s must be finite, got nan")
     (folder / "frames.jsonl").write_text(lines.replace('"time_s": 100.2', '"time_s": 10.2', 1))
     refused(DamagedFileError, "line 5, has an earlier time")
     (folder / "frames.jsonl").write_text("")

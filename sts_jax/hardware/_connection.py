@@ -20,7 +20,7 @@ Answer = TypeVar("Answer", protocol.Controller, protocol.State, protocol.Watchin
 
 
 class Connection:
-    """An open port to a controller. Several threads may use one connection."""
+    """An open serial port to the LED controller. Several threads may use one connection."""
 
     def __init__(self, name: str, baud: int):
         """Open the port. `ports.open_port` lists the errors.
@@ -41,17 +41,21 @@ class Connection:
         self._heard = b""  # invalid lines that arrived during the current exchange
 
     def handshake(self, timeout_s: float) -> protocol.Controller:
-        """Return the controller's description, and check that it uses the same version of the protocol.
+        """Ask the controller for its description, and check that it uses the same version of the protocol as `sts_jax`.
 
-        Boards restart when a port is opened, so the request is repeated until `timeout_s` has passed.
+        Opening a port restarts most boards. The request is therefore repeated every 0.1 s until an answer arrives.
 
         Args:
             timeout_s: Longest wait for the answer (s).
 
+        Returns:
+            The description of the controller, such as its firmware, board and serial number.
+
         Raises:
-            NotALedControllerError: No valid answer arrived in time.
+            NotALedControllerError: No valid answer arrived in time, or the port accepts no bytes.
             WrongVersionError: The controller uses another version of the protocol.
-            DisconnectedError: The port vanished.
+            LedError: The controller refused the request for another reason.
+            DisconnectedError: The port vanished or is closed.
         """
         try:
             reply, _, _ = self.exchange(protocol.Hello, protocol.Controller, timeout_s=timeout_s)
@@ -66,12 +70,15 @@ class Connection:
     def exchange(
         self, request: Callable[[int], protocol.Request], answer: type[Answer], *, timeout_s: float
     ) -> tuple[Answer, float, float]:
-        """Send a request and wait for its answer. The request is repeated with the same sequence number.
+        """Send a request and wait for its answer.
+
+        The request is repeated every 0.1 s with the same sequence number until its answer arrives.
 
         Args:
-            request: Function that makes the request from its sequence number.
-            answer: Type of the expected answer. Replies of other types are ignored, except refusals.
-            timeout_s: Longest time, with all repetitions (s).
+            request: Function that makes the request. Its argument is the sequence number of the request.
+            answer: Type of the expected answer. A `protocol.Refused` reply to this request raises an error. Other
+                replies are ignored.
+            timeout_s: Longest wait for the answer, including all repetitions (s).
 
         Returns:
             The answer, the time just before the request was first sent, and the time at which the answer had arrived.
@@ -106,7 +113,10 @@ class Connection:
             )
 
     def close(self) -> None:
-        """Close the port. The controller's watchdog turns the lights off if they are on."""
+        """Close the port.
+
+        If the lights are on, the controller's watchdog turns them off, because no more requests arrive.
+        """
         self.stopped.set()
         with self._lock:
             try:

@@ -7,7 +7,7 @@ from sts_jax.hardware.shots import LightError, Pair
 
 
 class Background:
-    """A thread that takes pairs and keeps the newest one."""
+    """A thread that takes pairs of a visual and a tactile image continuously, and keeps the newest pair."""
 
     def __init__(self, take: Callable[[], Pair], interrupt: Callable[[], None]):
         """Start the thread.
@@ -40,19 +40,27 @@ class Background:
                 self._changed.notify_all()
 
     def latest(self) -> Pair | None:
-        """Return the newest pair, or None before the first pair. Raises the error with which the thread has ended."""
+        """Return the newest pair, or None if no pair has been taken yet.
+
+        If an error has ended the thread, this method raises the same error.
+        """
         with self._changed:
             self._raise()
             return self._pair
 
     def next(self, limit_s: float) -> Pair:
-        """Wait for a pair that this method has not returned yet, and return the newest one.
+        """Wait until there is a pair that this method has not returned yet, and return the newest pair.
+
+        If an error has ended the thread, this method raises the same error.
 
         Args:
             limit_s: Longest wait (s).
 
+        Returns:
+            The newest pair.
+
         Raises:
-            LightError: No pair was taken in time. The error with which the thread has ended is raised too.
+            LightError: No pair was taken in time.
         """
         with self._changed:
             if not self._changed.wait_for(lambda: self._fresh or self._error is not None, limit_s):

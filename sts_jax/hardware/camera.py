@@ -26,9 +26,11 @@ class Camera:
         frame = camera.read()
     ```
 
-    A thread fetches the frames continuously, so no frame grows old in the driver. If the device is lost, the thread
-    opens it again under the same path or URL, and later frames have a larger `epoch`. Threads may share a camera.
-    `async_read` then returns each frame to only one of the threads.
+    A background thread fetches the frames continuously, so that no old frames collect in the driver. If a device or
+    stream is lost, this thread opens it again under the same path or URL. The `epoch` of a frame is the number of its
+    connection, so it increases at each reconnection.
+
+    Several threads may use one camera. `async_read` then returns each frame to only one of them.
     """
 
     def __init__(self, config: CameraConfig):
@@ -41,14 +43,14 @@ class Camera:
         self._grabber: Grabber | None = None
 
     def connect(self, warmup_s: float = 1.0) -> "Camera":
-        """Open the camera, let its automatic controls settle, and lock them.
+        """Open the camera, and wait until its automatic exposure and white balance have settled.
 
-        The call lasts at most `warmup_s` plus four times `CameraConfig.timeout_s`. A video file starts at its first
-        frame, without a warm-up.
+        The settings of a device are then locked if `CameraConfig.lock` is True. The call lasts at most `warmup_s` plus
+        four times `CameraConfig.timeout_s`. A video file starts at its first frame, without a wait.
 
         Args:
-            warmup_s: Time for exposure and white balance to settle (s). The frames of this time are discarded if the
-                settings of a device are locked.
+            warmup_s: Time for the automatic exposure and white balance to settle (s). If the settings of a device are
+                locked afterwards, the frames that arrive during this time are discarded.
 
         Returns:
             This camera.
@@ -94,11 +96,11 @@ class Camera:
     def disconnect(self) -> None:
         """Close the camera. Does nothing if the camera is not connected.
 
-        The call lasts at most `CameraConfig.timeout_s` plus a second. If the driver does not return in this time, the
-        thread closes the camera later.
+        The call lasts at most `CameraConfig.timeout_s` plus 1 s. If the camera's driver does not respond in this time,
+        a background thread closes the camera as soon as the driver responds.
 
         Warns:
-            UserWarning: The driver has not returned in time.
+            UserWarning: The driver did not respond in time.
         """
         grabber, self._grabber = self._grabber, None
         if grabber is not None and not grabber.stop():
@@ -109,17 +111,23 @@ class Camera:
 
     @property
     def is_connected(self) -> bool:
-        """True if frames can be expected. False while the camera is lost, and after the end of a video file."""
+        """True if the camera is open and can deliver frames.
+
+        False before `connect`, while the camera is lost, and after an error or the end of a video file.
+        """
         return self._grabber is not None and self._grabber.running
 
     @property
     def statistics(self) -> CameraStatistics:
-        """Counts of frames, losses and other events since `connect`."""
+        """Counts of frames, lost connections and other events since `connect`."""
         return self._connected().statistics
 
     @property
     def refused(self) -> tuple[str, ...]:
-        """The settings that the driver did not accept when the camera was last opened, one text each."""
+        """Descriptions of the settings that the driver did not accept when the camera was last opened.
+
+        An example is "FPS: asked for 60, found 30".
+        """
         return tuple(self._connected().refused)
 
     @property
@@ -148,14 +156,16 @@ class Camera:
             support a manual exposure.
 
         Raises:
-            CameraError: The source is a stream or a file, the camera is not connected, or no frame has arrived in time.
+            CameraError: The source is a stream or a file, the camera is not connected, or no frame has arrived within
+                `CameraConfig.timeout_s`.
             ValueError: `exposure` is not positive.
         """
         if not exposure > 0:
             raise ValueError(f"exposure must be > 0, got {exposure}")
         if self.config.kind != "device":
+            remedy = "set it at the server of the stream" if self.config.kind == "stream" else "use a device"
             raise CameraError(
-                f"{self.config.name} is not a device, so its exposure cannot be set from here: set it at its server."
+                f"{self.config.name} is a {self.config.kind}, but only the exposure of a device can be set: {remedy}."
             )
         return self._connected().set_exposure(exposure, self.config.timeout_s)
 

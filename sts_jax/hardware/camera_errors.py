@@ -34,7 +34,7 @@ class CameraLostError(CameraError):
 
 
 class FrameSizeError(CameraError):
-    """The camera's frames have another size than the configuration or the earlier frames."""
+    """The camera's frames have another size than the configuration requests, or than the earlier frames."""
 
 
 class FrozenCameraError(CameraError):

@@ -34,8 +34,9 @@ _RATE_TOLERANCE = 0.02  # share by which a driver may round the frame rate
 class Capture:
     """A device, a stream or a video file that is open for reading.
 
-    FFmpeg rescales frames whose size has changed, and OpenCV does not report the change. The frames of motion JPEG
-    streams are therefore decoded by this class. It keeps the size of each frame, and rejects incomplete frames.
+    If the size of a stream's frames changes, FFmpeg rescales the frames, and OpenCV does not report the change. This
+    class therefore decodes the frames of motion JPEG streams itself. Decoding keeps the size of each frame and rejects
+    incomplete frames.
     """
 
     def __init__(self, config: CameraConfig):
@@ -99,7 +100,10 @@ class Capture:
         return rate if rate > 0 and np.isfinite(rate) else None
 
     def stamp(self) -> float | None:
-        """Return the time that a device's driver gave the last frame (s, without jitter), or None if it gives none."""
+        """Return the driver's time stamp of the last frame (s), or None if there is none.
+
+        The stamp has no jitter, unlike the time at which the frame reaches this process. Only devices have stamps.
+        """
         time_ms = self.properties.get(cv2.CAP_PROP_POS_MSEC) if self._config.kind == "device" else 0.0
         return time_ms / 1000 if time_ms > 0 else None
 
@@ -147,7 +151,13 @@ def _open(config: CameraConfig) -> cv2.VideoCapture:
 
 
 def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
-    """Return the error for frames of another size (pixels) than the configuration's."""
+    """Return the error for frames whose size is not the size that the configuration requests.
+
+    Args:
+        config: Configuration of the camera.
+        width: Width of the frames that the camera sends (pixels).
+        height: Height of these frames (pixels).
+    """
     if config.kind == "device":
         path = devices.device_path(config.target)
         remedy = (

@@ -37,15 +37,16 @@ class FoundCamera:
 def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
     """List the V4L2 cameras of this machine. The list is empty on other systems than Linux.
 
-    The source of a camera is its path in `/dev/v4l/by-id`, which contains the serial number. If there is no such path,
-    the source is the path of its USB port (`/dev/v4l/by-path`), or else its number (`/dev/video0`). Devices that
-    deliver no images, such as those for a camera's metadata, are left out.
+    The `source` of a camera is its path in `/dev/v4l/by-id`, which contains the serial number. If there is no such
+    path, the source is its path in `/dev/v4l/by-path`, which contains the USB port. If both are missing, the source is
+    the path of the device itself, such as `/dev/video0`. Devices that deliver no images, such as those for a camera's
+    metadata, are left out.
 
     Args:
-        root: Folder that contains `dev` and `sys`. Tests use another one than `/`.
+        root: Folder that contains the system's folders `dev` and `sys`. Only tests change it.
 
     Returns:
-        The cameras in the order of their numbers.
+        The cameras, in the order of the numbers in `/dev/video0`, `/dev/video1` and so on.
     """
     names: dict[Path, Path] = {}
     for folder in ("by-id", "by-path"):
@@ -61,7 +62,12 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
 
 
 def stable_path(device: str, root: Path = Path("/")) -> str:
-    """Return the path of a device in `/dev/v4l/by-id`, or the given path if there is none."""
+    """Return the path of a device in `/dev/v4l/by-id`, or `device` if this folder does not list the device.
+
+    Args:
+        device: Path of the device, such as `/dev/video0`.
+        root: Folder that contains the system's folder `dev`. Only tests change it.
+    """
     target = Path(device).resolve()
     for link in sorted((root / "dev/v4l/by-id").glob("*")):
         if link.resolve() == target:

@@ -15,7 +15,10 @@ _TEXTS = {
 
 
 class EmulatedController:
-    """An emulated LED controller. It is not connected to a port, and it is not thread-safe."""
+    """An emulated LED controller, which replaces the real one where there is no hardware.
+
+    The caller passes the request bytes and the time to `receive`, so no serial port is needed. Not thread-safe.
+    """
 
     def __init__(self, *, now_s: float = 0.0, boot: int = 1, serial_number: str = "EMULATED"):
         """Boot the controller with all lights off.
@@ -39,7 +42,7 @@ class EmulatedController:
 
         Args:
             data: Any number of bytes. An incomplete line is kept until the rest of the line arrives.
-            now_s: Current time (s).
+            now_s: Current time on the clock of the constructor's `now_s` (s).
 
         Returns:
             The lines that the controller sends, or no bytes.
@@ -50,13 +53,13 @@ class EmulatedController:
         return sent + b"".join(self._answer(line + b"\n", now_s) for line in lines if line)
 
     def tick(self, now_s: float) -> bytes:
-        """Turn the lights off if the watchdog's period has passed without a valid request.
+        """Turn the lights off if no valid request has arrived for the watchdog's period, `watch_ms`.
 
         Args:
-            now_s: Current time (s).
+            now_s: Current time on the clock of the constructor's `now_s` (s).
 
         Returns:
-            The line that reports this, or no bytes if the watchdog did nothing.
+            The line that reports that the lights were turned off, or no bytes if they were not.
         """
         if self.levels == protocol.DARK or now_s - self._valid_s < self.watch_ms / 1000:
             return b""
@@ -80,7 +83,11 @@ class EmulatedController:
         match request:
             case protocol.Hello(sequence, version):
                 if version != protocol.VERSION:
-                    raise protocol.ProtocolError(f"version {version}", protocol.Code.VERSION, sequence)
+                    raise protocol.ProtocolError(
+                        f"the version of the protocol must be {protocol.VERSION}, got {version}",
+                        protocol.Code.VERSION,
+                        sequence,
+                    )
                 names = "emulated", "emulation", self._serial_number
                 return protocol.Controller(sequence, protocol.VERSION, *names, channels=protocol.CHANNELS)
             case protocol.Set(sequence, levels):

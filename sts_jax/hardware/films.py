@@ -30,7 +30,10 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 
 class Still(NamedTuple):
-    """The description of a recorded image, without its pixels. All times are on the clock of the recording."""
+    """The description of a recorded image, without its pixels.
+
+    All times of a film are on the same clock, whose zero is arbitrary.
+    """
 
     stream: Stream
     time_s: float  # arrival of the frame (s)
@@ -117,8 +120,8 @@ class RecordedFilm(Film):
             self._files[stream] = path.open("rb")
         except OSError as error:
             raise type(error)(
-                f"{path} cannot be read ({error}), but {FRAMES} lists {len(places)} images of it. Check "
-                "the file, or copy the recording again."
+                f"{path} cannot be read ({error}), but {FRAMES} lists {len(places)} images of this file. Check the "
+                "file, or copy the recording again."
             ) from error
         size = path.stat().st_size
         there = sum(place.offset + place.size <= size for place in places)
@@ -143,8 +146,8 @@ class RecordedFilm(Film):
         data = file.read(place.size)
         if zlib.crc32(data) != place.crc32:
             raise DamagedFileError(
-                f"image {index + 1} of {self._folder} is damaged, because its checksum differs: {_AGAIN}, or remove "
-                f"line {index + 1} of {FRAMES}."
+                f"image {index + 1} of {self._folder} is damaged, because its checksum differs from the one in "
+                f"{FRAMES}: {_AGAIN}, or remove line {index + 1} of {FRAMES}."
             )
         image = cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
         return np.asarray(image)
@@ -182,20 +185,21 @@ def _lines(path: Path) -> list[tuple[Still, _Place]]:
 
 def _still(values: dict[str, Any]) -> Still:
     if values["stream"] not in ("visual", "tactile"):
-        raise ValueError(f"stream is {values['stream']!r}")
+        raise ValueError(f"stream must be 'visual' or 'tactile', got {values['stream']!r}")
     lit = Lit(**{**values["before"], "levels": tuple(values["before"]["levels"])})
     still = Still(
         values["stream"], float(values["time_s"]), values["sequence"], values["epoch"], lit, float(values["until_s"])
     )
     if not math.isfinite(still.time_s):
-        raise ValueError(f"time_s is {still.time_s}")
+        raise ValueError(f"time_s must be finite, got {still.time_s}")
     return still
 
 
 class VideoFilm(Film):
-    """The images of two video files, one per stream. Frames of the same number show the same time.
+    """The images of two video files, one for each stream. Frames with the same number have the same time.
 
-    A video file has no proof of the lights. `before` and `until_s` therefore have NaN as times.
+    A video file does not record when the lights were switched. In each `Still`, `until_s` and the times in `before` are
+    therefore NaN.
     """
 
     def __init__(self, visual: str | os.PathLike, tactile: str | os.PathLike, fps: float | None = None):

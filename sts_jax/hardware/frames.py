@@ -20,13 +20,13 @@ _MADE_UP = 4  # frames after the missing ones by which a gap may be corrected. M
 class Captured:
     """One frame of a camera.
 
-    A `sequence` number that is missing between two frames belongs to a frame that arrived but was not returned. It was
-    damaged, for example, or replaced by a newer frame.
+    Each frame that arrives has the next `sequence` number. If a number is missing between two returned frames, a frame
+    arrived but was not returned, for example because it was damaged or replaced by a newer frame.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, read-only, row 0 at the top
     time_s: float  # arrival of the frame on the clock `time.monotonic` (s), before it was decoded
-    sequence: int  # number of the frame since `connect`, starting at 0
+    sequence: int  # number of the frame since `Camera.connect`, starting at 0
     epoch: int  # number of the connection, starting at 0. It increases when a lost device is found again
     dropped: int  # frames lost just before this frame, estimated from the times, or skipped in a video file
     repeats: int  # number of frames just before this frame that are identical to it
@@ -36,7 +36,7 @@ class Captured:
 
 @dataclasses.dataclass(frozen=True)
 class CameraStatistics:
-    """Counts of frames, losses and other events since `connect`."""
+    """Counts of frames, lost connections and other events since `Camera.connect`."""
 
     frames: int = 0  # frames that were complete, of the right size and not frozen
     dropped: int = 0  # frames that camera or driver lost, estimated from the times, or frames skipped in a video file
@@ -70,11 +70,11 @@ class _Gap(NamedTuple):
 
 
 class Pace:
-    """Measures the period of the frames and estimates how many frames are missing.
+    """Measures the period of a camera's frames, and estimates how many frames were lost.
 
-    An interval of n + 1 periods between two frames counts as n lost frames. If the next frames follow in quick
-    succession, the frames were late and not lost, and `dropped` is corrected. The number that `arrived` has returned
-    before is not corrected.
+    After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the total.
+    If the next frames arrive early, the missing frames were only late, and `dropped` is reduced again. The numbers that
+    `arrived` returned before this correction remain too large.
     """
 
     def __init__(self, nominal: float | None):
@@ -99,7 +99,11 @@ class Pace:
         """Record a frame, and return the estimated number of frames that were lost just before it.
 
         Args:
-            time_s: Time of the frame (s). The first frame and a frame without progress of time return 0.
+            time_s: Time of the frame (s).
+
+        Returns:
+            Estimated number of lost frames. It is 0 for the first frame, while the period is unknown, and if `time_s`
+            is not later than the time of the frame before.
         """
         last, self._last = self._last, time_s
         if last is None or time_s <= last:
@@ -126,5 +130,5 @@ class Pace:
         self._gap = gap._replace(frames=frames, missing=missing) if missing and frames < gap.limit else None
 
     def interrupted(self) -> None:
-        """Forget the last frame. Call this after an interruption of the connection."""
+        """Ignore the interval before the next frame. Call this after an interruption of the connection."""
         self._last, self._gap, self.delayed = None, None, False

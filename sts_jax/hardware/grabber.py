@@ -39,7 +39,10 @@ class _Problem:
 
 
 class Grabber:
-    """The thread of one connection. Only this thread opens, reads and closes the source, and locks the camera."""
+    """The thread that fetches the frames of a camera, from `Camera.connect` to `Camera.disconnect`.
+
+    Only this thread opens, reads and closes the source, and locks the camera against use by others.
+    """
 
     def __init__(self, config: CameraConfig):
         self._config = config
@@ -66,7 +69,7 @@ class Grabber:
             timeout_s: Longest wait (s).
 
         Raises:
-            CameraError: The source cannot be opened, or sends no frame in time. The thread is stopped.
+            CameraError: The source cannot be opened, or sends no frame in time. In both cases the thread is stopped.
         """
         self._thread.start()
         atexit.register(self.stop)  # a thread that is inside OpenCV must not outlive the interpreter
@@ -85,10 +88,10 @@ class Grabber:
             )
 
     def stop(self) -> bool:
-        """Stop the thread, and return whether it has ended.
+        """Stop the thread, wait for its end, and return whether it has ended.
 
-        A driver that does not return within `timeout_s` and a second delays the end. The thread then ends by itself as
-        soon as the driver returns.
+        The wait lasts at most `CameraConfig.timeout_s` plus 1 s. If the camera's driver does not respond in this time,
+        the thread has not ended yet. It then ends as soon as the driver responds.
         """
         atexit.unregister(self.stop)
         self._stop.set()
@@ -98,13 +101,15 @@ class Grabber:
         return not self._thread.is_alive()
 
     def lock_settings(self, timeout_s: float) -> list[str]:
-        """Lock the settings at their current values, and discard all earlier frames.
+        """Lock the settings of the device at their current values, and discard all earlier frames.
+
+        The thread locks the settings when the next frame has arrived.
 
         Args:
-            timeout_s: Longest wait for the next frame, after which the settings are locked (s).
+            timeout_s: Longest wait for this frame (s).
 
         Returns:
-            The settings that the driver refused, one text each.
+            Descriptions of the settings that the driver did not accept.
 
         Raises:
             CameraError: No frame has arrived in time.
@@ -121,11 +126,12 @@ class Grabber:
         """Set the exposure between two frames.
 
         Args:
-            value: Exposure in the driver's unit.
-            timeout_s: Longest wait for the next frame (s), also while the camera is lost.
+            value: Exposure in the driver's unit (V4L2: 0.1 ms).
+            timeout_s: Longest wait for the next frame (s). If the camera is lost, the wait includes the time until it
+                is found again.
 
         Returns:
-            The exposure that the device has now, or None if the driver does not set it.
+            The exposure that the device has now, or None if the driver does not support a manual exposure.
 
         Raises:
             CameraError: No frame has arrived in time.
@@ -143,7 +149,7 @@ class Grabber:
 
     @property
     def held(self) -> dict[str, float]:
-        """The values of the locked settings, by field of `CameraConfig`."""
+        """The values of the locked settings, by field name of `CameraConfig`."""
         with self._changed:
             return dict(self._held)
 
@@ -156,7 +162,7 @@ class Grabber:
 
     @property
     def statistics(self) -> CameraStatistics:
-        """Counts since `connect`."""
+        """Counts of frames, lost connections and other events since `Camera.connect`."""
         with self._changed:
             return dataclasses.replace(self._counts, rate=self._pace.rate)
 
@@ -165,7 +171,10 @@ class Grabber:
 
         Args:
             timeout_s: Longest wait (s).
-            exposed_now: Discard frames that may have been exposed before this call.
+            exposed_now: True to discard the frames that may have been exposed before this call.
+
+        Returns:
+            The frame.
 
         Raises:
             CameraError: There is no frame, for the reasons that `Camera.read` lists.
@@ -190,15 +199,19 @@ class Grabber:
                     raise self._problem()
                 if self._epoch != epoch and not lost_before:
                     raise CameraLostError(
-                        f"{self._config.name} was lost during the call and found again: repeat the call. Its frames "
-                        f"now have epoch={self._epoch}."
+                        f"{self._config.name} was lost during the call and found again: repeat the call. The frames of "
+                        f"the new connection have epoch={self._epoch}."
                     )
                 if remaining <= 0:
                     raise self._timeout(timeout_s)
                 self._changed.wait(remaining)
 
     def latest(self) -> Captured:
-        """Return the newest frame. Raises the reason why there are no frames at present."""
+        """Return the newest frame. After the end of a video file, this is its last frame.
+
+        Raises:
+            CameraError: There are no frames at present, for the reasons that `Camera.read` lists.
+        """
         with self._changed:
             ended = self._problem is not None and self._problem.error is EndOfVideoError
             if self._problem is not None and not (ended and self._newest is not None):

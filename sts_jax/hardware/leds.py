@@ -26,7 +26,7 @@ class Lit:
     The levels were applied at some time between `sent_s` and `acknowledged_s`, both on the clock `time.monotonic`.
     """
 
-    levels: protocol.Levels  # duty cycles of the channels, 0 to 255
+    levels: protocol.Levels  # duty cycles of the four light channels, 0 to 255
     counter: int  # number of changes of the levels since the controller booted
     boot: int  # number of the controller's boot, 0 to 65535. The controller counts its boots
     sent_s: float  # time just before the request was first sent (s)
@@ -51,16 +51,17 @@ class Leds:
         assert leds.ping().unchanged_since(before)
     ```
 
-    Several threads may use one `Leds`. The controller has a watchdog: it turns the lights off if no request arrives for
-    `watchdog_ms`. A background thread therefore sends a request whenever a third of this period has passed without one,
-    so the lights stay on while this process runs. If the process ends or hangs, the watchdog turns them off.
+    Several threads may use one `Leds`. The controller has a watchdog, which turns the lights off if no request arrives
+    for the time `watchdog_ms` (an argument of `connect`). A background thread therefore sends a request whenever a
+    third of this time has passed without one, so the lights stay on while this process runs. If the process ends or
+    hangs, the watchdog turns the lights off.
 
     A request is repeated with the same sequence number every 0.1 s until its answer arrives. The controller executes it
     only once. Damaged lines and answers to other requests are ignored.
 
-    A request takes at most `answer_s`, and 0.3 s more if the port accepts no bytes or sends bytes without end. The
-    first request after a restart of the controller takes at most twice that time. If another thread's request is in
-    progress, its time is added.
+    A request takes at most the time `answer_s` (an argument of `connect`), and 0.3 s more if the port accepts no bytes
+    or sends bytes without end. The first request after a restart of the controller takes at most twice as long. A
+    thread also waits while the request of another thread is in progress.
     """
 
     def __init__(self, port: str, *, baud: int, timeout_s: float, answer_s: float, watchdog_ms: int):
@@ -126,9 +127,9 @@ class Leds:
     def find(cls, serial_number: str, *, timeout_s: float = 5.0) -> "Leds":
         """Search the USB ports for the controller with a given serial number, and connect to it.
 
-        Only the controller itself can report this number. USB ports are therefore opened one after the other until the
-        controller is found, beginning with ports whose USB serial number is the same. Opening a port restarts most
-        boards.
+        The controller reports its serial number only through an open port. The USB ports are therefore opened one after
+        the other until the controller is found. Ports whose USB device has the same serial number come first. Opening a
+        port restarts most boards.
 
         Args:
             serial_number: Serial number of the controller, as `Leds.serial_number` returns it.
@@ -183,14 +184,15 @@ class Leds:
         """Set the lights and wait until the controller has applied the levels.
 
         Args:
-            levels: Duty cycles of the four channels, integers from 0 (off) to 255 (always on).
+            levels: Duty cycles of the four light channels, integers from 0 (off) to 255 (always on).
 
         Returns:
             The controller's answer, which contains the applied levels.
 
         Raises:
             ValueError: `levels` are not four integers from 0 to 255.
-            LedTimeoutError: No valid answer arrived within `answer_s`. It is unknown if the lights changed.
+            LedTimeoutError: No valid answer arrived within the `answer_s` of `connect`. It is unknown whether the
+                lights changed.
             DisconnectedError: The port vanished or is closed.
             LedError: The controller refused the request or applied other levels.
         """
@@ -210,7 +212,7 @@ class Leds:
             The controller's answer.
 
         Raises:
-            LedTimeoutError: No valid answer arrived within `answer_s`.
+            LedTimeoutError: No valid answer arrived within the `answer_s` of `connect`.
             DisconnectedError: The port vanished or is closed.
             LedError: The controller refused the request.
         """
@@ -219,8 +221,8 @@ class Leds:
     def close(self) -> None:
         """Turn the lights off and close the port.
 
-        If the controller does not answer within `answer_s`, the port is closed anyway. The controller's watchdog then
-        turns the lights off. Closing twice is allowed.
+        If the controller does not answer within the `answer_s` of `connect`, the port is closed anyway. The
+        controller's watchdog then turns the lights off. Closing twice is allowed.
         """
         if not self._open:
             return
@@ -244,8 +246,8 @@ class Leds:
         Requests of other threads raise `DisconnectedError` meanwhile.
 
         Args:
-            limit_s: Time after which no further attempt begins (s). An attempt takes at most `timeout_s` plus two times
-                `answer_s` for each port.
+            limit_s: Time after which no further attempt begins (s). For each port, an attempt takes at most the
+                `timeout_s` plus two times the `answer_s` of `connect`.
 
         Raises:
             DisconnectedError: The controller was not found. The message lists the ports that were tried.
@@ -367,7 +369,7 @@ def _checked(levels: Sequence[int]) -> protocol.Levels:
     try:
         found = tuple(operator.index(level) for level in levels)
     except TypeError as error:
-        raise ValueError(f"levels must be {protocol.CHANNELS} integers, got {levels!r}") from error
+        raise ValueError(f"levels must be {protocol.CHANNELS} integers in 0..255, got {levels!r}") from error
     if len(found) != protocol.CHANNELS or not all(0 <= level <= 255 for level in found):
         raise ValueError(f"levels must be {protocol.CHANNELS} integers in 0..255, got {levels!r}")
     first, second, third, fourth = found

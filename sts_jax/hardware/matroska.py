@@ -9,12 +9,12 @@ _TIMESTAMP_NS = 1_000_000  # unit of the times in the file (ns)
 
 
 def header(width: int, height: int, encoding: str) -> bytes:
-    """Return the first bytes of a file with one video track.
+    """Return the first bytes of a Matroska video file with one video track.
 
     Args:
         width: Width of the images (pixels).
         height: Height of the images (pixels).
-        encoding: Encoding of the images, a key of `CODECS`.
+        encoding: Encoding of the images, "png" or "jpeg".
     """
     # Versions of EBML, length of the longest identifier and of the longest size field (bytes)
     ebml = _uint(0x4286, 1) + _uint(0x42F7, 1) + _uint(0x42F2, 4) + _uint(0x42F3, 8)
@@ -30,7 +30,9 @@ def header(width: int, height: int, encoding: str) -> bytes:
 
 
 def cluster(time_ms: int, image: bytes) -> bytes:
-    """Return the bytes of one image in the file. They end with the encoded image.
+    """Return the bytes that append one image to a Matroska video file, called a cluster in this format.
+
+    The last bytes are the encoded image.
 
     Args:
         time_ms: Time of the image since the start of the file (ms).

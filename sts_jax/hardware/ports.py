@@ -80,6 +80,9 @@ def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
         name: Name of the device, or a URL of pyserial.
         baud: Rate of the serial line (baud).
 
+    Returns:
+        The open port.
+
     Raises:
         PortNotFoundError: There is no such port.
         PortPermissionError: The user may not open the port.
@@ -135,7 +138,10 @@ def _group(name: str) -> str:
 
 
 def users_of(name: str) -> list[str]:
-    """The processes that have opened a device and that this user may see. The list is empty except on Linux."""
+    """Return the processes that have opened a device, as texts such as "process 123 (python)".
+
+    Only processes that this user may see are listed. The list is empty on other systems than Linux.
+    """
     target, users, own = os.path.realpath(name), [], False
     for folder in Path("/proc").glob("[0-9]*/fd"):
         with contextlib.suppress(OSError):

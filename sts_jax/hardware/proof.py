@@ -33,10 +33,11 @@ _GRACE_S = 0.2  # s by which the wait for a frame may exceed the deadline, so th
 
 
 class ProvenFrames:
-    """Switches the lights of a connected sensor, and selects frames that show the lights of one stream.
+    """Switches the lights of a connected sensor, and selects frames that are proven to show the lights of one stream.
 
-    The attributes describe the last switch of the lights: the controller's answer, the last frame before the switch,
-    and the number of frames that show its effect. One thread takes the images. Other threads may only call `stop`.
+    The lights are off in the visual stream and on in the tactile stream. For the last switch of the lights, the object
+    keeps the controller's answer, the last frame before the switch, and the number of frames that show its effect. Only
+    one thread may take images. Other threads may only call `stop`.
     """
 
     def __init__(
@@ -86,15 +87,20 @@ class ProvenFrames:
         self._stopping = False
 
     def measure_settling(self, switches: int, watch_s: float) -> Settling:
-        """Measure the settling times in up to three attempts, and use them from now on.
+        """Measure the settling times, and use them from now on.
+
+        A settling time is the time after a switch of the lights during which frames may still show the former lights.
 
         Args:
-            switches: Number of switches in each direction.
+            switches: Number of switches of the lights in each direction, off to on and on to off.
             watch_s: Time for which frames are collected after the first switch in each direction (s).
+
+        Returns:
+            The settling times.
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image was still changing at the end of each attempt.
+            LightError: The image was still changing at the end of this collection, in each of three attempts.
         """
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(LightError):
@@ -126,7 +132,16 @@ class ProvenFrames:
         self._effect, self._looks = lit - dark, {"visual": dark, "tactile": lit}
 
     def see_both(self, settling: Settling) -> None:
-        """Use known settling times from now on, and take one image of each stream to compare later frames with."""
+        """Use known settling times from now on, and take one image of each stream.
+
+        Later frames are compared with these images to recognise which lights they show.
+
+        Args:
+            settling: Times for which frames are discarded after a switch of the lights.
+
+        Raises:
+            NoContrastError: The lights do not change the image.
+        """
         lit = self._watched("tactile", 2 * settling.tactile_s).thumbnails[-1]
         dark = self._watched("visual", 2 * settling.visual_s).thumbnails[-1]
         self._begin(settling, dark, lit)
@@ -143,12 +158,16 @@ class ProvenFrames:
         return found
 
     def pair(self, deadline: float) -> Pair:
-        """Take an image of each stream. Both arrive after the call.
+        """Take an image of each stream. Both images arrive after the call.
 
-        The first image is of the stream for which the lights are already set.
+        The stream for which the lights were set last comes first, so a pair needs only one switch of the lights.
 
         Args:
-            deadline: Latest time on the clock `time.monotonic` (s). A reconnection extends it.
+            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the time
+                of the reconnection is added.
+
+        Returns:
+            The two images.
 
         Raises:
             LightError, LedError, CameraError: The causes are those of `STS.read`.
@@ -166,12 +185,18 @@ class ProvenFrames:
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
 
+        After the frame, the controller must confirm that the lights did not change. The switch from the visual to the
+        tactile stream, requested by `then`, includes this confirmation. In all other cases, one more request is sent.
+
         Args:
-            stream: The stream.
-            deadline: Latest time on the clock `time.monotonic` (s). A reconnection extends it.
-            after_s: Earliest arrival of the frame on the same clock (s).
-            then: Stream to which the lights are switched after the frame. The controller's answer to a switch from
-                visual to tactile proves the image, which saves a request. None: the lights stay.
+            stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).
+            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the time
+                of the reconnection is added.
+            after_s: Earliest arrival time of the frame on the same clock (s).
+            then: Stream for which the lights are set after the frame. None: the lights do not change.
+
+        Returns:
+            The image.
 
         Raises:
             LightError, LedError, CameraError: The causes are those of `STS.read`.
@@ -236,7 +261,7 @@ class ProvenFrames:
                     self._watched("tactile" if stream == "visual" else "visual", settled_s)
                     lit = self._set(stream)
                 checked_s = time.monotonic()
-        raise LightError("the thread that takes pairs was stopped.")
+        raise LightError("the taking of images was stopped by stop(): call resume() before the next image.")
 
     def _light_error(self, stream: Stream) -> LightError:
         remedy = "check that the LEDs light up, that the camera's exposure is locked, and that enough frames arrive"
@@ -290,8 +315,8 @@ class ProvenFrames:
         """Set the exposure. It is set before the lights, so that the settling time covers both changes."""
         if self._camera.set_exposure(exposure) is None:
             raise CameraError(
-                f"the driver of {self._camera.config.name} does not support a manual exposure, so it cannot be set to "
-                f"{exposure:g}: pass exposures=None."
+                f"the driver of {self._camera.config.name} does not support a manual exposure, so the exposure cannot "
+                f"be set to {exposure:g}: pass exposures=None."
             )
 
     def _proof(self, before: Lit, then: Stream | None) -> float | None:

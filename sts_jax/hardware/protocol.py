@@ -51,7 +51,7 @@ class ProtocolError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Hello:
-    """Request for the description of the controller, which is a `Controller`."""
+    """Request for the description of the controller. The reply is a `Controller`."""
 
     sequence: int
     version: int = VERSION  # version of the protocol that the host uses
@@ -59,7 +59,7 @@ class Hello:
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """Request to set the levels of the lights."""
+    """Request to set the levels of the lights. The reply is a `State`."""
 
     sequence: int
     levels: Levels  # duty cycles of the channels, 0 (off) to 255 (always on)
@@ -67,14 +67,17 @@ class Set:
 
 @dataclasses.dataclass(frozen=True)
 class Ping:
-    """Request for the state of the lights. Like any request, it restarts the watchdog's period."""
+    """Request for the state of the lights. The reply is a `State`.
+
+    Like any request, it restarts the watchdog, which turns the lights off after a time without requests.
+    """
 
     sequence: int
 
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """Request to set the watchdog's period."""
+    """Request to set the watchdog's period: the time without requests after which the lights are turned off."""
 
     sequence: int
     period_ms: int  # time without requests after which the lights go off, 100 to 10000 (ms)
@@ -105,7 +108,7 @@ class State:
 
 @dataclasses.dataclass(frozen=True)
 class Watching:
-    """Reply to `Watch`: the watchdog's period."""
+    """Reply to `Watch`: the controller will turn the lights off after `period_ms` without requests."""
 
     sequence: int
     period_ms: int  # time without requests after which the lights go off (ms)
@@ -113,7 +116,7 @@ class Watching:
 
 @dataclasses.dataclass(frozen=True)
 class Refused:
-    """Reply to a request that was not executed."""
+    """Reply to a request that the controller did not execute, with the reason."""
 
     sequence: int  # 0 if the controller could not read the request's sequence number
     code: Code  # reason for the refusal
@@ -165,8 +168,8 @@ def decode(line: bytes) -> str:
         line: The whole line, with its newline.
 
     Raises:
-        ProtocolError: The line is too long, contains other bytes than printable ASCII, lacks the checksum or the
-            newline, or its checksum differs.
+        ProtocolError: The line is longer than `LONGEST_LINE`, contains other bytes than printable ASCII, lacks the
+            checksum or the newline, or has a wrong checksum.
     """
     if len(line) > LONGEST_LINE:
         raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}", Code.LENGTH)
@@ -176,7 +179,8 @@ def decode(line: bytes) -> str:
     text, digits = found.groups()
     if int(digits, 16) != checksum(text):
         raise ProtocolError(
-            f"the checksum of the text is {checksum(text):04X}, but the line has {digits.decode()}: {line!r}"
+            f"the checksum of the text is {checksum(text):04X}, but the line has {digits.decode()}: {line!r}. Send the "
+            "line again, because it was probably damaged on its way."
         )
     return text.decode()
 
@@ -208,14 +212,16 @@ def decode_request(line: bytes) -> Request:
         line: The whole line, with its checksum and newline.
 
     Raises:
-        ProtocolError: The line is not a valid request. The error has the code and the sequence number of the reply
-            that a controller sends to such a line.
+        ProtocolError: The line is not a valid request. A controller answers such a line with a `Refused` reply. The
+            attributes `code` and `sequence` of the error are those of this reply.
     """
     text = decode(line)
     words = text.split(" ")
     sequence = _number(words[0], 1, LAST_SEQUENCE)
     if sequence is None:
-        raise ProtocolError(f"the sequence number must be in 1..{LAST_SEQUENCE}: {line!r}", Code.ARGUMENTS)
+        raise ProtocolError(
+            f"the sequence number must be in 1..{LAST_SEQUENCE}, got {words[0]!r} in the line {line!r}", Code.ARGUMENTS
+        )
     match words[1:]:
         case ["HELLO", version] if (number := _number(version, 0, 65535)) is not None:
             return Hello(sequence, number)
@@ -226,8 +232,16 @@ def decode_request(line: bytes) -> Request:
         case ["WATCH", period] if (number := _number(period, SHORTEST_WATCH_MS, LONGEST_WATCH_MS)) is not None:
             return Watch(sequence, number)
         case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
-            raise ProtocolError(f"arguments are missing, too many or out of range: {line!r}", Code.ARGUMENTS, sequence)
-    raise ProtocolError(f"unknown command: {line!r}", Code.COMMAND, sequence)
+            raise ProtocolError(
+                f"arguments are missing, too many or out of range in the line {line!r}: HELLO needs a version in "
+                f"0..65535, SET {CHANNELS} levels in 0..255, PING nothing, and WATCH a period in "
+                f"{SHORTEST_WATCH_MS}..{LONGEST_WATCH_MS} ms",
+                Code.ARGUMENTS,
+                sequence,
+            )
+    raise ProtocolError(
+        f"the command in the line {line!r} is unknown: it must be HELLO, SET, PING or WATCH", Code.COMMAND, sequence
+    )
 
 
 def encode_reply(reply: Reply) -> bytes:
@@ -265,7 +279,11 @@ def decode_reply(line: bytes) -> Reply:
     """
     found = _reply(decode(line).split(" "))
     if found is None:
-        raise ProtocolError(f"not a reply of the LED controller's protocol: {line!r}", Code.ARGUMENTS)
+        raise ProtocolError(
+            f"the line {line!r} is not a reply of the LED controller's protocol: docs/hardware/protocol.md defines the "
+            "replies",
+            Code.ARGUMENTS,
+        )
     return found
 
 

@@ -59,17 +59,18 @@ def asked(config: CameraConfig) -> dict[str, float]:
 def lock(
     capture: Properties, values: Mapping[str, float], *, current: bool = False
 ) -> tuple[dict[str, float], list[Refusal]]:
-    """Turn automatic controls off and set values, then read both back.
+    """Lock settings of a device: turn their automatic controls off, set their values, and check the result.
 
     Args:
         capture: Open device.
-        values: Values to set, by field name of `CameraConfig`.
-        current: Also lock exposure, white balance and focus at their current values if `values` does not contain them.
+        values: Values to set, by field name of `CameraConfig` (`exposure`, `gain`, `white_balance`, `focus`).
+        current: True to lock also exposure, white balance and focus at their current values if `values` does not
+            contain them.
 
     Returns:
-        The values that the device has now, by field name, and the refusals. A property that the device does not support
-        is a refusal only if a value was given for its setting, or if it controls exposure or white balance
-        automatically.
+        The values that the device has now, by field name, and a list of the properties that the driver did not set.
+        If the driver lacks a property, the list contains the property in two cases: `values` contains its setting, or
+        the property turns automatic exposure or automatic white balance on and off.
     """
     held: dict[str, float] = {}
     refused: list[Refusal] = []

@@ -22,7 +22,9 @@ class NoContrastError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Settling:
-    """Times for which frames are discarded after the controller has acknowledged a switch of the lights.
+    """Times for which frames are discarded after the LED controller has acknowledged a switch of the lights.
+
+    Frames that arrive during this time may still show the former lights.
 
     Raises:
         ValueError: A time is not between 0 and 60 s.
@@ -47,12 +49,19 @@ class Switch:
 
 
 def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
-    """Return the means of the 32 x 24 blocks of an image, 0 to 255."""
+    """Return a small copy of an image.
+
+    Args:
+        image: RGB image, 0 to 255.
+
+    Returns:
+        The mean colours of 24 rows of 32 blocks of the image, shape (24, 32, 3), 0 to 255.
+    """
     return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def difference(first: Thumbnail, second: Thumbnail) -> float:
-    """Return the mean absolute difference of two thumbnails (of 255)."""
+    """Return the mean absolute difference between the values of two thumbnails, 0 to 255."""
     return float(np.abs(first - second).mean())
 
 
@@ -60,10 +69,10 @@ def check_contrast(contrast: float) -> None:
     """Raise an error if the lights do not change the image.
 
     Args:
-        contrast: Mean difference of the images with the lights off and on (of 255).
+        contrast: Mean absolute difference between the images with the lights off and on, 0 to 255.
 
     Raises:
-        NoContrastError: The difference is too small.
+        NoContrastError: The difference is less than 2.
     """
     if contrast < _LEAST_CONTRAST:
         raise NoContrastError(
@@ -92,17 +101,18 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
     """Return how much of the effect of a switch of the lights an image shows.
 
-    The share is the median of `(look - before) / change` over the values on which the lights have a clear effect. An
-    object that moves in less than half of the view therefore has no influence.
+    The result is the median of `(look - before) / change` over the values that the switch changes clearly. Such a
+    change is at least 0.5 of 255, and at least a quarter of the median of all changes of 0.5 or more. An object that
+    moves in less than half of the view therefore has no influence.
 
     Args:
         look: Thumbnail of the image.
         before: Thumbnail of an image before the switch.
-        change: Difference of thumbnails that the switch causes, measured on earlier images.
+        change: Thumbnail after the switch minus thumbnail before it, measured on earlier images.
 
     Returns:
-        0 if the image shows the lights before the switch, 1 if it shows the lights after the switch. 0 if the lights
-        have no effect on any value.
+        0 if the image shows the lights before the switch, and 1 if it shows the lights after the switch. The result is
+        also 0 if the switch changes no value clearly.
     """
     effect = np.abs(change)
     visible = effect >= _VISIBLE
@@ -113,11 +123,12 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
 
 
 def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
-    """Return the settling times that the frames after several switches of the lights show.
+    """Compute the settling times from the frames after several switches of the lights.
 
-    A frame is settled if its share of the lights (`light_share`) differs by at most 0.02 from the share of the last
-    frame of its switch. The settling time is the largest delay of a frame that is not settled, plus one period of the
-    camera. The period is added because the switches sample only some phases of the exposure.
+    `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if this share differs
+    by at most 0.02 from the share of the last frame after the same switch. The delay of a frame is its time of arrival
+    after the controller's acknowledgement. The settling time is the largest delay of a frame that is not settled, plus
+    one period of the camera. The period is added because later switches can occur at other moments of the exposure.
 
     Args:
         on: Switches from off to on. The scene must be at rest.
@@ -139,7 +150,15 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 
 
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
-    """Return the delay of the last frame that is not settled (s), at least 0. `settling` has the criterion."""
+    """Return the delay of the last frame that is not settled (s), or 0 if there is none. The result is at least 0.
+
+    A frame is settled if its `light_share` differs by at most 0.02 from that of the last frame after the switch.
+
+    Args:
+        switch: The frames after a switch of the lights.
+        dark: Thumbnail with the lights off.
+        lit: Thumbnail with the lights on.
+    """
     shares = np.array([light_share(look, dark, lit) for look in switch.thumbnails])
     mixed = np.flatnonzero(np.abs(shares - shares[-1]) > _TOLERANCE)
     return max(float(switch.delays_s[mixed[-1]]), 0.0) if len(mixed) else 0.0

@@ -16,15 +16,15 @@ class LightError(RuntimeError):
 
 
 class NotStillError(TimeoutError):
-    """The visual stream still changed at the end of the wait."""
+    """The visual stream did not become still in time, because something in the view moved or changed."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Shot:
-    """An image of one stream.
+    """An image of one stream, with the times between which the lights did not change.
 
-    The lights did not change from `before.acknowledged_s` to `until_s`. The frame arrived between these times, and at
-    least the settling time after `before.acknowledged_s`.
+    The lights did not change from `before.acknowledged_s` to `until_s`, and the frame arrived between these times. It
+    also arrived at least one settling time after `before.acknowledged_s`, so it does not show the former lights.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only

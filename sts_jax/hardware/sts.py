@@ -53,13 +53,13 @@ class STS:
     the lights were in the state of its stream during the whole exposure. A frame of the camera must meet all of these
     conditions:
 
-    - It arrived later than the settling time after the controller had acknowledged the switch of the lights. Earlier
-      frames may show the former lights.
+    - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
+      lights. Earlier frames may show the former lights.
     - Two successive frames since the switch have shown the effect of the new lights.
     - The controller's next answer shows that the lights have not changed since the acknowledgement.
-    - It was not delayed by a stalled stream.
-    - It differs from the frame before, unless the camera's `frozen_after_s` is None.
-    - It is not black if the last image of the same stream was not black.
+    - It was not delayed. A delayed frame may have been exposed long before it arrived.
+    - It is not identical to the frame before. Identical frames are allowed if `CameraConfig.frozen_after_s` is None.
+    - It is not black. Black frames are allowed if the last image of the same stream was black, or if it is missing.
 
     All other frames are discarded. Only one thread may use a sensor at a time.
     """
@@ -128,7 +128,7 @@ class STS:
         """Make the sensor that a sensor file describes. `python -m experiments.commission` writes such files.
 
         ```python
-        with STS.from_file("bench") as sensor:
+        with STS.from_file("bench") as sensor:  # the folder "bench" contains the sensor file
             pair = sensor.read()
         ```
 
@@ -151,7 +151,7 @@ class STS:
         Raises:
             FileNotFoundError: There is no such file.
             OSError: The file cannot be read or is not JSON.
-            SensorFileError: The file is damaged or describes no device.
+            SensorFileError: The file is damaged, or has no description of a camera and lights.
             WrongDeviceError: The camera is not the one of the file. `connect` raises the same error if the controller
                 is not the one of the file.
             ValueError: A time is not positive and finite.
@@ -173,7 +173,10 @@ class STS:
 
     @property
     def device(self) -> Device | None:
-        """The device that the sensor file describes, or None if the sensor was not made by `from_file`."""
+        """The description of the camera, the lights and the lens in the sensor file.
+
+        None if the sensor was not made by `from_file`.
+        """
         return self._device
 
     @property
@@ -194,7 +197,7 @@ class STS:
 
     @property
     def levels(self) -> protocol.Levels:
-        """Duty cycles of the channels in the tactile stream, 0 to 255."""
+        """Duty cycles of the four light channels in images of the tactile stream, 0 (off) to 255 (always on)."""
         return self._levels
 
     @property
@@ -204,7 +207,7 @@ class STS:
 
     @property
     def settling(self) -> Settling:
-        """The settling times that are in use.
+        """The times for which frames are discarded after a switch of the lights.
 
         Raises:
             CameraNotConnectedError: No settling times were given, and `connect` has not measured them yet.
@@ -214,9 +217,11 @@ class STS:
         return self._settling
 
     def connect(self, warmup_s: float = 1.0) -> "STS":
-        """Open both devices, and measure the settling times unless they were given.
+        """Open the camera and the LED controller, and measure the settling times unless they were given.
 
-        The lights are switched on and off in any case, because later images are compared with one image of each stream.
+        A settling time is the time after a switch of the lights during which frames may still show the former lights.
+        Even if the settling times were given, the lights are switched on and off. This provides one image of each
+        stream, with which later images are compared.
 
         Args:
             warmup_s: Time for the camera's automatic exposure and white balance to settle before they are locked (s).
@@ -226,8 +231,8 @@ class STS:
 
         Raises:
             LedError: The controller cannot be opened, or does not answer. Subclasses name the cause.
-            CameraError: The camera cannot be opened, sends no frames, or does not accept `exposures`. Subclasses name
-                the cause.
+            CameraError: The camera cannot be opened, sends no frames, or does not accept the `exposures` that were
+                given. Subclasses name the cause.
             NoContrastError: The lights do not change the image.
             LightError: The settling times could not be measured, because the image keeps changing.
             WrongDeviceError: The controller is not the one of the sensor file.
@@ -271,19 +276,20 @@ class STS:
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take one image of each stream.
 
-        Both frames arrive after the call. A frame arrives at most the settling time after its exposure. The first image
-        is of the stream for which the lights are already set, so each pair needs only one switch of the lights.
+        Both frames arrive after the call. The first one may have been exposed before the call, but not earlier than one
+        settling time before its arrival. The stream for which the lights were set last comes first, so each pair needs
+        only one switch of the lights.
 
         Args:
-            timeout_ms: Longest wait for the pair (ms). None: two times `timeout_s`. A reconnection to the controller
-                extends the wait. The last request to the controller may exceed
+            timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
+                is lost meanwhile, the time of the reconnection is added. The last request to the controller may exceed
                 the limit.
 
         Returns:
             The two images.
 
         Raises:
-            LightError: No frame met the conditions in time.
+            LightError: No frame in time was proven to show the lights of its stream.
             LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
             CameraError: The sensor is not connected, or the camera sends no usable frames. `Camera.read` lists the
                 subclasses.
@@ -300,7 +306,7 @@ class STS:
         error, and the call after it starts a new thread.
 
         Args:
-            timeout_ms: Longest wait (ms). None: three times `timeout_s`.
+            timeout_ms: Longest wait (ms). None: three times the sensor's `timeout_s`.
 
         Returns:
             The two images.
@@ -363,16 +369,16 @@ class STS:
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
         """Wait until nothing moves in the visual stream.
 
-        Each image is reduced to the means of 32 x 24 blocks. The view is still if the images of `window_s` seconds
-        differ from the first of them by at most 6 of 255 in each block. If the image is noisy, a difference of 8 times
-        the median over all blocks is allowed.
+        Each image is divided into 32 x 24 blocks, and the mean colours of the blocks (0 to 255) are compared. The view
+        is still if no block differs by more than 6 from the first image of the last `window_s` seconds. For noisy
+        images, the limit is 8 times the median difference over all blocks, if this is larger than 6.
 
         Args:
             timeout_s: Longest time from the first image to the returned one (s).
             window_s: Time during which the view must not change (s).
 
         Returns:
-            The last image of this time.
+            The last image of the period in which the view was still.
 
         Raises:
             NotStillError: The view was not still for `window_s` within `timeout_s`.
@@ -389,9 +395,10 @@ class STS:
         several times in each direction, and the frames after each switch are compared.
 
         Args:
-            switches: Number of switches in each direction.
+            switches: Number of switches of the lights in each direction, off to on and on to off.
             watch_s: Time for which frames are collected after the first switch in each direction (s). It must be longer
-                than the settling times. The later switches use a shorter time, which follows from the first ones.
+                than the settling times. After the later switches, frames are collected for a shorter time, which is
+                computed from the frames after the first switches.
 
         Returns:
             The settling times.
@@ -450,8 +457,9 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
     """Return an endless iterator over the streams of successive images.
 
     Args:
-        duty: Share of tactile images, 0 to 1. The order keeps the share of the images so far as near to it as possible.
-        dwell: Number of successive images of one stream, >= 1.
+        duty: Share of tactile images, 0 to 1. After each group of `dwell` images, the share of all images so far is as
+            close to `duty` as possible.
+        dwell: Number of successive images of one stream in a group, >= 1.
 
     Returns:
         The iterator, whose items are "visual" or "tactile".
@@ -475,7 +483,7 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
 
 
 def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Shot:
-    """Return the first image before which the view has been still for `window_s`.
+    """Wait until the view has been still for `window_s` seconds, and return the last image of this period.
 
     `STS.wait_until_still` describes when a view is still.
 
@@ -501,20 +509,20 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"the view was not still for {window_s:g} s within {timeout_s:g} s: one block of the last image differs by "
-        f"{change:.0f} of 255 from an image before it (at most {allowed:.0f} counts as still). Keep the scene at rest, "
+        f"the view was not still for {window_s:g} s within {timeout_s:g} s. The last image and an image before it "
+        f"differ by up to {change:.0f} of 255 in one block (allowed: at most {allowed:.0f}). Keep the scene at rest, "
         "raise timeout_s, or check whether the light of the room changes."
     )
 
 
 def checked_levels(levels: Sequence[int]) -> protocol.Levels:
-    """Return the levels of the tactile stream as a tuple of four integers.
+    """Check the levels of the lights in the tactile stream, and return them as a tuple of four integers.
 
     Raises:
         ValueError: There are not four levels in 0 to 255, or all are 0.
     """
     values = tuple(int(level) for level in levels)
     if len(values) != protocol.CHANNELS or not all(0 <= value <= 255 for value in values) or not any(values):
-        raise ValueError(f"levels must be four numbers from 0 to 255, at least one above 0, got {tuple(levels)}")
+        raise ValueError(f"levels must be four integers from 0 to 255, at least one above 0, got {tuple(levels)}")
     first, second, third, fourth = values
     return first, second, third, fourth
