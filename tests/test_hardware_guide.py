@@ -186,7 +186,7 @@ def test_noise_is_measured():
     measured = guide.empty_pad([guide.Observation(float(i), *look) for i, look in enumerate(looks)])
     np.testing.assert_allclose(measured.visual_noise.mean(), 2, rtol=0.05)
     np.testing.assert_allclose(measured.tactile, 100, atol=1)
-    with pytest.raises(ValueError, match="at least 2 observations"):
+    with pytest.raises(ValueError, match="at least 2 items"):
         guide.empty_pad([])
 
 

@@ -105,8 +105,8 @@ def test_another_camera_or_controller_is_refused_by_name():
     camera, leds = DEVICE.camera, DEVICE.leds
     DEVICE.check_identity()
     DEVICE.check_identity(camera=camera, leds=leds)
-    both = rf"describes camera {re.escape(camera)} and LED controller {leds}, but the connected device has "
-    with pytest.raises(WrongDeviceError, match=both + r"camera /dev/video3\. Load the file.*experiments\.commission"):
+    both = rf"describes camera {re.escape(camera)} and LED controller {leds}, but the connected sensor has "
+    with pytest.raises(WrongDeviceError, match=both + r"camera /dev/video3\. Load the .*experiments\.commission"):
         DEVICE.check_identity(camera="/dev/video3", leds=leds)
     with pytest.raises(WrongDeviceError, match=both + "LED controller FFFF"):
         DEVICE.check_identity(camera=camera, leds="FFFF")
@@ -166,7 +166,7 @@ def test_a_truncated_file_is_refused(tmp_path, size):
         ("lens.fx", 10**400, "too large|finite number"),
         ("lens.width", 64.0, "lens.width is 64.0, but it must be a whole number"),
         ("background_visual.sha256", "0" * 63, "64 hexadecimal digits"),
-        ("background_visual.name", "../a.png", "file name without folder"),
+        ("background_visual.name", "../a.png", "file name without a folder"),
         ("colour", 1, r"device\.colour is unknown\. The known fields are camera, fps"),
         ("lens.cx", ..., r"device\.lens\.cx is missing"),
         ("camera", ..., r"device\.camera is missing"),
@@ -197,10 +197,10 @@ def test_a_damaged_or_missing_background_is_named(tmp_path):
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     for read in (Device.load, lambda folder: device.background(folder, "tactile")):
-        with pytest.raises(SensorFileError, match=r"background_tactile\.png is damaged or belongs to another"):
+        with pytest.raises(SensorFileError, match=r"background_tactile\.png differs.* damaged or belongs to another"):
             read(tmp_path)
     path.unlink()
-    with pytest.raises(SensorFileError, match=r"background_tactile\.png cannot be read .*Copy it"):
+    with pytest.raises(SensorFileError, match=r"background_tactile\.png cannot be read .*Copy the image"):
         Device.load(tmp_path)
     with pytest.raises(SensorFileError, match="has no visual background"):
         DEVICE.background(tmp_path, "visual")

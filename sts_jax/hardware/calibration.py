@@ -34,18 +34,18 @@ _RULER = 100  # length of the printed ruler (mm)
 
 
 class CalibrationError(ValueError):
-    """Raised if the images do not determine the lens. The message names the images and the remedy."""
+    """Raised if a lens cannot be calibrated from the given images. The message names the images and the remedy."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Board:
     """A ChArUco board: a chessboard with an ArUco marker in each white square.
 
-    The board's frame has its origin at the board's centre. x points to the right of the print, y to its bottom, and z
-    into the paper.
+    The frame of the board has its origin at the centre of the board. If you look at the printed side, x points to the
+    right, y points downwards, and z points into the paper.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A field of the board is out of range.
     """
 
     columns: int = 9  # number of squares in a row, at least 4
@@ -60,11 +60,11 @@ class Board:
                 raise ValueError(f"{name} must be >= 4, got {getattr(self, name)}")
         if not 0 < self.marker < self.square < 1:
             raise ValueError(
-                f"a board needs 0 < marker < square < 1 m, got marker={self.marker} and square={self.square}"
+                f"a board must have 0 < marker < square < 1 m, got marker={self.marker} and square={self.square}"
             )
         if not self.dictionary.startswith("DICT_") or not hasattr(cv2.aruco, self.dictionary):
             raise ValueError(
-                f"dictionary must be a name of OpenCV's predefined dictionaries such as 'DICT_4X4_50', got "
+                f"dictionary must be the name of one of OpenCV's predefined dictionaries, such as 'DICT_4X4_50', got "
                 f"{self.dictionary!r}"
             )
         known = len(self._markers().bytesList)
@@ -81,12 +81,16 @@ class Board:
 
     @property
     def corners(self) -> NDArray[np.float64]:
-        """Inner corners of the chessboard in the board's frame (m), shape (n, 3)."""
+        """Positions of the n inner corners of the chessboard in the board's frame (m), shape (n, 3), row by row."""
         middle = np.array([*self.size, 0.0]) / 2
         return np.asarray(self.opencv().getChessboardCorners(), np.float64) - middle
 
     def opencv(self) -> "cv2.aruco.CharucoBoard":
-        """Return the board as an object of OpenCV. The origin of its frame is the top left corner of the board."""
+        """Return the same board as an OpenCV object.
+
+        OpenCV's frame of the board has its origin at the top left corner. The frame of this class has its origin at
+        the centre.
+        """
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._markers())
 
     def _markers(self) -> "cv2.aruco.Dictionary":
@@ -112,12 +116,14 @@ class Calibration:
 
 
 def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)) -> NDArray[np.uint8]:
-    """Draw an A4 page with the board, its dimensions, a frame to cut along, and a ruler of 100 mm.
+    """Draw an A4 page with the board, its dimensions, a frame around the board, and a ruler of 100 mm.
+
+    The page is cut along the frame after printing.
 
     Args:
         board: The board to draw.
-        outline: Width and height of the frame around the board (m). Choose the size of the pad: if the edges of the
-            cut sheet lie on the edges of the pad, the board is centred on the pad.
+        outline: Width and height of the frame around the board (m). Choose the size of the sensor's gel pad. The cut
+            sheet then has the size of the pad, and if it covers the pad exactly, the board is centred on the pad.
 
     Returns:
         Grey image with 10 pixels per mm, shape (2970, 2100), uint8.
@@ -130,11 +136,12 @@ def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15,
     limits = [(_PAGE[0] - 10) * _PIXELS_PER_MM, (_PAGE[1] - 60) * _PIXELS_PER_MM]
     if any(p > f for p, f in zip(pixels, frame, strict=True)):
         raise ValueError(
-            f"the board of {_mm(board.size)} does not fit into outline={_mm(outline)}: use smaller squares"
+            f"the board of {_mm(board.size)} does not fit into outline={_mm(outline)}: use smaller or fewer squares, "
+            "or a larger outline"
         )
     if any(f > limit for f, limit in zip(frame, limits, strict=True)):
         raise ValueError(
-            f"outline is {_mm(outline)}, but at most {_PAGE[0] - 10} mm x {_PAGE[1] - 60} mm fit on the page"
+            f"outline must be at most {_PAGE[0] - 10} mm x {_PAGE[1] - 60} mm to fit on the A4 page, got {_mm(outline)}"
         )
     page = np.full((_PAGE[1] * _PIXELS_PER_MM, _PAGE[0] * _PIXELS_PER_MM), 255, np.uint8)
     left, top = (page.shape[1] - frame[0]) // 2, 10 * _PIXELS_PER_MM
@@ -162,15 +169,16 @@ def save_board(
     *,
     outline: tuple[float, float] = (0.15, 0.15),
 ) -> None:
-    """Write the page of `board_image` to a file that prints at its true size.
+    """Write the page that `board_image` draws to a file that prints at its true size.
 
     Args:
         path: Path of the file, ending in .pdf or .png.
         board: The board to draw.
-        outline: Width and height of the frame around the board (m).
+        outline: Width and height of the frame around the board (m), usually the size of the sensor's gel pad.
 
     Raises:
-        ValueError: The path has another ending, or the board does not fit into the frame or the frame on the page.
+        ValueError: The path has another ending, the board does not fit into the frame, or the frame does not fit on the
+            page.
         OSError: The file cannot be written.
     """
     path = Path(path)
@@ -190,14 +198,14 @@ def save_board(
 
 
 def find_board(image: NDArray[np.uint8], board: Board = Board()) -> FoundCorners:
-    """Find the corners of a board in a raw image.
+    """Find the corners of a board in a raw image, which is an unchanged image of the camera.
 
     Args:
         image: Raw image, shape (height, width, 3) for RGB or (height, width) for grey, uint8.
         board: The printed board.
 
     Returns:
-        The corners that were found. There may be none.
+        The corners that were found. If the board is not found, the arrays of the result are empty.
     """
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
     parameters = cv2.aruco.DetectorParameters()
@@ -218,27 +226,29 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a lens and the camera's pose in the sensor from images of a board.
 
-    In one image, the board must lie on the gel's outer face with its print towards the camera. It must be centred on
-    the pad, with its edges parallel to the edges of the pad. Any of its four edges may be at the top. In the other
-    images, the board must have different distances, positions and tilts.
+    In one image, the board must lie on the outer face of the gel pad, with the printed side towards the camera. The
+    board must be centred on the pad, and the edges of both must be parallel. Any edge of the board may be at the top.
+    In the other images, the board must have different distances, positions and tilts.
 
-    The fit determines the lens and the pose of the board in each image. It minimises a soft L1 loss of the differences
-    between the pixel coordinates of the corners that were found and of their projections. A weak prior keeps the
-    coefficients k of the lens small.
+    The calibration fits the parameters of the lens and the pose of the board in each image. The reprojection error of
+    a corner is the distance between the pixel at which the corner was found and the pixel to which the fitted lens
+    projects it. The fit minimises a soft L1 loss of the column and row components of the reprojection errors. A weak
+    prior keeps the coefficients `Lens.k` small.
 
     Args:
-        images: Raw images of one camera, all of one size, shape (height, width, 3) for RGB or (height, width) for grey,
-            uint8. At least 6 must show at least 12 corners of the board.
+        images: Raw images of one camera, all of the same size, shape (height, width, 3) for RGB or (height, width) for
+            grey, uint8. At least 6 of the images must each show at least 12 corners of the board.
         board: The printed board.
         on_pad: Index in `images` of the image in which the board lies on the pad.
         largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Returns:
-        The lens with the camera's pose relative to the pad, and the errors of each image.
+        The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board, the board on the pad is not found or not parallel to the image,
-            the boards are nearly parallel in all images, or the error of an image is too large.
+        CalibrationError: Too few images show the board. Or the board on the pad is not found, or is not parallel to the
+            image. Or the board has nearly the same tilt in all images. Or the reprojection error of an image is larger
+            than `largest_error`.
         ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
     """
     height, width = _common_size(images)
@@ -254,29 +264,31 @@ def fit_lens(
     on_pad: int = 0,
     largest_error: float = 1.0,
 ) -> Calibration:
-    """Calibrate a lens as `calibrate` does, but from corners that `find_board` has found already.
+    """Calibrate a lens as `calibrate` does, but from the results of `find_board` instead of images.
 
     Args:
-        found: Corners of the board in each image.
+        found: Corners of the board in each image, from `find_board`.
         size: Width and height of the raw images (pixels).
         board: The printed board.
-        on_pad: Index in `found` of the image in which the board lies on the pad.
+        on_pad: Index in `found` of the image in which the board lies on the sensor's gel pad.
         largest_error: Largest allowed root mean square of the reprojection errors of an image (pixels).
 
     Returns:
-        The lens with the camera's pose relative to the pad, and the errors of each image.
+        The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board, the board on the pad is not found or not parallel to the image,
-            the boards are nearly parallel in all images, or the error of an image is too large.
+        CalibrationError: Too few images show the board. Or the board on the pad is not found, or is not parallel to the
+            image. Or the board has nearly the same tilt in all images. Or the reprojection error of an image is larger
+            than `largest_error`.
         ValueError: `on_pad` is not the index of an image.
     """
     width, height = size
     if not 0 <= on_pad < max(1, len(found)):
-        raise ValueError(f"on_pad must be the index of one of the {len(found)} images, got {on_pad}")
+        raise ValueError(f"on_pad must be the index of an image, 0 to {max(len(found) - 1, 0)}, got {on_pad}")
     if len(found) < FEWEST_IMAGES:
         raise CalibrationError(
-            f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, got {len(found)}."
+            f"a calibration needs at least {FEWEST_IMAGES} images of the board in different poses, got {len(found)}. "
+            "Take more images."
         )
     counts = tuple(len(corners.numbers) for corners in found)
     used = _usable(counts, on_pad)
@@ -373,8 +385,9 @@ def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
                 best = fit
     if best is None:
         raise CalibrationError(
-            "no pose of the board fits the corners that were found. Check that the numbers of squares and the "
-            "dictionary of `board` are those of the printed board, and take images with more of the board in view."
+            "the pose of the board cannot be computed from the corners that were found in the images. Check that the "
+            "numbers of squares and the dictionary of `board` are those of the printed board. Take images that show "
+            "more of the board."
         )
     return best
 
@@ -392,17 +405,21 @@ def _fitted(views: _Views, start: _Fit) -> _Fit:
 def _common_size(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int]:
     """Height and width of the images, or an error if they have different sizes or another type."""
     if not images:
-        raise CalibrationError("there are no images. Take images with the board in different poses.")
+        raise CalibrationError(
+            f"images is empty. Take at least {FEWEST_IMAGES} images of the board in different poses."
+        )
     for i, image in enumerate(images):
         if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
             raise ValueError(
-                f"image {i} must be uint8, grey or RGB, but it is {image.dtype} of shape {image.shape}. Read it with "
-                "`Camera.read` or from a PNG file."
+                f"image {i} must be uint8 of shape (height, width) or (height, width, 3), got {image.dtype} of shape "
+                f"{image.shape}. Read the image with `Camera.read` or from a PNG file."
             )
     sizes = {image.shape[:2] for image in images}
     if len(sizes) > 1:
         names = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
-        raise ValueError(f"the images must all have one size, got {names}. Take all of them with the same settings.")
+        raise ValueError(
+            f"all images must have the same size, got {names} pixels. Take all images with the same camera settings."
+        )
     height, width = images[0].shape[:2]
     return height, width
 
@@ -423,13 +440,13 @@ def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
     )
     if on_pad not in used:
         raise CalibrationError(
-            f"image {on_pad}, in which the board lies on the pad, shows {counts[on_pad]} of its corners, but at least "
-            f"{FEWEST_CORNERS} are needed.{lacking}{remedy}"
+            f"image {on_pad}, in which the board lies on the pad, shows {counts[on_pad]} corners of the board, but at "
+            f"least {FEWEST_CORNERS} are needed.{lacking}{remedy}"
         )
     if len(used) < FEWEST_IMAGES:
         raise CalibrationError(
-            f"only {len(used)} of {len(counts)} images show enough of the board, but at least {FEWEST_IMAGES} are "
-            f"needed.{lacking}{remedy}"
+            f"only {len(used)} of {len(counts)} images show at least {FEWEST_CORNERS} corners of the board, but at "
+            f"least {FEWEST_IMAGES} are needed.{lacking}{remedy}"
         )
     return used
 
@@ -452,8 +469,9 @@ def _check_tilts(poses: NDArray[np.float64]) -> None:
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
-            f"the boards of all images are parallel within {math.degrees(spread):.0f} degrees, so the focal length is "
-            "not determined. Hold the board with tilts of 20 to 40 degrees to different sides in some images."
+            f"the board has nearly the same tilt in all images, parallel within {math.degrees(spread):.0f} degrees, so "
+            f"the focal length cannot be computed. Two images must differ by at least {math.degrees(LEAST_TILT):.0f} "
+            "degrees. Hold the board with tilts of 20 to 40 degrees to different sides in some images."
         )
 
 
@@ -474,12 +492,13 @@ def _pose_on_pad(
     sensor = max(turns, key=lambda turn: turn.as_matrix()[0, 0])
     tilt = math.acos(float(np.clip(sensor.as_matrix()[2, 2], -1, 1)))
     twist = math.atan2(sensor.as_matrix()[1, 0], sensor.as_matrix()[0, 0])
-    for angle, words in ((tilt, "tilted against"), (abs(twist), "turned in")):
+    for angle, words in ((tilt, "tilted against"), (abs(twist), "rotated in")):
         if angle > MOST_TILT_ON_PAD:
             raise CalibrationError(
-                f"the board of image {index} is {words} the image plane by {math.degrees(angle):.0f} degrees, but on "
-                f"the pad it must be parallel to the image's edges within {math.degrees(MOST_TILT_ON_PAD):.0f} "
-                "degrees. Choose the image in which the board lies on the pad (`on_pad`), or mount the camera straight."
+                f"the board of image {index} is {words} the image plane by {math.degrees(angle):.0f} degrees, but at "
+                f"most {math.degrees(MOST_TILT_ON_PAD):.0f} degrees are allowed for a board on the pad. Set `on_pad` "
+                "to the index of the image in which the board lies on the pad, or mount the camera parallel to the "
+                "pad, so that the edges of the pad are horizontal and vertical in the image."
             )
     (x, y, z), (tx, ty, tz) = sensor.as_rotvec().tolist(), pose[3:].tolist()
     return (x, y, z), (tx, ty, tz)

@@ -24,7 +24,7 @@ _PASSING = (
 
 
 class Action(enum.Enum):
-    """The actions of the person who collects trajectories."""
+    """The actions that are available to the person who collects trajectories with `collect`."""
 
     CONFIRM = "confirm"  # confirm the current stage: the pad is empty, the object is released, the trajectory is good
     DISCARD = "discard"  # discard the current trajectory
@@ -33,7 +33,7 @@ class Action(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
-    """The information that is shown to the person."""
+    """The information that `collect` shows to the person who moves the objects."""
 
     pair: Pair | None  # newest pair of images, None: there is none yet
     stage: Stage  # current stage of the guide
@@ -53,33 +53,36 @@ class PairReader(Protocol):
     """A sensor that returns pairs of images, such as `STS` or the digital twin's `VirtualSensor`."""
 
     def read(self) -> Pair:
-        """Return an image of each stream. Both arrive after the call."""
+        """Return a new image of each stream. Both images arrive after the beginning of the call."""
 
 
 @runtime_checkable
 class Person(Protocol):
-    """The interface to the person who collects, such as a web page or a terminal. Its methods must not wait."""
+    """The interface between `collect` and the person who moves the objects, such as a web page or a terminal.
+
+    All methods must return at once, because `collect` reads no images while it waits for them.
+    """
 
     def show(self, view: View) -> None:
         """Show the current view. `collect` calls this method after each attempt to read a pair."""
 
     def action(self) -> Action | None:
-        """Return the next action of the person, or None. The action refers to the last view."""
+        """Return the next action of the person, or None if there is none. It refers to the view that was shown last."""
 
 
 class AutomaticPerson:
-    """A program in place of a person, which confirms every trajectory. Something else must move the object."""
+    """A `Person` that confirms every trajectory automatically. Another program must move the objects."""
 
     def __init__(self) -> None:
-        """Create a person who has seen no view yet."""
+        """Begin in the stage `CLEAR`."""
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store the stage of the view."""
+        """Store the stage of the view for `action`."""
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `CONFIRM` in the stage `REVIEW`, else None."""
+        """Return `Action.CONFIRM` if the last view was in the stage `Stage.REVIEW`, else None."""
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 
 
@@ -97,28 +100,31 @@ def collect(
 ) -> int:
     """Collect trajectories until the person stops, or until the session has enough of them.
 
+    A trajectory consists of two pairs of images: one of an object that a person holds on the pad, and one of the same
+    object at rest after its release. The guide, a state machine that evaluates the images, chooses the instruction for
+    the person and decides when each pair is saved.
+
     Args:
         sensor: Connected sensor.
-        session: Session in which the trajectories are saved. It stays open.
+        session: Session in which the trajectories are saved. `collect` does not close it.
         person: Interface that shows the instructions and returns the person's actions.
         config: Thresholds and times of the guide. None: the defaults of `GuideConfig`.
-        empty: The empty pad, made with `known_pad` from the backgrounds of a sensor file. None: it is measured at the
-            beginning.
+        empty: Appearance of the empty pad, from `known_pad`. None: the empty pad is measured at the beginning.
         trusted: True if the pad is certainly empty at the beginning. If False and `empty` is None, the person has to
-            confirm that it is empty.
-        count: Number of confirmed trajectories in the session, earlier ones included, at which collecting ends. None:
-            no limit.
+            confirm that the pad is empty.
+        count: Number of confirmed trajectories in the session at which collecting ends. Trajectories of earlier calls
+            count too. None: no limit.
         note: Text that is stored with each trajectory.
-        patience_s: Longest time without images (s). A lost camera or controller can return during this time, and the
-            person sees the error.
+        patience_s: Longest time without images (s). During this time, the person sees the error, and `collect`
+            continues if a lost camera or LED controller is found again.
 
     Returns:
         Number of trajectories that were confirmed during this call.
 
     Raises:
-        LightError, LedError, CameraError: `sensor.read` failed for longer than `patience_s`, or with an error from
-            which it cannot recover.
-        SessionError: A change of the session cannot be written, or too many changes wait.
+        LightError, LedError, CameraError: `sensor.read` failed for longer than `patience_s`, or with an error that is
+            not temporary.
+        SessionError: Images or confirmations cannot be written to disk, or too many of them wait to be written.
     """
     return _Collecting(sensor, session, person, config or GuideConfig(), note).run(
         guide.start(empty, trusted=trusted), count, patience_s

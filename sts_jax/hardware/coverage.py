@@ -19,11 +19,13 @@ PARTS = tuple(f"{row} {column}" for row in _ROWS for column in _COLUMNS)
 
 
 def view_angle(lens: Lens, pinhole: Pinhole) -> float:
-    """Return the largest angle between the optical axis of a lens and a ray of the sensor's view (rad).
+    """Return the largest angle between the optical axis of a lens and a ray from the camera to the view (rad).
+
+    The view is the part of the gel's outer face that rectified images show. The largest angle is at one of its corners.
 
     Args:
-        lens: The lens and the pose of the camera.
-        pinhole: The view of the sensor, such as `Sensor.camera`.
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
     """
     left, top, width, height = window(pinhole, _RESOLUTION)
     corners = np.array([(x, y, 0.0) for x in (left, left + width) for y in (top, top + height)])
@@ -32,24 +34,28 @@ def view_angle(lens: Lens, pinhole: Pinhole) -> float:
 
 
 def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None) -> None:
-    """Raise an error unless the raw images show the sensor's whole view and the lens is calibrated up to its corners.
+    """Raise an error unless the raw images show the whole view and the calibration covers the corners of the view.
+
+    The view is the part of the gel's outer face that rectified images show.
 
     Args:
-        lens: The lens and the pose of the camera.
-        pinhole: The view of the sensor, such as `Sensor.camera`.
-        largest_angle: Largest angle of a corner in the calibration, `Calibration.largest_angle` (rad). The view may
-            exceed this angle by 3 degrees. None: the angles are not compared.
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
+        largest_angle: `Calibration.largest_angle`, the largest angle from the optical axis at which the calibration
+            images show a corner of the board (rad). The corners of the view may be up to 3 degrees farther from the
+            optical axis. None: this angle is not checked.
 
     Raises:
-        CalibrationError: A part of the view lies outside of the raw image, or the view exceeds `largest_angle` by more
-            than 3 degrees, or it contains rays beyond `Lens.largest_angle`.
+        CalibrationError: A part of the view lies outside of the raw image. Or a corner of the view is more than
+            3 degrees beyond `largest_angle`. Or the view contains rays at larger angles than `Lens.largest_angle`.
     """
     needed = view_angle(lens, pinhole)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
         raise CalibrationError(
-            f"in the calibration, the corners of the board reach {math.degrees(largest_angle):.1f} degrees from the "
-            f"optical axis, but the corners of the sensor's view are at {math.degrees(needed):.1f} degrees. Take more "
-            "images with the board in the corners of the image, and calibrate again."
+            f"the corners of the sensor's view are {math.degrees(needed):.1f} degrees from the optical axis, but the "
+            f"calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees, and the view may "
+            f"exceed this angle by at most {math.degrees(_EXTRAPOLATION):.0f} degrees. Take more images with the board "
+            "in the corners of the image, and calibrate again."
         )
     try:
         pixels = rectification(lens, pinhole, _RESOLUTION)
@@ -61,19 +67,19 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
         blocks = [b for rows in np.array_split(outside, 3) for b in np.array_split(rows, 3, axis=1)]
         parts = ", ".join(part for part, block in zip(PARTS, blocks, strict=True) if block.any())
         raise CalibrationError(
-            f"the raw image lacks {outside.mean():.1%} of the sensor's view ({parts}). Mount the camera under the "
-            "middle of the pad and parallel to it, or use a lens with a larger field of view."
+            f"the raw image does not show {outside.mean():.1%} of the sensor's view ({parts}). Mount the camera under "
+            "the centre of the pad and parallel to the pad, or use a lens with a larger field of view."
         )
 
 
 def covered(found: Sequence[FoundCorners], size: tuple[int, int]) -> tuple[str, ...]:
-    """Return the parts of the raw image in which corners of a board were found.
+    """Return the parts of the raw image in which corners of a board were found, in any of the calibration images.
 
-    The image is divided into 3 x 3 parts. The outer parts are a fifth of the image wide and high, and the middle ones
-    three fifths.
+    The image is divided into 3 rows and 3 columns. The top and bottom rows each have 20 % of the image's height, and
+    the left and right columns each have 20 % of the image's width.
 
     Args:
-        found: Corners of the board in each image.
+        found: Corners of the board in each image, from `find_board`.
         size: Width and height of the raw images (pixels).
 
     Returns:

@@ -27,7 +27,9 @@ class Exposed(NamedTuple):
 
 
 def brightness(image: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Return the 99th percentile of the pixels' brightest channels, 0 to 255.
+    """Return the brightness of an image, 0 to 255.
+
+    It is the 99th percentile over all pixels of the largest of the three colour values.
 
     Args:
         image: RGB image.
@@ -38,17 +40,18 @@ def brightness(image: UInt8[np.ndarray, "height width 3"]) -> float:
 def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
     """Set the exposure of a camera so that its images are bright but not saturated.
 
-    The exposure is scaled until the `brightness` of an image is within 25 of 200, for at most 10 attempts. The search
-    also ends if the driver does not change the exposure any more.
+    The function adjusts the exposure, in at most 10 attempts, until the `brightness` of an image is between 175 and
+    225. The search also stops if the driver does not change the exposure any more.
 
     Args:
-        camera: Connected camera whose driver can set the exposure. The lights of the stream must be on or off already.
+        camera: Connected camera whose driver can set the exposure. Before the call, switch the sensor's lights on for
+            the exposure of the tactile stream, or off for the visual stream.
         longest: Largest allowed exposure, in the unit of the driver. An exposure that is longer than the time between
             two frames lowers the frame rate.
 
     Returns:
-        The exposure that is set now, and the brightness of its images. They may still be too dark or saturated
-        (brightness of at least 250).
+        The exposure that is set now, and the brightness of an image with this exposure. If the search has failed, the
+        image may still be too dark, or saturated (brightness of at least 250).
 
     Raises:
         CameraError: The driver does not allow setting the exposure, or the camera sends no frames.
@@ -68,7 +71,8 @@ def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
             return Exposed(found, seen)
     if found is None:
         raise CameraError(
-            f"the driver of {camera.config.name} does not let the exposure be set: use the camera's own exposure."
+            f"the driver of {camera.config.name} does not support a manual exposure: use the camera's automatic "
+            "exposure instead of choose_exposure()."
         )
     time.sleep(LAG_S)
     return Exposed(found, brightness(camera.read().image))

@@ -27,7 +27,7 @@ _KEPT = 16  # number of earlier observations that are kept in `State.window` bes
 
 
 class Stage(enum.Enum):
-    """The stages of a trajectory. Each one is an instruction for the person."""
+    """The stages of recording one trajectory. Each stage is an instruction for the person who moves the object."""
 
     CLEAR = "clear"  # take everything off the pad
     PLACE = "place"  # place the object on the pad
@@ -39,10 +39,10 @@ class Stage(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class GuideConfig:
-    """Thresholds and times of the guide.
+    """Thresholds and times of the guide, the state machine that leads a person through the recording of trajectories.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A field is out of range.
     """
 
     deviations: float = 6.0  # threshold of a block's change, in standard deviations of the noise of the block's mean
@@ -73,7 +73,10 @@ class GuideConfig:
 
 
 class Observation(NamedTuple):
-    """The block means of a pair of images."""
+    """The block means of a pair of images.
+
+    An image is divided into 24 rows of 32 blocks. A block mean is the mean colour of one block.
+    """
 
     time_s: float  # arrival time of the later image, on any clock that increases (s)
     visual: Blocks  # block means of the visual image
@@ -82,7 +85,10 @@ class Observation(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmptyPad:
-    """The block means of both streams when nothing is on the pad, and the noise of these means."""
+    """The block means of both streams while the pad is empty, and the noise of these means.
+
+    An image is divided into 24 rows of 32 blocks. A block mean is the mean colour of one block.
+    """
 
     visual: Blocks  # block means of the visual image
     tactile: Blocks  # block means of the tactile image
@@ -92,7 +98,10 @@ class EmptyPad:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """The state of the guide. `start` makes the first one."""
+    """The state of the guide, the state machine that leads a person through the recording of trajectories.
+
+    `start` makes the first state.
+    """
 
     stage: Stage  # current stage
     since_s: float | None  # time of the first observation in this stage (s), None: there was none
@@ -109,30 +118,39 @@ class State:
 def observe(
     time_s: float, visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]
 ) -> Observation:
-    """Compute the block means of a pair of images.
+    """Divide each image of a pair into 24 rows of 32 blocks, and compute the mean colour of each block.
 
     Args:
-        time_s: Arrival time of the later image (s).
+        time_s: Arrival time of the later image, on any clock that increases (s).
         visual: Raw visual image, RGB, of any size.
         tactile: Raw tactile image, RGB, of any size.
+
+    Returns:
+        The time and the block means of both images.
     """
     return Observation(time_s, thumbnail(visual), thumbnail(tactile))
 
 
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
-    """Measure the empty pad and its noise from several observations.
+    """Measure the appearance of the empty pad, and its noise, from several observations.
 
-    The noise of a block is the standard deviation of its means. Because few observations can underestimate it, it is at
-    least the median of the standard deviations of all blocks in the stream.
+    An observation contains the mean colour of each of the 24 x 32 blocks of both images. The noise of a block is
+    the standard deviation of its mean colour over the observations. A few observations can underestimate the noise.
+    Each value is therefore raised to at least the median noise of all blocks of the stream.
 
     Args:
-        observations: At least two observations of the empty pad at rest.
+        observations: At least two observations of the empty pad without movement.
+
+    Returns:
+        The mean of the observations, and the noise of each block.
 
     Raises:
         ValueError: There are fewer than two observations.
     """
     if len(observations) < 2:
-        raise ValueError(f"at least 2 observations are needed to measure the noise, got {len(observations)}")
+        raise ValueError(
+            f"observations must contain at least 2 items, so that the noise can be measured, got {len(observations)}"
+        )
     visual, tactile = (
         np.stack(looks) for looks in ([o.visual for o in observations], [o.tactile for o in observations])
     )
@@ -146,9 +164,10 @@ def _noise(looks: Float[np.ndarray, "n 24 32 3"]) -> Blocks:
 
 
 def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
-    """Make an `EmptyPad` from the background images of a sensor file.
+    """Make an `EmptyPad` from the images of the empty pad in a sensor file, which `Device.background` reads.
 
-    The noise in the result is 0, because one image does not show it. `step` measures the noise before each trajectory.
+    The noise in the result is 0, because it cannot be measured from one image. `step` measures the noise before each
+    trajectory.
 
     Args:
         visual: Raw image of the empty pad without light, RGB.
@@ -159,27 +178,31 @@ def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.nda
 
 
 def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
-    """Make the state of the guide before the first trajectory.
+    """Make the first state of the guide, the state machine that leads a person through the recording of trajectories.
 
     Args:
-        empty: The empty pad, for example from `known_pad`. None: not known yet.
-        trusted: True if the pad is certainly empty now. If False and `empty` is None, the guide waits for `confirm`.
+        empty: Appearance of the empty pad, for example from `known_pad`. None: not known yet.
+        trusted: True if the pad is certainly empty now. If False and `empty` is None, the guide stays in the first
+            stage until `confirm` is called.
     """
     return State(Stage.CLEAR, None, None, empty, trusted, False, False, (), 0, None)
 
 
 def step(config: GuideConfig, state: State, observation: Observation) -> tuple[State, End | None]:
-    """Advance the guide by one observation.
+    """Advance the guide by one pair of images.
+
+    The guide is the state machine that leads a person through the recording of trajectories.
 
     Args:
         config: Thresholds and times.
-        state: State after the previous observation.
-        observation: The new observation.
+        state: State after the previous pair of images.
+        observation: Result of `observe` for the new pair of images.
 
     Returns:
-        The new state, and "initial" or "final" if a pair of images is to be saved now, else None. The pair to save is
-        the one before `observation`. There is no movement between the pairs before and after it, so nothing moved while
-        it was taken.
+        The new state, and "initial", "final" or None. "initial" means that the caller must save the previous pair of
+        images as the pair of the held object, and "final" as the pair of the object at rest. The previous pair is saved
+        because nothing moved between the pairs before and after it. Therefore, nothing moved while it was taken. None
+        means that no pair must be saved.
     """
     moved = not state.window or not _same(config, state, state.window[0], observation)
     window = (observation,) if moved else (state.window[0], *state.window[1:][-_KEPT:], observation)
@@ -218,10 +241,13 @@ def _clear(config: GuideConfig, state: State) -> State:
 
 
 def confirm(state: State) -> State:
-    """Advance the guide after the person has confirmed.
+    """Advance the guide after the person has confirmed the current stage of recording a trajectory.
 
-    A confirmation means that the pad is empty (stage `CLEAR`), that the object is released (`RELEASE`), or that the
-    trajectory is good (`REVIEW`). In the other stages, the state does not change.
+    The meaning of a confirmation depends on the stage. In `CLEAR`, the pad is empty. In `RELEASE`, the object is
+    released. In `REVIEW`, the trajectory is good. In all other stages, the state is returned unchanged.
+
+    Args:
+        state: Current state of the guide.
     """
     match state.stage:
         case Stage.CLEAR:
@@ -234,12 +260,24 @@ def confirm(state: State) -> State:
 
 
 def discard(state: State) -> State:
-    """Return to the stage `CLEAR` because the person discards the trajectory. `CLEAR` and `PLACE` do not change."""
+    """Return to the stage `CLEAR`, because the person discards the trajectory.
+
+    In the stages `CLEAR` and `PLACE`, no trajectory has begun, and the state is returned unchanged.
+
+    Args:
+        state: Current state of the guide.
+    """
     return state if state.stage in (Stage.CLEAR, Stage.PLACE) else _enter(state, Stage.CLEAR)
 
 
 def interrupted(state: State) -> State:
-    """Forget the observed time without movement, after images were missing because a device was interrupted."""
+    """Restart the measurement of the time without movement. Call this function after a gap in the images.
+
+    An object may have moved during the gap, for example while the camera was disconnected.
+
+    Args:
+        state: Current state of the guide.
+    """
     return dataclasses.replace(state, window=(), count=0, still=False)
 
 
@@ -252,13 +290,14 @@ def _enter(state: State, stage: Stage) -> State:
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
     """Return True if the tactile image shows a contact.
 
-    A contact is a difference from the empty pad in at least `config.contact_blocks` blocks. The median difference of
-    all blocks is subtracted first, so a change of the whole image's brightness is not a contact.
+    A tactile image shows a contact if at least `config.contact_blocks` of its 24 x 32 blocks differ from the empty pad.
+    The median difference over all blocks is subtracted first, so that a change in the brightness of the whole image is
+    not a contact.
 
     Args:
         config: Thresholds.
-        empty: The empty pad.
-        observation: The observation to test.
+        empty: Appearance of the empty pad, from `empty_pad` or `known_pad`.
+        observation: Result of `observe` for the pair of images to test.
     """
     change = observation.tactile - empty.tactile
     change = change - np.median(change, axis=(0, 1))
@@ -310,7 +349,7 @@ _HINTS = {
 
 
 def instruction(config: GuideConfig, state: State) -> str:
-    """Return the instruction for the person, with a hint if the stage takes longer than `config.hint_s`."""
+    """Return the text of the instruction for the person, with a hint after `config.hint_s` seconds in one stage."""
     if state.stage is Stage.CLEAR and state.empty is None and not state.trusted:
         return f"{_INSTRUCTIONS[Stage.CLEAR]} Then confirm."
     late = state.now_s is not None and state.since_s is not None and state.now_s - state.since_s >= config.hint_s

@@ -44,16 +44,17 @@ class Pinhole(Protocol):
 class Lens:
     r"""A fisheye lens in the Kannala-Brandt model (OpenCV's `cv2.fisheye`), with the camera's pose in the sensor.
 
-    A point p of the sensor frame is at q = R p + t in the camera frame. R is the matrix of `rotation`, and t is
-    `translation`. Let a be the angle between q and the optical axis (rad). The point appears at the raw pixel
+    A point p of the sensor frame is at q = R p + t in the camera frame. R is the rotation matrix of the rotation vector
+    `rotation`, and t is `translation`. The optical axis is the z-axis of the camera frame. Let a be the angle between q
+    and the optical axis (rad). The point appears in the camera's image at the pixel
 
         (column, row) = (fx d q_x / r + cx, fy d q_y / r + cy),
         r = sqrt(q_x^2 + q_y^2),
         d = a + k_1 a^3 + k_2 a^5 + k_3 a^7 + k_4 a^9.
 
     Raises:
-        ValueError: A value is out of range, the pad is not in front of the camera, or the camera is not inside the
-            sensor (z < 0 in the sensor frame).
+        ValueError: A field is out of range. Or the pad is not in front of the camera. Or the camera is outside of the
+            sensor, which means that its z coordinate in the sensor frame is not negative.
     """
 
     width: int  # width of the raw images (pixels)
@@ -84,14 +85,14 @@ class Lens:
                 raise ValueError(f"{name} must be > 0, got {getattr(self, name)}")
         if self.translation[2] <= 0:
             raise ValueError(
-                f"translation must have a third number > 0, so that the pad is in front of the camera, got "
+                f"the third number of translation must be > 0, so that the pad is in front of the camera, got "
                 f"{self.translation}"
             )
         if self.center[2] >= 0:
             raise ValueError(
                 f"rotation {self.rotation} and translation {self.translation} place the camera at "
-                f"{tuple(round(float(c), 4) for c in self.center)} in the sensor frame, but the camera must lie inside "
-                "the sensor, at z < 0"
+                f"{tuple(round(float(c), 4) for c in self.center)} m in the sensor frame, but the camera must lie "
+                "inside the sensor, where z is negative"
             )
 
     @classmethod
@@ -103,16 +104,18 @@ class Lens:
         field_of_view: float = math.radians(160),
         distance: float = 0.1,
     ) -> "Lens":
-        """Return an equidistant lens whose camera looks straight at the centre of the pad.
+        """Return an equidistant lens whose optical axis is perpendicular to the pad and meets the centre of the pad.
 
-        In an equidistant lens, the distance of a pixel from the image's centre is proportional to the angle of its ray.
+        In an equidistant lens, the distance of a pixel from the centre of the image is proportional to the angle
+        between the pixel's ray and the optical axis.
 
         Args:
             width: Width of the raw image (pixels).
             height: Height of the raw image (pixels).
-            field_of_view: Angle across the image's diagonal, in (0, 2 pi] (rad). The default is the 160 degrees of the
-                paper's sensor.
-            distance: Distance from the camera to the gel's outer face (m). The default is from the paper's code.
+            field_of_view: Field of view across the image's diagonal, in (0, 2 pi] (rad). The default is 160 degrees,
+                as in the sensor of the original paper.
+            distance: Distance from the camera to the gel's outer face (m). The default is the value in the code of the
+                original paper.
 
         Raises:
             ValueError: An argument is out of range.
@@ -144,16 +147,17 @@ class Lens:
 
     @property
     def largest_angle(self) -> float:
-        """Angle from the optical axis up to which the lens model is valid (rad), at most pi.
+        """Largest angle from the optical axis at which the lens model is valid (rad), at most pi.
 
-        Beyond this angle, the polynomial d decreases, so two angles would have the same pixel. No real lens behaves
-        like this.
+        Up to this angle, a larger angle is projected to a pixel farther from the pixel of the optical axis. Beyond it,
+        the polynomial of the model decreases, and two different angles would be projected to the same pixel. No real
+        lens behaves like this.
         """
         return _largest_angle(self.k)
 
 
 def rotation_matrix(vector: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Convert a rotation vector (rad) to a rotation matrix, shape (3, 3)."""
+    """Convert a rotation vector (axis times angle, rad) to a rotation matrix, shape (3, 3)."""
     angle = math.hypot(*vector)
     if angle == 0:
         return np.eye(3)
@@ -163,7 +167,7 @@ def rotation_matrix(vector: tuple[float, float, float]) -> NDArray[np.float64]:
 
 
 def project(lens: Lens, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Project points in the sensor frame to raw pixels.
+    """Project points in the sensor frame to raw pixels, which are pixels of the camera's unchanged image.
 
     Args:
         lens: The lens and the pose of the camera.
@@ -171,10 +175,10 @@ def project(lens: Lens, points: NDArray[np.floating]) -> NDArray[np.float64]:
 
     Returns:
         Raw pixel coordinates (column, row), shape (..., 2). They may lie outside of the image. They are NaN for points
-        at angles beyond `Lens.largest_angle`.
+        at larger angles from the optical axis than `Lens.largest_angle`.
 
     Raises:
-        ValueError: `points` has another shape.
+        ValueError: The last axis of `points` does not have length 3.
     """
     points = np.asarray(points, np.float64)
     if points.shape[-1:] != (3,):
@@ -183,14 +187,15 @@ def project(lens: Lens, points: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Project points in the camera frame to raw pixels, as `project` does.
+    """Project points in the camera frame to raw pixels, as `project` does for points in the sensor frame.
 
     Args:
         lens: The lens.
         points: Points in the camera frame (m), shape (..., 3).
 
     Returns:
-        Raw pixel coordinates (column, row), shape (..., 2).
+        Raw pixel coordinates (column, row), shape (..., 2). They are NaN for points at larger angles from the optical
+        axis than `Lens.largest_angle`.
     """
     radius = np.hypot(points[..., 0], points[..., 1])
     angle = np.arctan2(radius, points[..., 2])
@@ -200,14 +205,14 @@ def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Compute the rays of raw pixels, the inverse of `project_camera`.
+    """Compute the direction of the ray that meets each raw pixel. This is the inverse of `project_camera`.
 
     Args:
         lens: The lens.
         pixels: Raw pixel coordinates (column, row), shape (..., 2).
 
     Returns:
-        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels at angles beyond
+        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels that correspond to no angle up to
         `Lens.largest_angle`.
     """
     pixels = np.asarray(pixels, np.float64)
@@ -221,18 +226,22 @@ def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
 def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDArray[np.float32]:
     """Compute the raw pixel that corresponds to each pixel of the rectified image.
 
+    The raw image comes from the real camera. The rectified image shows the view of the simulated pinhole camera. Two
+    pixels correspond if their rays meet the gel's outer face at the same point.
+
     Args:
-        lens: The lens and the pose of the camera.
-        pinhole: The view of the sensor, such as `Sensor.camera`.
-        resolution: Height and width of the rectified image (pixels). The image shows the largest centred part of the
-            view with this aspect ratio, as `sts_jax.sense` does.
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
+        resolution: Height and width of the rectified image (pixels). If the aspect ratio of the view is different, the
+            view is cropped around its centre.
 
     Returns:
-        Raw pixel coordinates (column, row) of each pixel, shape (height, width, 2). Some lie outside of the raw image
-        if the camera does not see the whole view.
+        Raw pixel coordinates (column, row) of each rectified pixel, shape (height, width, 2). Some lie outside of the
+        raw image if the camera does not see the whole view.
 
     Raises:
-        ValueError: The view contains rays beyond `Lens.largest_angle`, or `resolution` or `pinhole` is out of range.
+        ValueError: The view contains rays at larger angles than `Lens.largest_angle`, or `resolution` or `pinhole` is
+            out of range.
     """
     left, top, width, height = window(pinhole, resolution)
     rows, columns = resolution
@@ -244,39 +253,41 @@ def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> 
         pixels[band] = project(lens, np.stack([grid_x, grid_y, np.zeros_like(grid_x)], axis=-1))
     if np.isnan(pixels).any():
         raise ValueError(
-            f"the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from its optical axis, but the "
-            "sensor's view needs larger angles. Calibrate it again, with images of the board in the corners of the "
-            "view."
+            f"the model of the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from the optical "
+            "axis, but the sensor's view needs larger angles. Calibrate the lens again, with images of the board in "
+            "the corners of the view."
         )
     return pixels
 
 
 def rectified(lens: Lens, pinhole: Pinhole, image: NDArray[np.uint8], resolution: tuple[int, int]) -> NDArray[np.uint8]:
-    """Convert a raw image to the sensor's pinhole view.
+    """Rectify a raw image: convert the image of the real camera to the view of the simulated pinhole camera.
 
     Each rectified pixel is the mean of one or more samples of the raw image. Neighbouring samples are at most about one
-    raw pixel apart, so small images show no aliasing. The maps for the eight most recent combinations of lens, pinhole
-    and resolution are cached, because computing a map is slow.
+    raw pixel apart, so small images show no aliasing. Computing the positions of the samples is slow. They are cached
+    for the eight most recent combinations of `lens`, `pinhole` and `resolution`.
 
     Args:
-        lens: The lens and the pose of the camera.
-        pinhole: The view of the sensor, such as `Sensor.camera`.
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
         image: Raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
-        resolution: Height and width of the rectified image (pixels).
+        resolution: Height and width of the rectified image (pixels). If the aspect ratio of the view is different, the
+            view is cropped around its centre.
 
     Returns:
         Rectified image, shape (height, width) or (height, width, channels), uint8. Parts of the view that the camera
         does not see are black.
 
     Raises:
-        ValueError: The image is not uint8 or has another size than the lens, the view contains rays beyond
-            `Lens.largest_angle`, or `resolution` or `pinhole` is out of range.
+        ValueError: The image is not uint8, or its size is not that of `lens`. Or the view contains rays at larger
+            angles than `Lens.largest_angle`. Or `resolution` or `pinhole` is out of range.
     """
     _check_image(image)
     if image.shape[:2] != (lens.height, lens.width):
         raise ValueError(
-            f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated at "
-            f"{lens.width}x{lens.height}. Set the camera to the size of the lens, or calibrate again."
+            f"the image has {image.shape[1]}x{image.shape[0]} pixels, but the lens was calibrated with images of "
+            f"{lens.width}x{lens.height} pixels. Set the camera to {lens.width}x{lens.height} pixels, or calibrate the "
+            f"lens again with images of {image.shape[1]}x{image.shape[0]} pixels."
         )
     maps = _rectifying_maps(lens, _Values.of(pinhole), _checked(resolution))
     sampled = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
@@ -284,17 +295,22 @@ def rectified(lens: Lens, pinhole: Pinhole, image: NDArray[np.uint8], resolution
 
 
 def distortion(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDArray[np.float32]:
-    """Compute the pixel of the rectified image that corresponds to each raw pixel, the inverse of `rectification`.
+    """Compute the rectified pixel that corresponds to each raw pixel. This is the inverse of `rectification`.
+
+    The raw image comes from the real camera. The rectified image shows the view of the simulated pinhole camera. Two
+    pixels correspond if their rays meet the gel's outer face at the same point.
 
     Args:
-        lens: The lens and the pose of the camera.
-        pinhole: The view of the sensor, such as `Sensor.camera`.
-        resolution: Height and width of the rectified image (pixels).
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
+        resolution: Height and width of the rectified image (pixels). If the aspect ratio of the view is different, the
+            view is cropped around its centre.
 
     Returns:
-        Rectified pixel coordinates (column, row) of each raw pixel, shape (lens.height, lens.width, 2). Raw pixels
-        outside of the view have coordinates outside of the rectified image. Raw pixels whose ray does not meet the
-        plane of the gel's outer face, or exceeds `Lens.largest_angle`, have NaN.
+        Rectified pixel coordinates (column, row) of each raw pixel, shape (lens.height, lens.width, 2). They lie
+        outside of the rectified image for raw pixels outside of the view. They are NaN for a raw pixel whose ray does
+        not meet the plane of the gel's outer face, and for a raw pixel that corresponds to no angle up to
+        `Lens.largest_angle`.
 
     Raises:
         ValueError: `resolution` or `pinhole` is out of range.
@@ -310,19 +326,21 @@ def distorted(
     outside: float | tuple[float, float, float],
     samples: int | None = None,
 ) -> NDArray[np.uint8]:
-    """Convert a rectified image to the raw image that the camera would take of it, the inverse of `rectified`.
+    """Convert a rectified image to the raw image of the same scene. This is the inverse of `rectified`.
 
-    The maps for the two most recent combinations of lens, pinhole, size and `samples` are cached, because computing a
-    map is slow.
+    The rectified image shows the view of the simulated pinhole camera. The raw image is the image that the real camera
+    would take. Computing the positions of the samples is slow. They are cached for the two most recent combinations of
+    `lens`, `pinhole`, image size and `samples`.
 
     Args:
-        lens: The lens and the pose of the camera.
-        pinhole: The view of the sensor, such as `Sensor.camera`.
-        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show the
-            largest centred part of the view with its aspect ratio, as the images of `sts_jax.sense` do.
-        outside: Grey value or colour of the raw pixels outside of the view, 0 to 255.
-        samples: Number of samples per raw pixel in each direction. The samples are averaged. Fewer samples are faster.
-            None: as many as needed to avoid aliasing.
+        lens: The lens and the pose of the real camera.
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
+        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show
+            the whole view, as an image of `sts_jax.sense` does. If the aspect ratio of the image differs from that of
+            the view, the image must show the view cropped around its centre.
+        outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
+        samples: Number of samples per raw pixel in each direction. The raw pixel is the mean of its samples. Fewer
+            samples are faster. None: as many samples as needed to avoid aliasing.
 
     Returns:
         Raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
@@ -343,14 +361,15 @@ def distorted(
 def window(pinhole: Pinhole, resolution: tuple[int, int]) -> tuple[float, float, float, float]:
     """Return the rectangle of the gel's outer face that a rectified image shows.
 
-    The result equals that of `sts_jax.optics.full_window`, which this package does not import.
+    This function is equivalent to `sts_jax.optics.full_window`, but uses NumPy instead of JAX.
 
     Args:
-        pinhole: The view of the sensor, such as `Sensor.camera`.
-        resolution: Height and width of the rectified image (pixels).
+        pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
+        resolution: Height and width of the rectified image (pixels). If the aspect ratio of the view is different, the
+            view is cropped around its centre.
 
     Returns:
-        x of the left edge, y of the top edge, width and height, in the sensor frame (m).
+        x of the left edge, y of the top edge, width and height of the rectangle in the sensor frame (m).
 
     Raises:
         ValueError: `resolution` or `pinhole` is out of range.
@@ -454,7 +473,15 @@ def _averaged(image: NDArray, resolution: tuple[int, int]) -> NDArray:
 
 
 def distort_angle(k: Sequence[float], angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Evaluate the polynomial d of a `Lens` with coefficients `k` at angles from the optical axis (rad)."""
+    """Evaluate the polynomial d(a) = a + k_1 a^3 + k_2 a^5 + k_3 a^7 + k_4 a^9 of the lens model.
+
+    Args:
+        k: Coefficients k_1 to k_4 of the lens.
+        angle: Angles a from the optical axis (rad), of any shape.
+
+    Returns:
+        Distances d from the pixel of the optical axis, in units of the focal length, in the shape of `angle`.
+    """
     square = angle * angle
     return angle * (1 + square * (k[0] + square * (k[1] + square * (k[2] + square * k[3]))))
 

@@ -40,7 +40,7 @@ _QUALITY = (cv2.IMWRITE_JPEG_QUALITY, 95, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.
 
 
 def video_name(stream: str) -> str:
-    """Return the name of the video file of a stream, "visual" or "tactile"."""
+    """Return the file name of the video of a stream. `stream` is "visual" or "tactile"."""
     return f"{stream}.mkv"
 
 
@@ -54,8 +54,10 @@ class Recorder:
                 recorder.add(shot)
     ```
 
+    In this example, "bench" is the folder of the sensor file, and "runs/monday" is the new folder of the recording.
+
     When `add` returns, the image is in its file and survives if the process is killed. A power failure can lose the
-    last seconds, which the operating system has not written to the disk yet.
+    images of the last seconds, because the operating system writes them to the disk with a delay.
 
     Attributes:
         folder: Folder of the recording.
@@ -118,14 +120,14 @@ class Recorder:
             shot: Image to write. It must be later than all images that were added before.
 
         Raises:
-            ValueError: The image has another size than the images of the sensor.
+            ValueError: The size of the image differs from the size in the `origin` of this recorder.
             OSError: The disk is full or the folder is not writable. All images that were added before are kept.
         """
         height, width = self._size
         if shot.image.shape != (height, width, 3):
             raise ValueError(
-                f"the {shot.stream} image has shape {shot.image.shape}, but the images of this recording have "
-                f"{(height, width, 3)}: make a new recording for another size."
+                f"the {shot.stream} image has shape {shot.image.shape}, but all images of this recording must have "
+                f"shape {(height, width, 3)}: make a new recording for images of another size."
             )
         self._start_s = shot.time_s if self._start_s is None else self._start_s
         name, image = video_name(shot.stream), self._encoded(shot)

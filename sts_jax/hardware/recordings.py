@@ -84,8 +84,8 @@ class Recordings:
         trajectory.initial.visual.image, trajectory.final.tactile.image
     ```
 
-    A trajectory is read from disk, and its checksums are compared, each time it is accessed. The list of trajectories
-    is that at the time of loading.
+    Each access to a trajectory reads its files from disk and compares their checksums with the recorded ones. The
+    numbers of the trajectories are read once, by `load_recordings`. Later changes of the session do not change them.
 
     Attributes:
         folder: Folder of the session.
@@ -124,14 +124,15 @@ class Recordings:
     def images(self, convert: Callable[[Image], Image] = lambda image: image) -> Images:
         """Read the images of all trajectories into arrays.
 
-        The raw images of 500 trajectories of 1640 x 1232 pixels need 12 GB of memory. `convert` can make them smaller.
+        The raw images of 500 trajectories of 1640 x 1232 pixels need 12 GB of memory. Use `convert` to make them
+        smaller.
 
         Args:
-            convert: Function that is applied to each raw image, such as a rectification or a resize. All its results
-                must have the same shape.
+            convert: Function that is applied to each raw image, for example to rectify or to resize it. All results
+                must have the same shape. The default returns the raw image.
 
         Returns:
-            Four arrays, one for each stream of the initial and of the final pairs.
+            Four arrays: the initial visual, initial tactile, final visual and final tactile images.
 
         Raises:
             DamagedFileError: A file is missing or damaged.
@@ -152,7 +153,10 @@ class Recordings:
 
 
 def load_recordings(folder: str | os.PathLike) -> Recordings:
-    """List the confirmed trajectories of a session, whose images are read later. Another process may be collecting.
+    """List the confirmed trajectories of a session.
+
+    The images are read later, when a trajectory is accessed. Another process may add trajectories to the session at the
+    same time.
 
     Args:
         folder: Folder of the session, which contains `session.json`.
@@ -163,13 +167,13 @@ def load_recordings(folder: str | os.PathLike) -> Recordings:
     Raises:
         FileNotFoundError: There is no session in the folder.
         DamagedFileError: `session.json` is damaged.
-        ValueError: The session has another version of the format.
+        ValueError: The session was written in another version of the format.
     """
     return Recordings(folder)
 
 
 def read_session(folder: Path) -> dict[str, Any]:
-    """Read `session.json` and check its version. `load_recordings` lists the errors."""
+    """Return the content of `session.json` in a session's folder. The errors are those of `load_recordings`."""
     path = folder / SESSION
     try:
         content = _files.read_json(path, "restore it from a backup")
@@ -196,7 +200,7 @@ def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") ->
 
     Raises:
         LockedError: Another process is using the folder.
-        FileNotFoundError: There is no such session or trajectory, or a pair is missing.
+        FileNotFoundError: There is no such session or trajectory, or the trajectory lacks its initial or final images.
         DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
     """
@@ -205,7 +209,9 @@ def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") ->
 
 
 def discard_recording(folder: str | os.PathLike, number: int) -> None:
-    """Move a trajectory to the folder `discarded`. Nothing is deleted.
+    """Discard a trajectory, so that `load_recordings` leaves it out. Its files move to the folder `discarded`.
+
+    Nothing is deleted. `restore_recording` undoes the change.
 
     Args:
         folder: Folder of the session.
@@ -223,7 +229,7 @@ def discard_recording(folder: str | os.PathLike, number: int) -> None:
 
 
 def restore_recording(folder: str | os.PathLike, number: int) -> None:
-    """Move a trajectory back from the folder `discarded`. If it was confirmed before, it is confirmed again.
+    """Restore a discarded trajectory. If it was confirmed before it was discarded, it is confirmed again.
 
     Args:
         folder: Folder of the session.
@@ -250,12 +256,18 @@ def _locked(folder: str | os.PathLike) -> Iterator[Path]:
 
 
 def trajectory_folder(folder: Path, number: int, *, discarded: bool = False) -> Path:
-    """Return the folder of a trajectory in the folder of a session."""
+    """Return the path of a trajectory's folder.
+
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
+        discarded: If True, return the path that the trajectory has after it was discarded.
+    """
     return folder / (DISCARDED if discarded else TRAJECTORIES) / f"{number:05d}"
 
 
 def list_recordings(folder: str | os.PathLike) -> list[Entry]:
-    """List all trajectories of a session, also unconfirmed and discarded ones.
+    """List all trajectories of a session, including unconfirmed and discarded trajectories.
 
     Args:
         folder: Folder of the session.
@@ -281,7 +293,8 @@ def next_recording(folder: str | os.PathLike) -> int:
         folder: Folder of the session.
 
     Returns:
-        The largest number of all trajectories, also discarded ones, plus 1. 0 if there is no trajectory or no session.
+        The largest number of all existing trajectories plus 1. Discarded trajectories count too. If there is no
+        trajectory or no session, the result is 0.
     """
     return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1
 
@@ -311,14 +324,14 @@ def _entry(path: Path, number: int, *, discarded: bool) -> Entry:
 
 
 def encoded_pair(pair: Pair, settling: Settling | None) -> dict[str, bytes]:
-    """Encode a pair as the content of its files.
+    """Encode a pair of images as the files `visual.png`, `tactile.png` and `pair.json`.
 
     Args:
-        pair: The images and their proofs.
-        settling: Settling times to store with the pair. None: not stored.
+        pair: The images, with the times that prove which lights were on.
+        settling: Settling times of the sensor's lights, which are stored in `pair.json`. None: not stored.
 
     Returns:
-        Content of each file, by name.
+        Content of each file, by file name.
     """
     files: dict[str, bytes] = {}
     content: dict[str, Any] = {
@@ -345,7 +358,10 @@ def encoded(image: Image) -> bytes:
     """Encode an RGB image as PNG."""
     done, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _PNG)
     if not done:
-        raise ValueError(f"an image of shape {image.shape} cannot be encoded as PNG")
+        raise ValueError(
+            f"OpenCV cannot encode an image of type {image.dtype} and shape {image.shape} as PNG: use an image of type "
+            "uint8 and shape (height, width, 3)"
+        )
     return data.tobytes()
 
 
@@ -358,7 +374,7 @@ def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
         note: Text that is stored with the trajectory.
 
     Raises:
-        FileNotFoundError: A pair is missing.
+        FileNotFoundError: The trajectory does not exist, or lacks its initial or final pair of images.
         OSError: The file cannot be written.
     """
     path = trajectory_folder(folder, number)
@@ -373,12 +389,19 @@ def _pair_sum(path: Path, end: str) -> str:
     """The SHA-256 of the file `pair.json` of a pair."""
     file = path / end / PAIR
     if not file.exists():
-        raise FileNotFoundError(f"trajectory {path.name} has no {end} pair, so it cannot be confirmed: discard it.")
+        raise FileNotFoundError(
+            f"trajectory {path.name} cannot be confirmed, because it has no {end} pair of images ({file} does not "
+            "exist): discard the trajectory, or give another number."
+        )
     return _files.sha256(file)
 
 
 def discard_trajectory(folder: Path, number: int) -> None:
     """Move a trajectory to the folder `discarded`. Nothing is deleted. The caller must have locked the session.
+
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
 
     Raises:
         FileNotFoundError: There is no such trajectory.
@@ -391,6 +414,10 @@ def discard_trajectory(folder: Path, number: int) -> None:
 def restore_trajectory(folder: Path, number: int) -> None:
     """Move a trajectory back from the folder `discarded`. The caller must have locked the session.
 
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
+
     Raises:
         FileNotFoundError: There is no such discarded trajectory.
         FileExistsError: There is another trajectory of the same number.
@@ -401,7 +428,9 @@ def restore_trajectory(folder: Path, number: int) -> None:
 
 def _move(source: Path, target: Path) -> None:
     if not source.is_dir():
-        raise FileNotFoundError(f"{source} does not exist: list the trajectories to see their numbers.")
+        raise FileNotFoundError(
+            f"trajectory folder {source} does not exist: list the trajectories with list_recordings()."
+        )
     if target.exists():
         raise FileExistsError(
             f"{source} cannot be moved to {target}, which exists already: rename one of the two folders to an "
@@ -414,7 +443,11 @@ def _move(source: Path, target: Path) -> None:
 
 
 def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
-    """Read a confirmed trajectory and compare all checksums.
+    """Read a confirmed trajectory, and compare the checksums of its files with the recorded ones.
+
+    Args:
+        folder: Folder of the session.
+        number: Number of the trajectory.
 
     Raises:
         FileNotFoundError: There is no such confirmed trajectory.
@@ -424,12 +457,12 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
     file = path / CONFIRMED
     if not file.exists():
         raise FileNotFoundError(
-            f"{folder} has no confirmed trajectory {number}: list the trajectories to see their numbers."
+            f"{folder} has no confirmed trajectory {number}: list the trajectories with list_recordings()."
         )
     content = _files.read_json(file, _remedy(number))
     checksum = content.pop("checksum", None) if isinstance(content, dict) else None
     if checksum != _files.digest(content):
-        raise DamagedFileError(f"{file} is damaged, because its checksum differs: {_remedy(number)}.")
+        raise DamagedFileError(f"{file} is damaged (its checksum does not match its content): {_remedy(number)}.")
     if content["number"] != number:
         raise DamagedFileError(
             f"{file} belongs to trajectory {content['number']}, not to trajectory {number}: rename the folder to "
@@ -440,10 +473,10 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
 
 
 def read_pair(path: Path, number: int, checksum: str | None = None) -> Pair:
-    """Read a pair and compare the checksums of its images.
+    """Read a pair of images, and compare their checksums with those in `pair.json`.
 
     Args:
-        path: Folder of the pair.
+        path: Folder of the pair, which contains `pair.json`.
         number: Number of the trajectory, for error messages.
         checksum: Expected SHA-256 of `pair.json`. None: not compared.
 
@@ -469,10 +502,10 @@ def _checked(path: Path, checksum: str | None, number: int) -> bytes:
     except OSError as error:
         raise DamagedFileError(f"{path} cannot be read ({error}): {_remedy(number)}.") from error
     if checksum is not None and hashlib.sha256(data).hexdigest() != checksum:
-        raise DamagedFileError(f"{path} is damaged, because its checksum differs: {_remedy(number)}.")
+        raise DamagedFileError(f"{path} is damaged (its checksum differs from the recorded one): {_remedy(number)}.")
     return data
 
 
 def _remedy(number: int) -> str:
     """The remedy for a damaged trajectory, for error messages."""
-    return f"restore it from a backup, or discard trajectory {number}"
+    return f"restore the file from a backup, or discard trajectory {number} with discard_recording()"

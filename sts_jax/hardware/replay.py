@@ -29,13 +29,14 @@ class Replay:
         pair = sensor.read()
     ```
 
-    The replay imitates the timing of the sensor: each image becomes available as long after `connect` as it arrived
-    after the beginning of the recording. A program that reads too slowly misses images, as with a sensor, and `skipped`
-    counts them. With `speed=None`, the replay waits for the program instead and returns every image.
+    The replay imitates the timing of the sensor. An image that arrived 2 s after the beginning of the recording becomes
+    available 2 s after `connect`. With `speed=2`, it becomes available after 1 s. A program that reads too slowly
+    misses images, as with a sensor, and `skipped` counts them. With `speed=None`, the replay waits for the program
+    instead and returns every image.
 
-    The times of a `Shot` are on the clock `time.monotonic`. Differences of times are those of the recording, divided by
-    the speed. A replay cannot switch lights, so the images of both streams have their recorded order. Only one thread
-    at a time may use a replay.
+    The times of a `Shot` are on the clock `time.monotonic` of the replay. The time between two images is that of the
+    recording, divided by the speed. A replay cannot switch lights, so it returns the images of both streams in the
+    order of the recording. Only one thread at a time may use a replay.
 
     Attributes:
         skipped: Number of images since `connect` that were not returned because the program read too slowly.
@@ -77,12 +78,12 @@ class Replay:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike, *, speed: float | None = 1.0, loop: bool = False) -> "Replay":
-        """Create a replay from the copy of the sensor file in a recording. The counterpart of `STS.from_file`.
+        """Create a replay of a recording. A program can call this method instead of `STS.from_file`.
 
         Args:
-            path: Path of the sensor file in the folder of a recording, or path of this folder.
+            path: Path of the recording's folder, or of the file `sensor.json` in this folder.
             speed: Seconds of the recording that are played per second, > 0. None: as fast as the program reads.
-            loop: If True, the replay starts again at the end.
+            loop: If True, the replay continues from the beginning after the end of the recording.
 
         Returns:
             The replay, which is not connected yet.
@@ -116,8 +117,9 @@ class Replay:
             FileNotFoundError: There is no recording, or one of its files is missing.
             DamagedFileError: A file of the recording is damaged or truncated.
             CameraError: A video cannot be read.
-            ValueError: `warmup_s` or `fps` is out of range, the recording is empty or of another format, or the two
-                videos have different lengths.
+            ValueError: `warmup_s`, or the constructor argument `fps`, is out of range. Or the recording is empty or was
+                written in another version of the format. Or the lengths of the two videos differ by more than one
+                frame.
         """
         if not 0 <= warmup_s < math.inf:
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -146,9 +148,9 @@ class Replay:
             film.close()
 
     def read(self, timeout_ms: float | None = None) -> Pair:
-        """Return the next pair whose two images become available after the call.
+        """Wait for the next pair whose two images become available after the call, and return it.
 
-        With `speed=None`, this is the pair after the last one that was returned.
+        With `speed=None`, return the pair that follows the last returned pair, without waiting.
 
         Args:
             timeout_ms: Longest wait (ms). None: no limit.
@@ -159,8 +161,8 @@ class Replay:
         Raises:
             ValueError: `timeout_ms` is not positive.
             CameraNotConnectedError: The replay is not connected.
-            LightError: No pair becomes available in time.
-            EndOfVideoError: There are no more pairs.
+            LightError: No pair becomes available within `timeout_ms`.
+            EndOfVideoError: The recording has no more pairs.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
             DamagedFileError: An image of the recording is damaged.
         """
@@ -174,7 +176,7 @@ class Replay:
     def async_read(self, timeout_ms: float | None = None) -> Pair:
         """Return the newest available pair that was not returned yet, or wait for the next one.
 
-        With `speed=None`, this is the pair after the last one that was returned.
+        With `speed=None`, return the pair that follows the last returned pair, without waiting.
 
         Args:
             timeout_ms: Longest wait (ms). None: no limit.
@@ -185,8 +187,8 @@ class Replay:
         Raises:
             ValueError: `timeout_ms` is not positive.
             CameraNotConnectedError: The replay is not connected.
-            LightError: No pair becomes available in time.
-            EndOfVideoError: There are no more pairs.
+            LightError: No pair becomes available within `timeout_ms`.
+            EndOfVideoError: The recording has no more pairs.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
             DamagedFileError: An image of the recording is damaged.
         """
@@ -210,7 +212,7 @@ class Replay:
             ValueError: `max_age_ms` is not positive.
             CameraNotConnectedError: The replay is not connected.
             StaleFrameError: The newest pair is older than `max_age_ms`, or no pair is available yet.
-            EndOfVideoError: The newest pair is older than `max_age_ms`, and there are no more pairs.
+            EndOfVideoError: The newest pair is older than `max_age_ms`, and the recording has no more pairs.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
             DamagedFileError: An image of the recording is damaged.
         """
@@ -233,9 +235,9 @@ class Replay:
         """Iterate over the images in the order of the recording.
 
         Args:
-            duty: Share of tactile images, 0 to 1, as in `STS.stream`. The streams of the returned images follow from
-                `duty` and `dwell`, and recorded images of the other stream are left out. None: all recorded images.
-            dwell: Number of successive images of one stream, >= 1. It has no effect if `duty` is None.
+            duty: Share of tactile images, 0 to 1. `duty` and `dwell` determine the stream of each returned image, as
+                in `STS.stream`. Recorded images of the other stream are skipped. None: return all recorded images.
+            dwell: Number of successive images of the same stream, >= 1. It has no effect if `duty` is None.
 
         Returns:
             An iterator of images. Each step waits until its image is available. At the end of the recording, it raises
@@ -244,7 +246,7 @@ class Replay:
         Raises:
             ValueError: An argument is out of range.
             CameraNotConnectedError: The replay is not connected.
-            CameraError: The recording has no images of a stream that `duty` needs.
+            CameraError: The recording has images of one stream only, but `duty` requires the other stream.
         """
         self._opened()
         if duty is None:
@@ -256,14 +258,14 @@ class Replay:
         return self._images(order)
 
     def wait_until_still(self, timeout_s: float = 10.0, *, window_s: float = 0.5) -> Shot:
-        """Wait until nothing moves in the visual stream, by the same criterion as `STS.wait_until_still`.
+        """Wait until nothing moves in the visual stream. `STS.wait_until_still` describes the criterion.
 
         Args:
-            timeout_s: Longest wait, in the time of the recording (s).
-            window_s: Time without movement, in the time of the recording (s).
+            timeout_s: Longest wait, in seconds of the recording.
+            window_s: Time during which nothing may move, in seconds of the recording.
 
         Returns:
-            The last image of the time without movement.
+            The image at the end of the first `window_s` seconds without movement.
 
         Raises:
             NotStillError: Something still moves after `timeout_s`.

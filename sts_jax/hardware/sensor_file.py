@@ -55,17 +55,19 @@ class Background:
 
     def __post_init__(self) -> None:
         if not self.name or self.name != Path(self.name).name:
-            raise ValueError(f"name of a background must be a file name without folder, got {self.name!r}")
+            raise ValueError(f"name of a background must be a file name without a folder, got {self.name!r}")
         if not re.fullmatch("[0-9a-f]{64}", self.sha256):
             raise ValueError(f"sha256 of {self.name} must have 64 hexadecimal digits, got {self.sha256!r}")
 
 
 @dataclasses.dataclass(frozen=True)
 class Device:
-    """The description of a commissioned sensor: its camera, lights and lens, and the values that were measured.
+    """The description of a real sensor, which `python -m experiments.commission` measures and stores in a sensor file.
+
+    It describes the camera, the LED controller, the lens and the measured settings.
 
     Raises:
-        ValueError: A value is out of range.
+        ValueError: A field is out of range.
     """
 
     camera: str  # path in /dev/v4l/by-id, or URL. The user name and the password of a URL are removed
@@ -74,7 +76,7 @@ class Device:
     lens: Lens  # lens and pose of the camera, with the width and height of the raw images
     settle_on_s: float  # time from the acknowledgement that the light is on to the first frame that shows it fully (s)
     settle_off_s: float  # time from the acknowledgement that the light is off to the first frame fully without it (s)
-    levels: protocol.Levels  # duty cycles of the channels in the tactile stream, 0 to 255
+    levels: protocol.Levels  # duty cycles of the four LED channels in the tactile stream, 0 to 255
     commissioned: str  # date of the commissioning, ISO 8601
     exposure_visual: float | None = None  # exposure of the visual stream in the driver's unit, None: not set
     exposure_tactile: float | None = None  # exposure of the tactile stream in the driver's unit, None: not set
@@ -127,16 +129,20 @@ class Device:
 
     @property
     def exposures(self) -> tuple[float, float] | None:
-        """Exposures of the visual and the tactile stream in the driver's unit, or None if one of them is not set."""
+        """Exposure of the visual stream and exposure of the tactile stream, or None if one of the two is not set.
+
+        The unit is that of the camera's driver.
+        """
         if self.exposure_visual is None or self.exposure_tactile is None:
             return None
         return self.exposure_visual, self.exposure_tactile
 
     def camera_config(self, source: str | None = None) -> CameraConfig:
-        """Return the configuration with which the camera was commissioned.
+        """Return the configuration that the camera had when this device was measured.
 
         Args:
-            source: Another path or URL of the same camera, such as its URL with a password. None: `camera`.
+            source: Another path or URL of the same camera, such as its URL with a password. None: the path or URL in
+                the attribute `camera`.
         """
         config = CameraConfig(self.camera if source is None else source, self.width, self.height, fps=self.fps)
         if config.kind != "device":
@@ -157,32 +163,34 @@ class Device:
         visual: NDArray[np.uint8] | None = None,
         tactile: NDArray[np.uint8] | None = None,
     ) -> "Device":
-        """Write a sensor file, which `Device.load` and `sts_jax.Sensor.load` read, and its background images.
+        """Write a sensor file and the background images that it refers to.
 
-        The images are written first. Each file is written completely or not at all. If the process ends in between, an
-        earlier sensor file no longer matches the new images, and `Device.load` raises an error.
+        `Device.load` reads the device from the sensor file, and `sts_jax.Sensor.load` reads the constants. The images
+        are written before the sensor file, and no file is ever written partially. If the process is killed between
+        two files, an older sensor file in the folder does not match the new images, and `Device.load` raises an error.
 
         Args:
             path: Path of the file, ending in .json, or of a folder, in which the file is named `sensor.json`.
             constants: The constants of the simulated sensor, from `sts_jax.Sensor.constants()`. Their field `camera`
                 describes the rectified view.
-            visual: Raw image of the empty pad without light, RGB, shape (height, width, 3), uint8. None: keep the file
-                of `background_visual`.
-            tactile: Raw image of the empty pad with light, RGB, shape (height, width, 3), uint8. None: keep the file of
-                `background_tactile`.
+            visual: Raw image of the empty pad without light, RGB, shape (height, width, 3), uint8. None: the attribute
+                `background_visual` and its existing image file are kept.
+            tactile: Raw image of the empty pad with light, RGB, shape (height, width, 3), uint8. None: the attribute
+                `background_tactile` and its existing image file are kept.
 
         Returns:
-            A copy of this device with the backgrounds that were written.
+            A copy of this device that refers to the written background images.
 
         Raises:
             SensorFileError: The file of a background that is kept is missing or damaged.
-            ValueError: An image has another size than the lens or is not uint8, or `constants` are not the constants of
-                a simulated sensor.
+            ValueError: An image is not uint8 or does not have the shape (height, width, 3) of this device's lens, or
+                `constants` are not the constants of a simulated sensor.
             OSError: A file cannot be written.
         """
         if "camera" not in constants or "device" in constants:
             raise ValueError(
-                "constants must be the constants of a simulated sensor: pass `sts_jax.Sensor.load(...).constants()`"
+                "constants must be the constants of a simulated sensor, with the field 'camera' and without the field "
+                f"'device', got the fields {list(constants)}: pass `sts_jax.Sensor.load(...).constants()`"
             )
         file = sensor_file(path)
         for stream, image in (("visual", visual), ("tactile", tactile)):
@@ -199,7 +207,7 @@ class Device:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Device":
-        """Read the device from a sensor file, and compare the checksums of the background images.
+        """Read the device from a sensor file, and compare the background images with the checksums in the file.
 
         Args:
             path: Path of the sensor file or of its folder.
@@ -210,8 +218,8 @@ class Device:
         Raises:
             FileNotFoundError: There is no such file.
             OSError: The file cannot be read or is not JSON.
-            SensorFileError: The file describes no device or has another version, a field is missing, unknown or out of
-                range, or a background image is missing or damaged.
+            SensorFileError: The file describes no device, or was written in another version of the format. Or a field
+                is missing, unknown or out of range. Or a background image is missing or damaged.
         """
         file = sensor_file(path)
         values = _files.read_json(file, f"{_COMMISSION} again")
@@ -230,7 +238,7 @@ class Device:
         try:
             loaded = _decoded(cls, device, "device")
         except ValueError as error:
-            raise SensorFileError(f"{file}: {error}. Correct it, or {_COMMISSION} again.") from error
+            raise SensorFileError(f"{file}: {error}. Correct the file, or {_COMMISSION} again.") from error
         loaded._check_backgrounds(file)
         return loaded
 
@@ -250,7 +258,7 @@ class Device:
         """
         background = self._named(stream)
         if background is None:
-            raise SensorFileError(f"the sensor file has no {stream} background. To record it, {_COMMISSION}.")
+            raise SensorFileError(f"{sensor_file(path)} has no {stream} background. To record one, {_COMMISSION}.")
         image = _checked_image(sensor_file(path).with_name(background.name), background)
         self._check_image(stream, image)
         return image
@@ -273,7 +281,8 @@ class Device:
         if found:
             raise WrongDeviceError(
                 f"the sensor file describes camera {self.camera} and LED controller {self.leds}, but the connected "
-                f"device has {' and '.join(found)}. Load the file of the connected device. To make one, {_COMMISSION}."
+                f"sensor has {' and '.join(found)}. Load the sensor file of the connected sensor. If there is no such "
+                f"file, {_COMMISSION}."
             )
 
     def _named(self, stream: Stream) -> Background | None:
@@ -324,13 +333,14 @@ def _checked_content(path: Path, background: Background) -> bytes:
         content = path.read_bytes()
     except OSError as error:
         raise SensorFileError(
-            f"the background image {path} cannot be read ({error}). Copy it from the original folder of the sensor "
-            f"file, or {_COMMISSION} again."
+            f"the background image {path} cannot be read ({error}). Copy the image from the original folder of the "
+            f"sensor file, or {_COMMISSION} again."
         ) from error
     if hashlib.sha256(content).hexdigest() != background.sha256:
         raise SensorFileError(
-            f"the background image {path} is damaged or belongs to another sensor file, because its checksum differs. "
-            f"Copy it from the original folder of the sensor file, or {_COMMISSION} again."
+            f"the checksum of the background image {path} differs from the one in the sensor file, so the image is "
+            "damaged or belongs to another sensor file. Copy the image from the original folder of the sensor file, or "
+            f"{_COMMISSION} again."
         )
     return content
 

@@ -35,7 +35,7 @@ class Origin:
     leds: str  # serial number of the LED controller
     width: int  # width of the images (pixels)
     height: int  # height of the images (pixels)
-    levels: protocol.Levels  # duty cycles of the channels in the tactile stream, 0 to 255
+    levels: protocol.Levels  # duty cycles of the four LED channels in the tactile stream, 0 to 255
 
     @classmethod
     def of(cls, sensor: STS) -> "Origin":
@@ -72,7 +72,10 @@ class _Job:
 
 
 class Session:
-    """A folder to which trajectories are added, each with an initial and a final pair of images.
+    """A folder to which trajectories are added.
+
+    A trajectory consists of an initial pair of images, in which an object is held on the pad, and a final pair, in
+    which the released object is at rest.
 
     ```python
     with Session.open("runs/real/dataset", Origin.of(sensor)) as session:
@@ -87,8 +90,9 @@ class Session:
 
     A background thread writes the files, so `save` and `confirm` return at once. The trajectories that `confirmed`
     counts are on disk and survive a loss of power. If writing fails, for example because the disk is full, the thread
-    tries again every second, and `problem` describes the error. Changes that are not on disk yet wait in memory. There
-    is room for the changes of two trajectories, so call `check_ready` before each trajectory.
+    tries again every second, and `problem` describes the error. Changes (pairs of images, confirmations and discards)
+    that are not on disk yet wait in memory. At most 6 changes can wait, which are the changes of two trajectories. Call
+    `check_ready` before each trajectory, so that the session can accept all its changes.
     """
 
     def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):
@@ -118,11 +122,12 @@ class Session:
             settling: Settling times of the sensor's lights, which are stored with each pair. None: not stored.
 
         Returns:
-            The open session. Its first new trajectory has the number after all existing ones, also discarded ones.
+            The open session. Its first new trajectory has the largest number of all earlier trajectories plus 1, where
+            discarded trajectories count too. If there are none, the number is 0.
 
         Raises:
             LockedError: Another process is using the folder.
-            ValueError: The session has another origin. The message states both values.
+            ValueError: The existing session has another origin. The message contains the differing values.
             DamagedFileError: `session.json` is damaged.
             OSError: The folder cannot be written to.
         """
@@ -143,7 +148,7 @@ class Session:
 
     @property
     def confirmed(self) -> int:
-        """Number of confirmed trajectories that are on disk, without discarded ones."""
+        """Number of confirmed trajectories that are on disk. Discarded trajectories do not count."""
         with self._changed:
             return len(self._confirmed)
 
@@ -163,19 +168,24 @@ class Session:
         """Raise an error unless the session can accept a whole trajectory now.
 
         Raises:
-            SessionError: Writing fails, too many changes wait, or the disk has too little space.
+            SessionError: The last attempt to write failed, or more than 3 changes are not on disk yet, or the disk has
+                too little free space.
         """
         if (problem := self.problem) is not None:
-            raise SessionError(f"{self.waiting} changes are not on disk yet and wait in memory: {problem}")
+            raise SessionError(
+                f"cannot start a new trajectory, because {self.waiting} changes are not on disk yet: {problem}"
+            )
         if (waiting := self.waiting) > _QUEUE - _JOBS_OF_TRAJECTORY:
             raise SessionError(
-                f"the disk is too slow: {waiting} changes are not on disk yet. Wait until they are written."
+                f"cannot start a new trajectory, because the disk is too slow: {waiting} changes are not on disk yet, "
+                f"but at most {_QUEUE - _JOBS_OF_TRAJECTORY} are allowed. Wait until they are written, for example "
+                "with flush()."
             )
         free = shutil.disk_usage(self.folder).free
         if free < self._raw_bytes * 2:  # for the new trajectory and for one that may wait
             raise SessionError(
-                f"only {free / 1e6:.0f} MB are free in {self.folder}, and two trajectories need up to "
-                f"{2 * self._raw_bytes / 1e6:.0f} MB: free some disk space."
+                f"cannot start a new trajectory, because only {free / 1e6:.0f} MB are free in {self.folder}, and two "
+                f"trajectories need up to {2 * self._raw_bytes / 1e6:.0f} MB: free some disk space."
             )
 
     def begin(self) -> int:
@@ -184,15 +194,16 @@ class Session:
         return number
 
     def save(self, number: int, end: End, pair: Pair) -> None:
-        """Write a pair of images in the background.
+        """Write a pair of images to disk in the background.
 
         Args:
             number: Number of the trajectory, from `begin`.
-            end: "initial" for the pair of the held object, "final" for the pair of the object at rest.
+            end: "initial" if the images show the object while it is held, "final" if they show the object at rest after
+                its release.
             pair: The images.
 
         Raises:
-            SessionError: Too many changes wait, or the session is closed. The pair was not accepted.
+            SessionError: 6 changes are not on disk yet, or the session is closed. The pair will not be written.
         """
         folder = recordings.trajectory_folder(self.folder, number)
 
@@ -206,20 +217,21 @@ class Session:
         self._saved.add((number, end))
 
     def confirm(self, number: int, note: str = "") -> None:
-        """Confirm a trajectory in the background. Only confirmed trajectories are read by `load_recordings`.
+        """Confirm a trajectory in the background. `load_recordings` reads only confirmed trajectories.
 
         Args:
             number: Number of the trajectory, from `begin`. Both of its pairs must have been passed to `save`.
             note: Text that is stored with the trajectory.
 
         Raises:
-            SessionError: Too many changes wait, or the session is closed. The confirmation was not accepted.
-            ValueError: A pair was not passed to `save` in this session.
+            SessionError: 6 changes are not on disk yet, or the session is closed. The trajectory is not confirmed.
+            ValueError: The initial or the final pair of the trajectory was not passed to `save` of this object.
         """
         ends: tuple[End, End] = ("initial", "final")
         if missing := [end for end in ends if (number, end) not in self._saved]:
             raise ValueError(
-                f"trajectory {number} cannot be confirmed before save() of its {' and '.join(missing)} pair"
+                f"trajectory {number} cannot be confirmed, because save() was not called with its "
+                f"{' and '.join(missing)} pair: call save() before confirm()"
             )
         write = lambda: recordings.confirm_trajectory(self.folder, number, note)  # noqa: E731
         self._add(_Job(f"the confirmation of trajectory {number}", write, number))
@@ -228,10 +240,10 @@ class Session:
         """Move a trajectory to the folder `discarded` in the background. Nothing is deleted.
 
         Args:
-            number: Number of the trajectory. If none of its pairs was saved, nothing happens.
+            number: Number of the trajectory. If the trajectory has no saved pair, nothing happens.
 
         Raises:
-            SessionError: Too many changes wait, or the session is closed. The change was not accepted.
+            SessionError: 6 changes are not on disk yet, or the session is closed. The trajectory is not discarded.
         """
 
         def move() -> None:
@@ -249,7 +261,7 @@ class Session:
             timeout_s: Longest wait (s).
 
         Raises:
-            SessionError: Changes were not on disk in time. The message lists them and states the cause.
+            SessionError: After `timeout_s`, some changes are not on disk. The message lists them and gives the cause.
         """
         with self._changed:
             if self._changed.wait_for(lambda: not self._jobs, timeout_s):
@@ -265,7 +277,8 @@ class Session:
             timeout_s: Longest wait for the changes (s).
 
         Raises:
-            SessionError: Changes were not on disk in time, and are lost. The message lists them and states the cause.
+            SessionError: After `timeout_s`, some changes are not on disk. They are lost. The message lists them and
+                gives the cause.
         """
         try:
             self.flush(timeout_s)
@@ -288,11 +301,11 @@ class Session:
         """Append a job to the queue of the background thread."""
         with self._changed:
             if self._closing:
-                raise SessionError(f"the session of {self.folder} is closed: open it again.")
+                raise SessionError(f"the session of {self.folder} is closed: open it again with Session.open().")
             if len(self._jobs) >= _QUEUE:
                 raise SessionError(
-                    f"{len(self._jobs)} changes are not on disk yet, so {job.name} was not accepted: call "
-                    "check_ready() before each trajectory."
+                    f"{job.name} was not accepted, because {len(self._jobs)} changes are not on disk yet: wait with "
+                    "flush() and try again. To avoid this error, call check_ready() before each trajectory."
                 )
             self._jobs.append(job)
             self._changed.notify_all()

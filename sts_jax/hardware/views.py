@@ -13,7 +13,7 @@ Progress = Callable[[int, int], None]  # called with the number of trajectories 
 
 
 class SensorView(NamedTuple):
-    """Rectified images of both streams at one time, in the format of `Predictor`."""
+    """Rectified images of both streams at one time, for the arguments `visual` and `tactile` of a `Predictor`."""
 
     visual: Float[np.ndarray, "height width 3"]  # visual image, RGB, float32 in [0, 1]
     tactile: Float[np.ndarray, "height width 3"]  # tactile image, RGB, float32 in [0, 1]
@@ -37,8 +37,8 @@ def sensor_view(
     """Rectify the two raw images of a pair, or the two backgrounds of a sensor file.
 
     Args:
-        lens: Lens and pose of the camera, `Device.lens`.
-        pinhole: View of the sensor, `Sensor.camera`.
+        lens: Lens and pose of the real camera, from `Device.lens`.
+        pinhole: The simulated pinhole camera that defines the view, from `Sensor.camera`.
         visual: Raw visual image, RGB, uint8. For a pair of `STS.read` or of a recording, it is `pair.visual.image`.
         tactile: Raw tactile image, RGB, uint8. For a pair, it is `pair.tactile.image`.
         resolution: Height and width of the rectified images (pixels), usually `Predictor.preprocessing.resolution`.
@@ -47,27 +47,27 @@ def sensor_view(
         The rectified images. Each pixel is the mean of the raw image over the pixel's area.
 
     Raises:
-        ValueError: An image has another size than the lens or is not uint8, `resolution` is out of range, or the view
-            contains rays beyond `Lens.largest_angle`.
+        ValueError: An image is not uint8, or its size is not that of `lens`. Or `resolution` is out of range. Or the
+            view contains rays at larger angles than `Lens.largest_angle`.
     """
     images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
     return SensorView(*(image.astype(np.float32) / 255 for image in images))
 
 
 def relit(view: SensorView, background: SensorView, empty: SensorView) -> SensorView:
-    """Adapt the brightness and colours of a view to the sensor on which a model was trained.
+    """Adapt the brightness and colours of images to those of the sensor on which a model was trained.
 
-    Each pixel is multiplied by `empty / background` and clipped to [0, 1]. `background` is limited to at least 1/255.
-    A model interprets every difference from the empty pad of its training images as an object. Without this adaptation,
-    the vignetting of another camera or a dark border of its view would count as objects.
+    The result is `view * empty / background` for each pixel, clipped to [0, 1]. Values of `background` below 1/255 are
+    replaced by 1/255. A model regards every difference from the empty pad of its training images as part of an object.
+    Without this adaptation, the vignetting of another camera or a dark border of its images would count as an object.
 
     Args:
         view: Rectified images of a sensor.
-        background: Rectified images of the same sensor's empty pad.
-        empty: Images of the empty pad that the model was trained on, `SensorView(**predictor.empty)`.
+        background: Rectified images of the same sensor's empty pad, from `sensor_view`.
+        empty: Images of the empty pad of the sensor on which the model was trained, `SensorView(**predictor.empty)`.
 
     Returns:
-        The view as if the sensor of the model had taken it.
+        The images that the sensor of the model would have taken of the same scene.
 
     Raises:
         ValueError: The three arguments have different resolutions.
@@ -75,8 +75,8 @@ def relit(view: SensorView, background: SensorView, empty: SensorView) -> Sensor
     shapes = {name: own.visual.shape for name, own in (("view", view), ("background", background), ("empty", empty))}
     if len(set(shapes.values())) > 1:
         raise ValueError(
-            f"the visual images have the shapes {shapes}, but the shapes must be equal: rectify all of them with the "
-            "same resolution"
+            f"the visual images of view, background and empty must have the same shape, got {shapes}: rectify all of "
+            "them with the same resolution"
         )
     return SensorView(
         *(
@@ -98,8 +98,8 @@ def recorded_images(
 
     Args:
         recordings: Confirmed trajectories, from `load_recordings`.
-        lens: Lens and pose of the camera, `Device.lens`.
-        pinhole: View of the sensor, `Sensor.camera`.
+        lens: Lens and pose of the real camera, from `Device.lens`.
+        pinhole: The simulated pinhole camera that defines the view, from `Sensor.camera`.
         resolution: Height and width of the rectified images (pixels).
         progress: Function that is called after each trajectory, with the number of trajectories that are done and with
             their total.
@@ -108,7 +108,7 @@ def recorded_images(
         The rectified images, in the order of the trajectories' numbers.
 
     Raises:
-        ValueError: There is no confirmed trajectory, or the images have another size than the lens.
+        ValueError: There is no confirmed trajectory, or the size of the images is not that of `lens`.
         DamagedFileError: A file is missing or damaged.
     """
     width, height = recordings.session["width"], recordings.session["height"]
