@@ -51,7 +51,10 @@ class Args:
 
     def __post_init__(self) -> None:
         if self.times < 2:
-            raise ValueError(f"--times must be at least 2 to compare the final poses of a start, got {self.times}")
+            raise ValueError(
+                "--times, the number of simulations of each start, must be at least 2 to compare their final poses, "
+                f"got {self.times}"
+            )
 
 
 def spread(start: np.ndarray, end: np.ndarray, outcome: np.ndarray) -> list[str]:

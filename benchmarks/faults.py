@@ -74,9 +74,12 @@ class Args:
         if self.number < 1:
             raise ValueError(f"--number must be at least 1, got {self.number}")
         if not 0 <= self.long <= 1:
-            raise ValueError(f"--long must be in [0, 1], got {self.long}")
+            raise ValueError(f"--long is a share of the faults and must be in [0, 1], got {self.long}")
         if unknown := set(self.only) - set(KINDS) - {KILLED}:
-            raise ValueError(f"--only has unknown kinds {sorted(unknown)}, known are: {', '.join([*KINDS, KILLED])}")
+            raise ValueError(
+                f"--only has unknown kinds {sorted(unknown)}, but each kind must be one of: "
+                f"{', '.join([*KINDS, KILLED])}"
+            )
 
 
 @dataclasses.dataclass
@@ -367,8 +370,8 @@ def kill(bench: Bench, count: Count) -> None:
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
             raise RuntimeError(
-                "no light was on when the reading program was to be killed (status of the program: "
-                f"{process.poll()}, None if it still runs)"
+                "the reading program must be killed while a light is on, but no light turned on in time or the program "
+                f"ended early: the program's exit status is {process.poll()} (None if it still runs)"
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

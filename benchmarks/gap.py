@@ -95,7 +95,8 @@ def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
         truth, image = device.capture()
         if not truth.lowest == truth.highest == light:
             raise AssertionError(
-                f"the light of the {stream} frame must be {light} throughout, got {truth.lowest} to {truth.highest}"
+                f"the light during the exposure of the {stream} frame must be constant at {light} of its full "
+                f"brightness, got {truth.lowest} to {truth.highest}"
             )
         after = device.ping()
         shots.append(hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s))
@@ -116,7 +117,7 @@ def release(device: twin.Twin) -> None:
     until_s = device.now_s + LONGEST_S
     while device.state.phase != twin.Phase.STILL:
         if device.now_s > until_s:
-            raise AssertionError(f"the object still moves after {LONGEST_S} s")
+            raise AssertionError(f"the object of the twin still moves {LONGEST_S} s after its release")
         device.step(0.1)
 
 

@@ -114,10 +114,12 @@ class Args:
     def __post_init__(self) -> None:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
-            raise ValueError(f"parts of {self.scenario} must be some of {', '.join(known)}, got {' '.join(unknown)}")
+            raise ValueError(
+                f"each part must be one of {', '.join(known)} for --scenario {self.scenario}, got {', '.join(unknown)}"
+            )
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:
-            raise ValueError(f"--soaked provides the starts, so leave out {' and '.join(unused)}")
+            raise ValueError(f"--soaked provides the simulated starts: leave out {' and '.join(unused)}")
 
 
 def outcomes(study: Study, starts: Starts) -> None:

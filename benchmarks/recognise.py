@@ -45,7 +45,8 @@ def main(args: Args) -> str:
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:
         raise ValueError(
-            f"--first is {args.first}: fewer than {NUMBER} held-out trajectories follow, so give a smaller --first"
+            f"--first is {args.first}, but only {len(rows)} held-out trajectories begin there and {NUMBER} are needed: "
+            "give a smaller --first"
         )
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")

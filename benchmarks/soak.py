@@ -157,7 +157,8 @@ def soaked(folder: Path, name: str) -> Starts:
     claimed, paths = folder / f"{name}.json", sorted(folder.glob(f"{name}-????.npz"))
     if not (claimed.exists() and paths):
         raise FileNotFoundError(
-            f"{folder} has no block {name}-*.npz: make blocks with python -m benchmarks.soak --keep {folder}"
+            f"{folder} has no blocks of trajectories ({name}.json and {name}-*.npz): make them with "
+            f"python -m benchmarks.soak --keep {folder}"
         )
     claim(folder, name, json.loads(claimed.read_text())["block"])
     parts = []

@@ -11,8 +11,8 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ("--soaked a --keep b --objects 200", "--soaked provides the starts, so leave out --objects and --keep"),
-        ("fill --scenario inclined", "parts of inclined must be some of outcomes, truth, pictures, got fill"),
+        ("--soaked a --keep b --objects 200", "--soaked provides the simulated starts: leave out --objects and --keep"),
+        ("fill --scenario inclined", "must be one of outcomes, truth, pictures for --scenario inclined, got fill"),
     ],
 )
 def test_command_line_rejects_contradictory_options(options, reason):

@@ -169,5 +169,5 @@ def test_broken_meshes_are_refused_and_large_ones_are_decimated(tmp_path):
     record = np.zeros(1_000_000, [("numbers", "<f4", 12), ("attribute", "<u2")])
     record["numbers"][:, 3:] = np.random.default_rng(0).uniform(0, 0.1, (1_000_000, 9))
     (tmp_path / "many.stl").write_bytes(bytes(80) + np.uint32(1_000_000).tobytes() + record.tobytes())
-    with pytest.raises(ValueError, match=r"many\.stl: has 1,000,000 faces, but at most 131,072 can be drawn: give"):
+    with pytest.raises(ValueError, match=r"many\.stl: the mesh has 1,000,000 faces, but at most 131,072 can be drawn"):
         sense.main(sense.Config(str(tmp_path / "many.stl"), out=tmp_path / "a.png"))

@@ -161,7 +161,7 @@ def test_stacked_bodies_can_be_mapped_over():
 def test_stack_refuses_two_classes(tmp_path):
     path = tmp_path / "box.stl"
     trimesh.creation.box((0.06, 0.04, 0.1)).export(path)
-    with pytest.raises(ValueError, match="body 1 is of another size class"):
+    with pytest.raises(ValueError, match="arrays of body 1 and body 0 have different shapes"):
         objects.stack([objects.make(jax.random.key(0), "bottle"), objects.load(path)])
 
 

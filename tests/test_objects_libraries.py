@@ -80,7 +80,7 @@ def bad_objects(root: Path) -> dict[str, str]:
     (root / "beyond.off").write_text("OFF\n4 4 0\n0 0 0\n0 0 1\n0 1 0\n1 0 0\n3 0 1 2\n3 0 1 9\n3 1 2 3\n3 0 2 3\n")
     return {
         "stack_of_sheets.stl": "flat",
-        "thin.stl": "sheet 0.1 mm thick",
+        "thin.stl": "the object is 0.1 mm thick",
         "tiny.stl": "longest side is 1 mm",
         "torn.glb": "cannot be read as a mesh",
         "empty.stl": "is empty",
@@ -117,4 +117,5 @@ def test_bad_objects_are_left_out_and_named(tmp_path):
 def test_a_deleted_file_is_left_out_and_named(folder):
     listed = objects.library(folder, cache=folder / "cache")
     (folder / "loose.obj").unlink()
-    assert objects.bodies(listed, [3]) == ([], [("loose.obj", "no such mesh file")])
+    reason = "no such mesh file: restore it, or list the folder again"
+    assert objects.bodies(listed, [3]) == ([], [("loose.obj", reason)])

@@ -76,11 +76,11 @@ def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason
     assert listed.items[3].notes == ("metadata.csv has no front: ShapeNet's default is used",)
     reasons = dict(listed.skipped)
     for name, reason in (
-        ("h", "it has several classes (fork, spoon)"),
-        ("i", "unit is missing"),
+        ("h", "categories of several classes (fork, spoon)"),
+        ("i", "has no unit"),
         ("j", "unit is 'inch'"),
         ("k", "must not be parallel"),
-        ("l", "its up is"),
+        ("l", "the column up is"),
         ("m", "models-OBJ/models/m.obj does not exist"),
         ("d", "several rows"),
         ("o", "_BAD"),
@@ -113,14 +113,14 @@ def test_images_are_found_in_the_folder_of_textures(tmp_path):
     np.testing.assert_allclose(entry.body.texture[128, 128], linear(np.array(paint) / 255), atol=1e-5)
     np.testing.assert_allclose(entry.body.colors[0], 1)  # and not the Kd
     (tmp_path / "models-textures" / "textures" / "a.png").unlink()
-    assert "a.png, which does not exist" in objects.read(objects.library(tmp_path), 0).notes[0]
+    assert "a.png. Add these files" in objects.read(objects.library(tmp_path), 0).notes[0]
 
 
 def test_a_larger_object_is_scaled_down_with_a_note(tmp_path):
     listed = only(tmp_path, box((3, 2, 20)))
     entry = objects.read(listed, 0)
     np.testing.assert_allclose(np.ptp(np.asarray(entry.body.vertices), axis=0), [0.018, 0.012, 0.12], rtol=1e-5)
-    assert entry.notes == ("its longest side is 0.508 m, scaled down to 0.12 m",)
+    assert entry.notes == ("the longest side is 0.508 m, scaled down to 0.12 m",)
     (note,) = objects.read(dataclasses.replace(listed, largest=0.05), 0).notes
     assert note.endswith("scaled down to 0.05 m")
 
@@ -129,7 +129,7 @@ def test_a_size_that_differs_from_the_table_is_noted(tmp_path):
     dims = r"5.08\,5.08\,10.16"  # cm
     assert objects.read(only(tmp_path / "a", box((2, 2, 4)), **{"aligned.dims": dims}), 0).notes == ()
     (note,) = objects.read(only(tmp_path / "b", box((2, 2, 3)), **{"aligned.dims": dims}), 0).notes
-    assert note == "its longest side in metadata.csv (aligned.dims) is 102 mm"
+    assert note == "the longest side in metadata.csv (aligned.dims) is 102 mm"
 
 
 def test_cutlery_is_solid_and_of_steel(tmp_path):
@@ -142,11 +142,11 @@ def test_cutlery_is_solid_and_of_steel(tmp_path):
 def test_missing_columns_are_named(tmp_path):
     shapenet.build(tmp_path, [], {})
     shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name not in ("unit", "front")])
-    with pytest.raises(ValueError, match=r"metadata\.csv: lacks the columns front, unit "):
+    with pytest.raises(ValueError, match=r"metadata\.csv: the table lacks the columns front, unit "):
         objects.library(tmp_path)
     shapenet.table(tmp_path, [], [name for name in shapenet.COLUMNS if name != "fullId"])
     (tmp_path / "models-OBJ").rename(tmp_path / "models")  # known by its columns alone
-    with pytest.raises(ValueError, match=r"metadata\.csv: lacks the columns fullId "):
+    with pytest.raises(ValueError, match=r"metadata\.csv: the table lacks the columns fullId "):
         objects.library(tmp_path)
     (tmp_path / "models").rename(tmp_path / "models-OBJ")
     shapenet.table(tmp_path, [], ["id", "class"])
@@ -156,5 +156,5 @@ def test_missing_columns_are_named(tmp_path):
 
 def test_a_table_without_a_usable_object_is_refused(tmp_path):
     shapenet.build(tmp_path, [shapenet.row("a", "Watch", unit="")], {"a": box()})
-    with pytest.raises(ValueError, match=r"contains no mesh that can be used.*\n  a: its unit is missing"):
+    with pytest.raises(ValueError, match=r"contains no usable mesh.*\n  a: the model has no unit"):
         objects.library(tmp_path)

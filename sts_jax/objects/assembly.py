@@ -30,21 +30,23 @@ def assemble(
     two_sided: Bool[np.ndarray, ""] | bool = False,
     category: int = -1,
 ) -> Body:
-    """Assemble a padded `Body` from a surface, its colours and its masses.
+    """Assemble a `Body` from a surface, its colours and its masses.
 
-    The origin moves to the centroid of the collision hull.
+    The body collides as the convex hull of the vertices, reduced to at most 64 vertices. The origin moves to the
+    centroid of this hull. The arrays are padded to sizes in FACE_CLASSES and HULL_CLASSES, so that bodies of similar
+    size have arrays of equal shapes.
 
     Args:
-        vertices: Vertices of the surface (m), with +z up.
-        faces: Vertex indices of each face, counter-clockwise seen from outside, at most FACE_CLASSES[-1] faces.
+        vertices: Vertices of the surface (m), with +z up, at most 131,072.
+        faces: Vertex indices of each face, counter-clockwise seen from outside, at most 131,072 faces.
         colors: Colour of each corner of each face, in linear light, [0, 1].
         density: Mass per area of each face (kg/m^2).
-        interior: Vertices and faces of a closed mesh in the same frame that bounds the contents. None for a solid
-            object.
+        interior: Vertices and faces of a closed mesh around the contents, such as the water in a bottle, in the frame
+            of `vertices`. None for an object without contents.
         contents_density: Density of the contents (kg/m^3).
-        mass: Mass of the shell (kg). None computes the mass from area and density.
-        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row.
-        texture: Square texture in linear light, [0, 1], with a side of TEXTURE_CLASSES.
+        mass: Mass of the object without contents (kg). None computes it from `density` and the areas of the faces.
+        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row. None sets all to 0.
+        texture: Square texture in linear light, [0, 1], with a side of 1, 256 or 1,024 pixels. None is a white pixel.
         two_sided: True if faces are also visible from behind.
         category: Index into CATEGORIES, or -1 for an object of no category.
 
@@ -52,7 +54,7 @@ def assemble(
         The body.
 
     Raises:
-        ValueError: The convex hull or the interior has no volume.
+        ValueError: The vertices lie in a plane, or `interior` encloses no volume.
     """
     hull = convex_hull(vertices)
     shape = ConvexHull(hull)
@@ -74,7 +76,7 @@ def assemble(
 
     contents = np.zeros((0, 3, 3)) if interior is None else (interior[0] - origin)[interior[1]]
     if interior is not None and not solid_moments(contents).sum(axis=0)[0] > 0:
-        raise ValueError("the interior encloses no volume: close it, or turn its faces outwards")
+        raise ValueError("the mesh around the contents encloses no volume: close this mesh, or turn its faces outwards")
 
     size = size_class(max(len(faces), len(vertices), len(contents)), FACE_CLASSES)
     single = np.float32
@@ -103,16 +105,17 @@ def corner_normals(
 ) -> Float[np.ndarray, "f 3 3"]:
     """Compute the unit normal at each corner of each face, so that shading is smooth except at sharp edges.
 
-    The normal is the mean over those faces at the vertex whose normals differ by less than `crease` from the normal of
-    the corner's face. The angles of the faces at the vertex are the weights.
+    The normal at a corner is a weighted mean of the normals of the faces that meet at its vertex. A face is included if
+    the angle between its normal and the normal of the corner's own face is less than `crease`. The weight of a face is
+    its interior angle at the vertex.
 
     Args:
         vertices: Vertices of the surface (m).
         faces: Vertex indices of each face. The surface is smooth only where faces share the index of a vertex.
-        crease: Largest angle between the normals of faces that are averaged (rad).
+        crease: Largest angle between the normals of faces that are averaged (rad), 40 degrees by default.
 
     Returns:
-        Normals of the corners. Faces without area count as facing (0, 0, 1).
+        Normals of the corners. A face without area has the normal (0, 0, 1) and the weight 0.
     """
     triangles = vertices[faces]
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

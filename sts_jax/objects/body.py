@@ -51,15 +51,18 @@ class Body:
     category: Int[Array, "*n"]  # Index into CATEGORIES, or -1 for an object of no category.
 
     def check(self) -> None:
-        """Raise an error unless this is one body that can be rendered and simulated. Runs on the host, not under `jit`.
+        """Raise an error unless the fields form a single body that can be rendered and simulated.
+
+        The check needs concrete values, so it cannot run under `jit`.
 
         Raises:
-            ValueError: The body has leading axes, a value that is not finite, a vertex index out of range, or an
-                unknown category. The message names the field.
+            ValueError: The fields hold several stacked bodies, a value is not finite, a vertex index is out of range,
+                or the category is unknown. The message names the field.
         """
         if jnp.ndim(self.vertices) != 2:
             raise ValueError(
-                f"vertices has the shape {jnp.shape(self.vertices)}, but one body has (v, 3): use jax.vmap for several"
+                f"vertices has the shape {jnp.shape(self.vertices)}, but one body has (v, 3): use jax.vmap for "
+                "stacked bodies"
             )
         for field in dataclasses.fields(self):
             values = np.asarray(getattr(self, field.name))
@@ -71,7 +74,7 @@ class Body:
         if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
             raise ValueError(
                 f"faces has indices from {faces.min()} to {faces.max()}, but with {len(self.vertices)} vertices they "
-                f"must be from 0 to {len(self.vertices) - 1}"
+                f"must be from 0 to {len(self.vertices) - 1}: correct the indices"
             )
         check_category(np.asarray(self.category).tolist())
 
@@ -100,12 +103,20 @@ class Body:
 
 
 def size_class(count: int, classes: tuple[int, ...]) -> int:
-    """Return the smallest of the size classes that is at least `count`."""
+    """Return the number of rows to which an array of `count` rows is padded.
+
+    Args:
+        count: Number of rows of the array.
+        classes: Allowed numbers of rows in ascending order, such as FACE_CLASSES. The last one is at least `count`.
+
+    Returns:
+        The smallest of the allowed numbers that is at least `count`.
+    """
     return next(size for size in classes if count <= size)
 
 
 def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
-    """Append rows of a value to an array until it has `size` rows."""
+    """Append rows to an array until it has `size` rows. Each appended row is `value`, or is filled with this number."""
     padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
     return np.concatenate([array, padding])
 
@@ -130,10 +141,12 @@ def _form(leaf: object) -> str:
 
 
 def stack(bodies: Sequence[Body]) -> Body:
-    """Stack bodies of the same size classes into one `Body` with a leading axis, for `jax.vmap`.
+    """Stack bodies into one `Body` with a leading axis, for `jax.vmap`.
 
     Args:
-        bodies: At least one body. The arrays of all bodies must have the same shapes.
+        bodies: At least one body. The arrays of all bodies must have the same shapes. Bodies of similar size do,
+            because their arrays are padded to the sizes in FACE_CLASSES, PART_CLASSES, HULL_CLASSES and
+            TEXTURE_CLASSES.
 
     Returns:
         A body whose arrays are stacked along a new first axis.
@@ -147,8 +160,8 @@ def stack(bodies: Sequence[Body]) -> Body:
     for index, shape in enumerate(shapes):
         if shape != shapes[0]:
             raise ValueError(
-                f"body {index} is of another size class than body 0: it has {_sizes(bodies[index])}, and body 0 has "
-                f"{_sizes(bodies[0])}. Stack the bodies of each size class separately"
+                f"the arrays of body {index} and body 0 have different shapes: body {index} has "
+                f"{_sizes(bodies[index])}, and body 0 has {_sizes(bodies[0])}. Stack only bodies with equal shapes"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 
@@ -181,15 +194,17 @@ def rigid(
     """Compute mass, centre of mass and inertia of a body whose contents fill a share of its interior.
 
     The shell has the mass m_s, the centre of mass c_s and the inertia I_s. The contents have the density rho, the
-    volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. Let s be the factor on the shell's
-    mass. The mass is m = s m_s + rho V. The centre of mass c follows from m c = s m_s c_s + rho V c_c. The inertia is
-    I = s I_s + rho (tr(C) 1 - C) plus the terms of Steiner's theorem that refer both masses to c.
+    volume V, the centre c_c and the second moments C = int (r - c_c) (r - c_c)^T dV. Let s be the factor `shell_scale`,
+    and E the identity matrix. The mass is m = s m_s + rho V. The centre of mass c follows from
+    m c = s m_s c_s + rho V c_c. By the parallel axis theorem, the inertia about c is
+    I = s I_s + rho (tr(C) E - C) + s m_s P(c_s - c) + rho V P(c_c - c), with P(d) = (d . d) E - d d^T.
 
     Args:
         body: One body.
-        fill: Share of the interior's volume that is filled, clipped to [0, 1].
-        shell_scale: Factor on the shell's mass.
-        up: Unit vector in the mesh frame that pointed up when the contents settled.
+        fill: Share of the interior's volume that is filled from below, clipped to [0, 1].
+        shell_scale: Factor on the mass and the inertia of the shell. 1 keeps the values of `body`.
+        up: Unit vector in the mesh frame that pointed upwards while the contents settled. The surface of the contents
+            is perpendicular to it.
 
     Returns:
         Mass (kg), centre of mass in the mesh frame (m), and inertia about the centre of mass along the mesh axes
@@ -212,9 +227,10 @@ def fill_moments(
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3 3"]]:
     """Compute volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
 
-    The triangles are clipped to the half-space below the liquid's surface. The signed tetrahedra between a reference
-    point and the clipped triangles then sum to the liquid. The reference point lies on the liquid's surface, so the
-    surface itself contributes nothing. Bisection finds the level of the surface.
+    The triangles are clipped to the half-space below the liquid's surface. Each clipped triangle and a reference point
+    form a tetrahedron with a signed volume. The moments of the liquid are the sums over these tetrahedra. The reference
+    point lies on the liquid's surface, so that tetrahedra over the surface itself would have no volume. Bisection finds
+    the height of the surface.
 
     Args:
         interior: Triangles of a closed surface (m), counter-clockwise seen from outside. Triangles without area have no
@@ -223,8 +239,8 @@ def fill_moments(
         up: Upward unit vector, perpendicular to the liquid's surface.
 
     Returns:
-        Volume (m^3), centre (m) and second moments about the centre (m^5). If nothing is filled, the centre is the
-        middle of the bounding box.
+        Volume (m^3), centre (m) and second moments about the centre (m^5) of the liquid. Without liquid, the centre is
+        the middle of the mesh's bounding box.
     """
     up = jnp.asarray(up, interior.dtype)
     height = interior @ up
@@ -232,7 +248,12 @@ def fill_moments(
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
     def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        """Compute volumes and corners of the tetrahedra below a level, their reference point and the total volume."""
+        """Compute the liquid below the height `level` (m) along `up`, as tetrahedra with a common reference point.
+
+        Returns:
+            Signed volume of each tetrahedron, its other three corners relative to the reference point, the reference
+            point, and the total volume.
+        """
         # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
         # adds the whole triangle and subtracts the piece at the corner above.
         reference = middle + (level - middle @ up) * up

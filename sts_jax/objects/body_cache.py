@@ -19,7 +19,13 @@ _FORMAT = 1  # version of cached bodies, increased when the same file and settin
 
 
 def path_of(library: Library, item: Item) -> Path:
-    """Return the path of an item's file in the cache of its library. The library must have a cache.
+    """Return the path of the file that caches an item's loaded body, in the folder `library.cache`.
+
+    The name of the file is a hash of the mesh file, the files to which it refers, and all settings for loading.
+
+    Args:
+        library: Library of the item. Its `cache` must not be None.
+        item: Item of the library.
 
     Raises:
         FileNotFoundError: The mesh file no longer exists.
@@ -35,14 +41,14 @@ def path_of(library: Library, item: Item) -> Path:
     except (OSError, ValueError):
         named = {}  # `load` raises an error for the damaged file
     if not item.path.is_file():
-        raise FileNotFoundError(f"{item.path}: no such mesh file")
+        raise FileNotFoundError(f"{item.path}: no such mesh file: restore it, or list the folder again")
     for name, path in [(item.path.name, item.path), *sorted(named.items())]:
         digest.update(name.encode() + b"\0" + (b"" if path is None else hashlib.sha256(path.read_bytes()).digest()))
     return library.cache / f"{digest.hexdigest()[:32]}.npz"
 
 
 def write(path: Path, entry: Entry) -> None:
-    """Write an entry to a file of the cache, completely or not at all."""
+    """Write a loaded item to a cache file. An interruption leaves no incomplete file at `path`."""
     about = json.dumps({"gaps": entry.gaps, "notes": entry.notes})
     leaves: dict[str, Any] = {field.name: getattr(entry.body, field.name) for field in dataclasses.fields(Body)}
 
@@ -54,7 +60,7 @@ def write(path: Path, entry: Entry) -> None:
 
 
 def read(path: Path, item: Item) -> Entry | None:
-    """Read the entry of an item from a file of the cache, or return None if the file is missing or damaged."""
+    """Read the loaded body of an item from a cache file. Return None if the file is missing or damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})

@@ -10,26 +10,26 @@ from sts_jax.objects.surface import Surface, proper, surface_samples
 
 
 def decimate(path: Path, surface: Surface, target: int) -> Surface:
-    """Reduce a surface to at most `target` faces and vertices, and warn about it.
+    """Reduce a surface to at most `target` faces and vertices, and issue a warning with the numbers of faces.
 
     Args:
-        path: Mesh file, for the warning and errors.
+        path: Path of the mesh file. The warning and errors contain it.
         surface: Surface to reduce.
         target: Largest number of faces and of vertices.
 
     Returns:
-        The surface with one colour per corner and without a texture.
+        The reduced surface, with one colour for each corner of each face and without a texture.
 
     Raises:
         ImportError: The package fast-simplification is not installed.
-        ValueError: The surface has too many loose parts.
+        ValueError: The surface consists of too many separate parts to reach `target`.
     """
     try:
         import fast_simplification
     except ImportError as error:
         raise ImportError(
-            f"{path}: has {len(surface.faces):,} faces, and decimation needs the package fast-simplification, which is "
-            "not installed: pip install -e '.[meshes]'"
+            f"{path}: the mesh has {len(surface.faces):,} faces. To decimate it to {target:,}, the package "
+            "fast-simplification is needed, which is not installed: pip install -e '.[meshes]'"
         ) from error
     # Slivers can block the decimation. If so, vertices are welded first, on a grid of 1/1000 of the size or coarser.
     for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
@@ -40,8 +40,8 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
             break
     else:
         raise ValueError(
-            f"{path}: {len(surface.faces):,} faces cannot be decimated to {target:,}, because they form too many loose "
-            "parts: give a larger faces="
+            f"{path}: the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,}, because it consists "
+            "of too many separate parts: increase the argument faces"
         )
     note = "" if surface.texture is None else ", and its texture to one colour per corner"
     warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{note}", stacklevel=3)

@@ -28,18 +28,18 @@ DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3), unit vectors for which `suppor
 def convex_hull(
     points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
 ) -> Float[np.ndarray, "h 3"]:
-    """Compute the vertices of a convex hull, simplified to a tolerance and a largest number of vertices.
+    """Compute an approximate convex hull of points that has a limited number of vertices.
 
-    The hull starts as a tetrahedron. The point farthest outside is added until no point is outside by more than the
-    tolerance.
+    The hull starts as a tetrahedron of four points. The point farthest outside is added until all points are inside,
+    apart from distances up to `tolerance`, or until the hull has `limit` vertices.
 
     Args:
         points: Points that the hull encloses (m).
-        limit: Largest number of vertices. It takes precedence over the tolerance.
-        tolerance: Largest distance of a point outside the hull (m).
+        limit: Largest number of vertices, at least 4. The default is 64.
+        tolerance: Largest distance of a point outside the hull (m), unless `limit` is reached. The default is 0.05 mm.
 
     Returns:
-        Vertices of the hull, which are a subset of the points.
+        Vertices of the hull. Each of them is one of the points.
 
     Raises:
         ValueError: The points lie in a plane.
@@ -85,16 +85,19 @@ def outside_hull(points: Float[np.ndarray, "n 3"], hull: Float[np.ndarray, "h 3"
 
 
 def support(body: Body) -> Float[np.ndarray, "128"]:
-    """Compute the support function h(d) = max over v of v . d of a body, with v the vertices of its collision parts.
+    """Compute the support function of a body for the 128 unit vectors in DIRECTIONS.
+
+    For a direction d, the support function is the largest dot product v . d. The maximum is over the vertices v of the
+    parts with which the body collides.
 
     Args:
         body: One body.
 
     Returns:
-        Values for the directions d in DIRECTIONS (m), in the mesh frame, float32.
+        Value for each direction (m), float32. Directions and vertices are in the mesh frame.
 
     Raises:
-        ValueError: `body` has leading axes.
+        ValueError: `body` holds several stacked bodies.
     """
     if np.ndim(body.hulls) != 3:
         raise ValueError(f"hulls has the shape {np.shape(body.hulls)}, but one body has (p, h, 3): pass a single body")
@@ -115,9 +118,9 @@ def rest_poses(
         com: Centre of mass (m), in the same frame.
 
     Returns:
-        The unit vector that points up while the hull rests on each of the k stable faces, and the share of each face.
-        The share is the solid angle of the face, seen from the centre of mass, over the sum of all stable faces. Both
-        arrays are empty if the hull rests on no face.
+        For each of the k faces on which the hull can rest, the unit vector that then points up, and the share of the
+        face. The share is the solid angle of the face, seen from the centre of mass, divided by the sum of the solid
+        angles of these k faces. Both arrays are empty if there is no such face.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

@@ -48,9 +48,10 @@ def library(
 ) -> Library:
     """List the objects of a folder without opening a mesh.
 
-    A folder that contains ShapeNetSem's metadata.csv is read by this table. Its columns define each object: `unit` the
-    size, `up` and `front` the orientation, and `category` the class, one of CATEGORIES. Meshes are expected at
-    models-OBJ/models/ID.obj and images in models-textures/textures.
+    If the folder contains ShapeNetSem's table metadata.csv, the table lists the objects. Its column `unit` defines the
+    size of an object, the columns `up` and `front` define its orientation, and the column `category` defines its class,
+    one of CATEGORIES. The mesh of the object with the id ID is expected at models-OBJ/models/ID.obj, and its images in
+    models-textures/textures.
 
     In any other folder, every mesh file is an object. Its class is the name of the first sub-folder of its path. The
     class of a file directly in the folder is the name of the folder.
@@ -58,19 +59,19 @@ def library(
     Args:
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
-        scale: Length of one unit of the files (m). None uses ShapeNetSem's table, or 1 m without a table.
-        longest_side: Longest side to which every object is scaled (m). None keeps the sizes. Only `scale` or
-            `longest_side` can be given.
+        scale: Length of one unit of the files (m), above 0. None uses ShapeNetSem's table, or 1 m without a table.
+        longest_side: Longest side to which every object is scaled (m), at most 0.15 m. None keeps the sizes. Only
+            `scale` or `longest_side` can be given.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
             fast-simplification.
-        largest: Longest side to which longer objects are scaled down (m).
+        largest: Longest side to which longer objects are scaled down (m), at most 0.15 m.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
 
     Returns:
-        The library, sorted by class and name.
+        The library. Its objects are sorted by class and name.
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -98,7 +99,7 @@ def library(
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:
         reasons = "".join(f"\n  {name}: {reason}" for name, reason in skipped[:5])
-        raise ValueError(f"{folder}: contains no mesh that can be used: give a folder with mesh files in it{reasons}")
+        raise ValueError(f"{folder}: the folder contains no usable mesh: give a folder with mesh files in it{reasons}")
     if scale is not None or longest_side is not None:
         items = [dataclasses.replace(item, scale=scale, longest_side=longest_side, stated=None) for item in items]
     if up is not None:
@@ -145,7 +146,8 @@ def read(collection: Library, index: int) -> Entry:
     """Load one item as a body, through the cache if the library has one.
 
     Scissors, forks and spoons are solid and of steel. All other objects are shells with contents. The body's category
-    is its class if the class is one of CATEGORIES, and -1 otherwise. The warnings of `load` about repairs become notes.
+    is the index of its class in CATEGORIES, or -1 if CATEGORIES lacks the class. Warnings of `load`, such as those
+    about repairs of the mesh, are returned as notes instead.
 
     Args:
         collection: Library from `library`.
@@ -155,7 +157,7 @@ def read(collection: Library, index: int) -> Entry:
         The body, the distances between its surface and its collision parts, and notes.
 
     Raises:
-        ImportError: The package for decimation or decomposition is needed and not installed.
+        ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.
         FileNotFoundError: The file no longer exists.
         ValueError: The file cannot be loaded as a body. The message contains the reason.
     """
@@ -181,7 +183,7 @@ def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[l
         The bodies, and (name, reason) of each skipped item.
 
     Raises:
-        ImportError: The package for decimation or decomposition is needed and not installed.
+        ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.
     """
     made, skipped = [], []
     for index in range(len(collection.items)) if indices is None else indices:
@@ -194,18 +196,18 @@ def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[l
 
 
 def survey(collection: Library, *, progress: Callable[[str], None] | None = None) -> tuple[Library, str]:
-    """Read every item once, to find the items that cannot be used and to list the others.
+    """Load every item once, to find the items that cannot be loaded and to describe all items in a listing.
 
     Args:
         collection: Library from `library`.
-        progress: Function that is called with the line of each object after the object has been read.
+        progress: Function that is called after each item with the text line that describes the item. None for no calls.
 
     Returns:
-        The library with the unusable items moved to `skipped`, and a listing. The listing has the number of objects of
-        each class, a line for each object and a line for each skipped item.
+        The library, in which the items that cannot be loaded are moved to `skipped`, and the listing. The listing is a
+        text with the number of objects of each class, a line for each object and a line for each skipped item.
 
     Raises:
-        ImportError: The package for decimation or decomposition is needed and not installed.
+        ImportError: A package for the decimation or the decomposition of a mesh is needed and not installed.
     """
     items, skipped, lines = [], list(collection.skipped), []
     for index, item in enumerate(collection.items):
@@ -237,16 +239,19 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
 
 
 def describe(entry: Entry) -> str:
-    """Describe one object in a line, as in the listing of `survey`."""
+    """Describe a loaded item in one line of text, as in the listing of `survey`."""
     return f"{entry.item.label}  {entry.item.name}: " + "; ".join([*facts(entry.body, entry.gaps), *entry.notes])
 
 
 def facts(body: Body, apart: tuple[float, float]) -> list[str]:
-    """Describe the size (mm), the faces, the collision hull and the gaps (mm) of a body in words.
+    """Describe the size and the collision parts of a body in four short texts.
 
     Args:
         body: One body.
-        apart: Gaps between the surface and the collision parts, from `gaps` (m).
+        apart: Both distances (m) between the surface and the collision parts, as `gaps` returns them.
+
+    Returns:
+        Size along x, y and z (mm), number of faces, number of vertices of the collision parts, and both distances (mm).
     """
     size = " x ".join(f"{side * 1e3:.0f}" for side in np.ptp(np.asarray(body.vertices), axis=0))
     drawn = int(np.asarray(body.faces).any(axis=1).sum())
@@ -294,12 +299,13 @@ def _made(collection: Library, item: Item) -> Entry:
     vertices = np.asarray(body.vertices, float)
     longest = float(np.ptp(vertices, axis=0).max())
     if item.stated is not None and not 0.9 < longest / min(item.stated, collection.largest) < 1.1:
-        notes.append(f"its longest side in metadata.csv (aligned.dims) is {item.stated * 1e3:.0f} mm")
+        notes.append(f"the longest side in metadata.csv (aligned.dims) is {item.stated * 1e3:.0f} mm")
     shape = ConvexHull(np.asarray(body.hulls[0], float))
     thickness = float(np.ptp(vertices @ shape.equations[:, :3].T, axis=0).min())
     if thickness < THINNEST:
         raise ValueError(
-            f"it is {thickness * 1e3:.2g} mm thick, but stable contacts need {THINNEST * 1e3:g} mm: thicken the mesh"
+            f"{item.path}: the object is {thickness * 1e3:.2g} mm thick, but stable contacts need at least "
+            f"{THINNEST * 1e3:g} mm: thicken the mesh"
         )
     apart = gaps(body)
     if collection.parts and apart[1] > HOLLOW:

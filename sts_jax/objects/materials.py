@@ -16,14 +16,15 @@ PLAIN = 0.7  # sRGB grey of a mesh without colours
 
 
 def references(path: Path, images: Path | None = None) -> dict[str, Path | None]:
-    """List the files to which an OBJ or glTF file refers. For other formats, the list is empty.
+    """Find the files to which an OBJ or glTF file refers, such as materials and images.
 
     Args:
         path: The mesh file.
         images: Additional folder in which images are looked up, or None.
 
     Returns:
-        The path of each file by its name in the mesh or material file. The path of a missing file is None.
+        Dictionary from the name of each file, as written in the mesh or material file, to its path. The path of a
+        missing file is None. For other formats, the dictionary is empty.
     """
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
@@ -55,12 +56,13 @@ def check_materials(path: Path, images: Path | None, strict: bool) -> None:
     missing = [str(path.parent / name) for name, file in files.items() if file is None]
     if missing and strict:
         raise FileNotFoundError(
-            f"{path} refers to {', '.join(missing)}, which does not exist: add it, or give texture="
+            f"{path}: the mesh refers to missing files: {', '.join(missing)}. Add these files, or give an image as "
+            "texture="
         )
     if missing:
         warnings.warn(
-            f"{path} refers to {', '.join(missing)}, which does not exist, so colours are missing: add it, or give "
-            "texture=",
+            f"{path}: colours are missing, because the mesh refers to missing files: {', '.join(missing)}. Add these "
+            "files, or give an image as texture=",
             stacklevel=3,
         )
     for file in files.values():
@@ -76,23 +78,23 @@ def read_image(path: Path) -> Image.Image:
         ValueError: The file cannot be read as an image.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such image file")
+        raise FileNotFoundError(f"{path}: no such image file: check the path")
     try:
         with Image.open(path) as picture:
             return picture.convert("RGB")
     except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: cannot be read as an image ({error}): replace it") from error
+        raise ValueError(f"{path}: cannot be read as an image ({error}): replace the file") from error
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):
-    """Resolver of file names with which trimesh also finds images in an additional folder."""
+    """Lookup of file names for trimesh that also finds images in the additional folder `images`."""
 
     def __init__(self, path: Path, images: Path) -> None:
         super().__init__(str(path))
         self.images = images
 
     def get(self, name: str) -> bytes:
-        """Return the content of a file to which the mesh file refers."""
+        """Return the content of the file to which the mesh file refers by `name`."""
         found = _found(Path(self.parent), name, self.images)
         return super().get(name) if found is None else found.read_bytes()
 
@@ -119,8 +121,8 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
         pieces: All meshes of the file.
 
     Returns:
-        Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) at all corners of all faces, and the texture
-        (t, t, 3) in linear light. The texture is None if no mesh has one.
+        Colours (f, 3, 3) in linear light and texture coordinates (f, 3, 2) at the corners of all f faces, and a square
+        texture (t, t, 3) in linear light with a side of t pixels. The texture is None if no mesh has one.
 
     Raises:
         ValueError: A texture cannot be read.
@@ -138,7 +140,7 @@ def albedo(path: Path, pieces: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.nd
     try:
         sheets = [np.asarray(picture.convert("RGB")) for picture in pictures]
     except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: its texture cannot be read ({error}): replace it") from error
+        raise ValueError(f"{path}: a texture of the mesh cannot be read ({error}): replace the texture") from error
     distinct: list[np.ndarray] = []
     cell = []
     for sheet in sheets:

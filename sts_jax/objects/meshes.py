@@ -45,7 +45,7 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
     """
     z, y = np.array(up, float), -np.array(front, float)
     if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
-        raise ValueError(f"up and front must be three finite numbers, not all zero, got {up} and {front}")
+        raise ValueError(f"up and front must be three finite numbers each, and up not (0, 0, 0), got {up} and {front}")
     z /= np.linalg.norm(z)
     across = y - (y @ z) * z
     if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(y):
@@ -74,15 +74,15 @@ def load(
 ) -> Body:
     """Load a mesh file as a body. All meshes of the file are merged into one.
 
-    The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull.
-    The collision hull is the convex hull, reduced to at most 64 vertices. `hull_gap` returns the error of this
-    reduction. Surfaces that are not closed are visible from both sides.
+    The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull,
+    the shape with which the body collides. This is the convex hull, reduced to at most 64 vertices. `hull_gap` measures
+    how far the surface lies outside it. Surfaces that are not closed are visible from both sides.
 
-    The albedo is the texture's value times the corner colour, in linear light. Textures, 8-bit colours and the `Kd` of
-    an OBJ file are read as sRGB. Factors and vertex colours of a glTF file are read as linear light (glTF
-    specification). The `Kd` of a textured OBJ file and alpha are ignored. Textures are resized to a square of
-    TEXTURE_CLASSES. Several textures are packed into one, where coordinates outside [0, 1] are clipped instead of
-    repeated.
+    The albedo is the texture's value times the corner colour, in linear light. Textures, 8-bit colours and the diffuse
+    colour `Kd` of an OBJ file are read as sRGB. Colour factors and vertex colours of a glTF file are read as linear
+    light (glTF specification). Alpha values are ignored, and so is the `Kd` of an OBJ file with textures. Textures are
+    resized to a square with a side of 1, 256 or 1,024 pixels. Several textures are packed into one square, in which a
+    texture cannot repeat within a face.
 
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.
@@ -90,22 +90,22 @@ def load(
             size. Only `longest_side` or `scale` can be given.
         scale: Length of one unit of the file (m). None is 1 m.
         largest: Largest allowed longest side (m), from 5 mm to 0.15 m. A larger mesh is scaled down to it with a
-            warning. None raises an error for a mesh that is larger than the pad.
+            warning. None raises an error for a mesh that is longer than 0.15 m, the width of the pad.
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass of
             the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
-        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3, and `rigid` receives the fill level.
-            If False, the body has no contents.
-        strict: If False, two defects are repaired with a warning. If a mesh encloses no volume, the volume of its
-            convex hull is used. Missing materials and images of an OBJ file are left out. If True, these defects are
-            errors.
+        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3. The share of the interior that they
+            fill is an argument of `rigid`. If False, the body has no contents.
+        strict: If False, two defects are repaired with a warning. If a mesh is not closed or encloses no volume, its
+            contents fill its convex hull. Missing materials and images of an OBJ file are left out. If True, these
+            defects are errors.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y, only for an `up` that is a direction. None is (0, -1, 0). If `up`
             is an axis, `front` must be None.
         texture: Image file that replaces the file's own textures. It needs texture coordinates in the mesh.
         textures: Additional folder in which the file's images are looked up.
         faces: Largest number of faces and of vertices, at least 4. A larger mesh is decimated with a warning, and its
-            texture is replaced by one colour per corner. This needs the package fast-simplification.
+            texture is replaced by one colour at each corner of each face. This needs the package fast-simplification.
         parts: If True, the body collides as convex parts (`decompose`) instead of as its convex hull. This needs the
             package coacd.
         category: Index into CATEGORIES, or -1 for an object of no category.
@@ -115,13 +115,14 @@ def load(
 
     Raises:
         FileNotFoundError: The file or the texture does not exist. With `strict`, also for a missing material or image.
-        ImportError: The package for decimation or decomposition is not installed.
+        ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.
         IsADirectoryError: The path is a folder.
         PermissionError: The file is not readable.
-        ValueError: The file is empty, truncated or not a mesh, or an image cannot be read. The mesh has no faces,
-            values that are not finite, too many faces, no extent in some direction, no texture coordinates for
-            `texture`, or a longest side above 0.15 m or below 5 mm. With `strict`, the mesh is not closed or encloses
-            no volume. The mesh cannot be decimated to `faces` or decomposed. An argument is out of range.
+        ValueError: The file is empty, truncated or not a mesh, or an image cannot be read. The mesh is flat, lacks
+            faces or has too many, or has a vertex that is not finite. Its longest side is above 0.15 m or below 5 mm.
+            It lacks the texture coordinates that `texture` needs. With `strict`, the mesh is not closed or encloses no
+            volume. The mesh cannot be decimated to `faces`, or cannot be decomposed into convex parts. An argument is
+            out of range.
     """
     path = Path(path)
     _check_arguments(path, longest_side, scale, largest, mass, density, faces, category)
@@ -134,7 +135,8 @@ def load(
     number = sum(len(piece.faces) for piece in pieces)
     if faces is None and number > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: give faces= to decimate it"
+            f"{path}: the mesh has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: decimate it with "
+            "the argument faces, the largest number of faces"
         )
     corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
     if not np.isfinite(corners).all():
@@ -189,8 +191,8 @@ def _attitude(
     if isinstance(up, str):
         if up not in AXES or front is not None:
             raise ValueError(
-                f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z', or three numbers if front "
-                "is given"
+                f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z' without front, or a "
+                "direction of three numbers with or without front"
             )
         return rotation(*AXES[up])
     try:
@@ -209,17 +211,20 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
         pieces = [piece for piece in scene.dump() if isinstance(piece, trimesh.Trimesh) and len(piece.faces)]
     except ModuleNotFoundError as error:
         # For text that is not UTF-8, trimesh imports a package that is not one of its requirements.
-        damaged = "it is truncated or damaged: replace it" if error.name == "charset_normalizer" else "install it"
-        raise ValueError(f"{path}: cannot be read as a mesh ({error}): {damaged}") from error
+        install = f"install the package {error.name}"
+        remedy = "the file is truncated or damaged: replace it" if error.name == "charset_normalizer" else install
+        raise ValueError(f"{path}: cannot be read as a mesh ({error}): {remedy}") from error
     except Exception as error:  # trimesh's many readers raise errors of many types
         raise ValueError(
-            f"{path}: cannot be read as a mesh ({error}): check that it is complete and has the right suffix"
+            f"{path}: cannot be read as a mesh ({error}): check that the file is complete and has the right suffix"
         ) from error
     if not pieces:
-        raise ValueError(f"{path}: has no faces: give a mesh with triangles")
+        raise ValueError(f"{path}: the mesh has no faces: give a mesh with triangles")
     for piece in pieces if sheet is not None else []:
         if getattr(piece.visual, "uv", None) is None:
-            raise ValueError(f"{path}: has no texture coordinates, so {texture} cannot be applied to it: omit texture=")
+            raise ValueError(
+                f"{path}: the mesh has no texture coordinates, so {texture} cannot be applied to it: omit texture="
+            )
         material = trimesh.visual.material.PBRMaterial(baseColorTexture=sheet)
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
     return pieces
@@ -230,7 +235,7 @@ def _check_file(path: Path) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give a mesh file in it, or pass it to objects.library")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such mesh file")
+        raise FileNotFoundError(f"{path}: no such mesh file: check the path")
     try:
         with path.open("rb") as file:
             head = file.read(1024)
@@ -238,20 +243,20 @@ def _check_file(path: Path) -> None:
             file.seek(max(0, size - 1024))
             tail = file.read()
     except OSError as error:
-        raise type(error)(f"{path}: cannot be opened ({error.strerror}): check its permissions") from error
+        raise type(error)(f"{path}: the file cannot be opened ({error.strerror}): check its permissions") from error
     if not size:
-        raise ValueError(f"{path}: is empty: replace it")
+        raise ValueError(f"{path}: the file is empty: replace it")
     if path.suffix.lower() != ".stl":
         return
     if head.lstrip().startswith(b"solid") and b"facet" in head:
         if b"endsolid" not in tail:
-            raise ValueError(f"{path}: is truncated, because its text ends without endsolid: replace it")
+            raise ValueError(f"{path}: the file is truncated, because its text ends without endsolid: replace it")
         return
     number = int.from_bytes(head[80:84], "little")  # triangles of 50 bytes each
     if size < 84 + 50 * number or size < 84:
         raise ValueError(
-            f"{path}: is truncated or not an STL. It has {size:,} bytes, but a binary STL of {number:,} triangles has "
-            f"{84 + 50 * number:,}: replace it"
+            f"{path}: the file is truncated or not an STL. It has {size:,} bytes, but a binary STL of {number:,} "
+            f"triangles has {84 + 50 * number:,}: replace it"
         )
 
 
@@ -268,16 +273,16 @@ def _factor(
     extent *= factor
     if extent < SMALLEST:
         raise ValueError(
-            f"{path}: its longest side is {extent * 1e3:.2g} mm, but the smallest object is {SMALLEST * 1e3:g} mm "
-            "long: check its unit and give longest_side, or scale, the length of one unit of the file in metres"
+            f"{path}: the longest side is {extent * 1e3:.2g} mm, but the smallest object is {SMALLEST * 1e3:g} mm "
+            "long: check the unit of the file, and give longest_side, or scale, the length of one unit in metres"
         )
     if largest is not None and extent > largest:
-        warnings.warn(f"{path}: its longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
+        warnings.warn(f"{path}: the longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(
-            f"{path}: its longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side in metres "
-            "(the file may be in millimetres)"
+            f"{path}: the longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side in metres, or "
+            "scale, the length of one unit in metres (0.001 if the file is in millimetres)"
         )
     return factor
 
@@ -289,8 +294,8 @@ def _body(
     vertices, faces, colors, uv, texture = surface
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: has {len(faces):,} faces and {len(vertices):,} vertices, but at most {FACE_CLASSES[-1]:,} of "
-            "each are allowed: give faces= to decimate it"
+            f"{path}: the mesh has {len(faces):,} faces and {len(vertices):,} vertices, but at most "
+            f"{FACE_CLASSES[-1]:,} of each are allowed: decimate it with the argument faces, the largest number of both"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     closed = is_closed(faces)
@@ -308,7 +313,7 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: close it, or give strict=False to use its convex hull's volume"
+                f"{path}: the mesh {fault}: close it, or give strict=False to use the volume of its convex hull"
             )
         if holds:
             warnings.warn(

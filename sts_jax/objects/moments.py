@@ -21,11 +21,12 @@ def solid_moments(
 
     Args:
         triangles: Corners of the triangles (m).
-        reference: Reference point (m), by default the origin. A solid that is clipped by a plane needs a point on the
-            plane, so that the missing cut face contributes nothing.
+        reference: Reference point (m), by default the origin. For a solid that is clipped by a plane, give a point on
+            the plane. The tetrahedra over the cut face, which has no triangles, then have no volume.
 
     Returns:
-        One row per triangle (m^3, m^4 and m^5), about the origin.
+        Integrals of 1, x, y, z, xx, yy, zz, xy, xz and yz over the tetrahedron of each triangle. Coordinates are
+        relative to the origin, not to the reference point. Units are m^3 for 1, m^4 for x to z, and m^5 for products.
     """
     origin = np.zeros(3) if reference is None else reference
     r = triangles - origin
@@ -36,7 +37,7 @@ def solid_moments(
 
 
 def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
-    """Compute the moments of triangles as thin sheets.
+    """Compute the area moments of triangles, for shells with a mass per area.
 
     Let a triangle have the corners r_i, the sum of corners s and the area A. Its first moments are int r = A s / 3, and
     its second moments are int r r^T = A (s s^T + sum_i r_i r_i^T) / 12.
@@ -45,7 +46,8 @@ def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, 
         triangles: Corners of the triangles (m).
 
     Returns:
-        One row per triangle (m^2, m^3 and m^4).
+        Integrals of 1, x, y, z, xx, yy, zz, xy, xz and yz over the area of each triangle. Units are m^2 for 1, m^3 for
+        x to z, and m^4 for products.
     """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(cross, axis=1) / 2

@@ -13,6 +13,8 @@ from sts_jax.objects.body import HULL_CLASSES, PART_CLASSES, Body, pad, size_cla
 from sts_jax.objects.hulls import convex_hull, outside_hull
 from sts_jax.objects.surface import surface_samples
 
+_KEEP = "use the body without a decomposition, so that it collides as its convex hull"
+
 
 def convex_parts(
     vertices: Float[np.ndarray, "v 3"],
@@ -23,17 +25,17 @@ def convex_parts(
 ) -> list[Float[np.ndarray, "_ 3"]]:
     """Decompose a surface into convex parts (CoACD: Wei et al., 2022, SIGGRAPH).
 
-    Equal meshes have equal parts, because the seed is fixed. CoACD first closes open surfaces, which thickens them a
-    little.
+    Equal meshes have equal parts, because the seed is fixed. CoACD first closes open surfaces, and thereby thickens
+    them a little.
 
     Args:
         vertices: Vertices of the surface (m).
         faces: Vertex indices of each face, counter-clockwise seen from outside.
-        limit: Largest number of parts.
-        vertices_per_part: Largest number of vertices of each part.
+        limit: Largest number of parts. The default is 8.
+        vertices_per_part: Largest number of vertices of each part. The default is 32.
 
     Returns:
-        Vertices of each part (m), the part with the largest volume first. A convex surface has a single part.
+        Vertices of each part (m). Parts are sorted by volume, the largest first. A convex surface has a single part.
 
     Raises:
         ImportError: The package coacd is not installed.
@@ -57,9 +59,9 @@ def convex_parts(
         )
         parts = [convex_hull(np.asarray(corners, float), limit=vertices_per_part) for corners, _ in pieces]
     except (RuntimeError, ValueError) as error:
-        raise ValueError(f"no convex parts were found ({error}): keep the convex hull") from error
+        raise ValueError(f"the surface has no decomposition into convex parts ({error}): {_KEEP}") from error
     if not parts:
-        raise ValueError("no convex parts were found: keep the convex hull")
+        raise ValueError(f"the surface has no decomposition into convex parts: {_KEEP}")
     return sorted(parts, key=lambda part: (-ConvexHull(part).volume, *part[0]))
 
 
@@ -70,8 +72,8 @@ def decompose(body: Body) -> Body:
         body: One body.
 
     Returns:
-        The body with the parts as `hulls`, at most PART_CLASSES[-1] parts of at most HULL_CLASSES[0] vertices each. If
-        a single part is enough, the body is returned unchanged.
+        The body with the parts in its field `hulls`, at most 8 parts of at most 32 vertices each. If a single part is
+        enough, the body is returned unchanged.
 
     Raises:
         ImportError: The package coacd is not installed.
@@ -93,8 +95,8 @@ def gaps(body: Body) -> tuple[float, float]:
         body: One body.
 
     Returns:
-        Largest distance (m) of the surface outside the collision parts, and largest distance (m) of the collision parts
-        outside the surface.
+        Largest distance (m) by which the surface lies outside the collision parts, and largest distance (m) by which
+        the collision parts lie outside the surface.
     """
     parts = np.asarray(body.hulls, float)
     new = np.array([True, *(parts[1:] != parts[:-1]).any(axis=(1, 2))])  # padding repeats the last part
@@ -106,9 +108,9 @@ def surface_gaps(
 ) -> tuple[float, float]:
     """Compute the largest distances between a visible surface and its collision parts.
 
-    Each result is the largest distance of the corners and 10,000 points of one surface from the other surface. The
-    distance of each point is exact. The true maximum can lie between the points, which causes an error of about half
-    their spacing. The first result is exact for a single hull.
+    Each distance is a maximum over points of one surface: all of its corners, and 10,000 other points. The distance of
+    each point from the other surface is exact. The true maximum can lie between the points. The error is then about
+    half the distance between neighbouring points. For a single hull, the first distance is exact.
 
     Args:
         vertices: Vertices of the visible surface (m).
@@ -116,9 +118,9 @@ def surface_gaps(
         hulls: Vertices of each convex part (m).
 
     Returns:
-        Largest distance (m) of the surface outside all parts. The visible surface can sink into the pad by this
-        distance. Largest distance (m) of the parts outside the surface. Up to this distance, the object collides where
-        nothing is visible, as in the hollow of a bowl.
+        Largest distance (m) by which the surface lies outside all parts, and largest distance (m) by which the parts
+        lie outside the surface. The visible surface can sink into the pad by the first distance. The object collides up
+        to the second distance away from its visible surface, as in the hollow of a bowl.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]
@@ -133,7 +135,7 @@ def surface_gaps(
 
 
 def hull_gap(body: Body) -> float:
-    """Compute the largest distance (m) of the visible surface of one body outside its collision parts."""
+    """Compute the largest distance (m) by which the visible surface of one body lies outside its collision parts."""
     surface = np.unique(np.asarray(body.vertices, float), axis=0)
     parts = [outside_hull(surface, np.unique(part, axis=0)) for part in np.asarray(body.hulls, float)]
     return float(np.min(parts, axis=0).max())

@@ -26,8 +26,8 @@ class Family:
     Args:
         name: Name of the class. The category of a body is the index of this name in CATEGORIES, or -1 if CATEGORIES
             lacks the name.
-        seed: Whole number >= 0 that is combined with the key, so that families with different seeds draw different
-            numbers from the same key.
+        seed: Whole number >= 0 that is combined with the key of `make`. Families with different seeds receive different
+            random numbers for the same key.
         parts: Function that receives a generator of NumPy, draws the dimensions and colours of an object from it, and
             returns the parts of the object in millimetres. +z is up as the object usually stands or lies. Equal
             generators must lead to equal parts. The object collides as the convex hull of all parts.
@@ -62,14 +62,17 @@ FAMILIES = {
 
 
 def find_family(category: str) -> Family:
-    """Find the family of a category.
+    """Return the family that generates the objects of a category.
 
     Args:
-        category: One of CATEGORIES, or "module:NAME" for a `Family` of your own. The module is imported, and NAME is
-            its variable. The module of a notebook or script is `__main__`.
+        category: One of CATEGORIES, or "module:NAME" for a `Family` of your own. The module is imported, and its
+            variable NAME must hold the family. The module of a notebook or script is `__main__`.
+
+    Returns:
+        The family.
 
     Raises:
-        ValueError: There is no such category, module or variable, or the variable is not a `Family`.
+        ValueError: There is no such category, module or variable, or the variable does not hold a `Family`.
     """
     if category in FAMILIES:
         return FAMILIES[category]
@@ -83,13 +86,14 @@ def find_family(category: str) -> Family:
         found = getattr(importlib.import_module(module), name, None)
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"category is {category!r}, but its module cannot be imported ({error}): install it, or start Python in "
-            "its folder"
+            f"category is {category!r}, but the module {module} cannot be imported ({error}): install the missing "
+            "module, or start Python in the folder that contains it"
         ) from error
     if not isinstance(found, Family):
+        fault = "does not exist" if found is None else f"is of type {type(found).__name__}"
         raise ValueError(
-            f"category is {category!r}, but {module} has no variable {name} with an objects.Family"
-            f"{'' if found is None else f', it is of type {type(found).__name__}'}: assign a Family to {name}"
+            f"category is {category!r}, but the variable {name} of the module {module} {fault}: assign an "
+            f"objects.Family to {name}"
         )
     return found
 
@@ -103,12 +107,14 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Returns:
         A body with +z up as the object usually stands or lies. A body of one of CATEGORIES has a longest side of 50 to
-        130 mm and the smallest size class of faces, FACE_CLASSES[0].
+        130 mm. The arrays of its vertices and faces have 1,024 rows, including padding.
 
     Raises:
         TypeError: `key` is not a JAX key.
-        ValueError: `category` is unknown, or the parts of its family are invalid. There are no parts, values that are
-            not finite, too many faces or more than one interior, or the longest side is below 5 mm or above 0.15 m.
+        ValueError: `category` is unknown, or its family returns invalid parts. The list of parts is empty, more than
+            one part bounds the contents, or a vertex is not finite. The parts have more than 131,072 faces or vertices
+            in total, lie in a plane, or have a longest side below 5 mm or above 0.15 m. The part that bounds the
+            contents encloses no volume.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category
@@ -123,15 +129,18 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
     density = np.concatenate([np.full(len(part.faces), part.density) for part in parts])
     inner = [part for part in parts if part.interior]
     interior = (inner[0].vertices * 1e-3, inner[0].faces) if inner else None
-    return assemble(
-        vertices,
-        faces,
-        np.repeat(colors[:, None], 3, axis=1),
-        density=density,
-        interior=interior,
-        contents_density=CONTENTS if inner else 0.0,
-        category=CATEGORIES.index(family.name) if family.name in CATEGORIES else -1,
-    )
+    try:
+        return assemble(
+            vertices,
+            faces,
+            np.repeat(colors[:, None], 3, axis=1),
+            density=density,
+            interior=interior,
+            contents_density=CONTENTS if inner else 0.0,
+            category=CATEGORIES.index(family.name) if family.name in CATEGORIES else -1,
+        )
+    except ValueError as error:
+        raise ValueError(f"family {family.name}: {error}") from error
 
 
 def _check(family: Family, parts: list[Part]) -> None:
@@ -144,8 +153,8 @@ def _check(family: Family, parts: list[Part]) -> None:
     points, faces = np.concatenate([part.vertices for part in parts]), sum(len(part.faces) for part in parts)
     if max(len(points), faces) > FACE_CLASSES[-1]:
         raise ValueError(
-            f"family {family.name}: all parts have {faces:,} faces and {len(points):,} vertices, but at most "
-            f"{FACE_CLASSES[-1]:,} fit: give outlines and paths fewer points"
+            f"family {family.name}: the parts of one object have {faces:,} faces and {len(points):,} vertices in "
+            f"total, but at most {FACE_CLASSES[-1]:,} of each are allowed: give outlines and paths fewer points"
         )
     if not np.isfinite(points).all():
         raise ValueError(f"family {family.name}: all vertices must be finite, got {points[~np.isfinite(points)][0]}")
@@ -153,5 +162,5 @@ def _check(family: Family, parts: list[Part]) -> None:
     if not 1e3 * SMALLEST <= longest <= 1e3 * PAD:
         raise ValueError(
             f"family {family.name}: the longest side must be {1e3 * SMALLEST:g} to {1e3 * PAD:g} mm, got {longest:.3g} "
-            "mm: parts are in millimetres, and shapes.scaled scales them to a length"
+            "mm: give the parts in millimetres, or scale them to a length with shapes.scaled"
         )

@@ -34,7 +34,11 @@ _UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 
 
 def find_root(folder: Path) -> Path | None:
-    """Find the folder of the table: `folder` or one of its sub-folders. Return None if there is no table."""
+    """Find ShapeNetSem's table metadata.csv in a folder or its direct sub-folders.
+
+    Returns:
+        The folder that contains the table, or None if there is no table.
+    """
     for table in (folder / "metadata.csv", *sorted(folder.glob("*/metadata.csv"))):
         if table.is_file():
             with table.open(encoding="utf-8", errors="replace", newline="") as lines:
@@ -45,13 +49,14 @@ def find_root(folder: Path) -> Path | None:
 
 
 def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
-    """List the models in the categories of CLASSES.
+    """List the models of ShapeNetSem that have a category in CLASSES, such as bottles and cameras.
 
     Args:
-        root: Folder of the table.
+        root: Folder that contains ShapeNetSem's table metadata.csv.
 
     Returns:
-        The items, and (name, reason) of each skipped model.
+        The mesh file and the settings for loading of each model that can be used, and (name, reason) of each skipped
+        model.
 
     Raises:
         ValueError: The table lacks columns or cannot be read.
@@ -74,15 +79,18 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             continue
         try:
             if name in seen:
-                raise ValueError("it has several rows in metadata.csv, of which the first is used: remove the others")
+                raise ValueError("the model has several rows in metadata.csv. The first one is used: remove the others")
             seen.add(name)
             if "_BAD" in categories:
-                raise ValueError("it is marked _BAD in metadata.csv")
+                raise ValueError("the model has the category _BAD in metadata.csv, so it is not used")
             if len(labels) > 1:
-                raise ValueError(f"it has several classes ({', '.join(sorted(labels))})")
+                raise ValueError(
+                    f"the model has categories of several classes ({', '.join(sorted(labels))}) in metadata.csv: keep "
+                    "only one class"
+                )
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
             if path is None:
-                raise ValueError(f"models-OBJ/models/{name}.obj does not exist")
+                raise ValueError(f"the mesh models-OBJ/models/{name}.obj does not exist: download it")
             found.append(_item(row, path, name, labels.pop(), images))
         except ValueError as error:
             skipped.append((name, str(error)))
@@ -99,28 +107,28 @@ def _rows(table: Path) -> list[dict[str, str]]:
         missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(
-                f"{table}: lacks the columns {', '.join(missing)} of ShapeNetSem's table: download it again"
+                f"{table}: the table lacks the columns {', '.join(missing)} of ShapeNetSem: download it again"
             )
         try:
             rows = list(reader)
         except csv.Error as error:
-            raise ValueError(f"{table}: cannot be read as a table ({error}): download it again") from error
+            raise ValueError(f"{table}: the file cannot be read as a table ({error}): download it again") from error
         if not any("rest" in row for row in rows):
             return rows
-    raise ValueError(f"{table}: has rows with more cells than columns: download it again")
+    raise ValueError(f"{table}: the table has rows with more cells than columns: download it again")
 
 
 def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:
     """Make the item of a row, or raise a ValueError with the reason why the row cannot be used."""
     unit = row["unit"].strip()
     if not unit:
-        raise ValueError("its unit is missing in metadata.csv, so its size is unknown")
+        raise ValueError("the model has no unit in metadata.csv, so its size is unknown: add the unit in metres")
     try:
         scale = float(unit)
     except ValueError:
         scale = float("nan")
     if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"its unit is {unit!r} in metadata.csv, but it must be a positive number of metres")
+        raise ValueError(f"the model's unit is {unit!r} in metadata.csv, but it must be a positive number of metres")
     missing = [key for key in ("up", "front") if not row[key].strip()]
     notes = [f"metadata.csv has no {key}: ShapeNet's default is used" for key in missing]
     up, front = _vector(row["up"], "up") or _UP, _vector(row["front"], "front") or _FRONT
@@ -139,5 +147,5 @@ def _vector(text: str, key: str) -> Vector | None:
     try:
         x, y, z = (float(part) for part in text.replace("\\", "").split(","))
     except ValueError as error:
-        raise ValueError(f"its {key} is {text!r} in metadata.csv, but it must be three numbers") from error
+        raise ValueError(f"the column {key} is {text!r} in metadata.csv, but it must have three numbers") from error
     return x, y, z

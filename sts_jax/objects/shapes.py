@@ -18,7 +18,7 @@ Painted = Color | Sequence[Color]
 
 
 class Part(NamedTuple):
-    """One closed or open surface with the colour of each face."""
+    """One surface of an object, closed or open, with a colour for each face."""
 
     vertices: np.ndarray  # Vertices, (v, 3) (mm).
     faces: np.ndarray  # Vertex indices of each face, (f, 3), counter-clockwise seen from outside.
@@ -31,13 +31,13 @@ class Part(NamedTuple):
 
 
 def circle(radius: Number, num: int) -> np.ndarray:
-    """Return a circle with a radius (mm) about the origin as an outline of `num` points, (num, 2)."""
+    """Return a circle with a radius (mm) about the origin, as an outline of `num` points, (num, 2)."""
     angle = 2 * np.pi * (np.arange(num) + 0.5) / num
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def ellipse(a: Number, b: Number, num: int, power: Number = 2.0) -> np.ndarray:
-    """Return a superellipse |x / a|^power + |y / b|^power = 1 as an outline of `num` points, (num, 2).
+    """Return the superellipse |x / a|^power + |y / b|^power = 1, as an outline of `num` points, (num, 2).
 
     Args:
         a: Half of the width along x (mm).
@@ -51,12 +51,12 @@ def ellipse(a: Number, b: Number, num: int, power: Number = 2.0) -> np.ndarray:
 
 
 def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray:
-    """Return a rectangle about the origin as an outline, (4, 2), or (8, 2) with its corners cut off.
+    """Return a rectangle about the origin, as an outline of 4 points, (4, 2), or of 8 points if corners are cut off.
 
     Args:
         width: Size along x (mm).
         depth: Size along y (mm).
-        chamfer: Length that is cut off each side at each corner (mm).
+        chamfer: Length by which each side is shortened at each corner (mm). 0 keeps the corners.
     """
     w, d, c = width / 2, depth / 2, chamfer
     if c == 0:
@@ -70,7 +70,12 @@ def rectangle(width: Number, depth: Number, chamfer: Number = 0.0) -> np.ndarray
 
 
 def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.ndarray:
-    """Return a horizontal ring for each (scale, z): the outline (n, 2), scaled, at the height z (mm)."""
+    """Return a horizontal ring for each of k levels, as an array (k, n, 3) (mm).
+
+    Args:
+        outline: Outline of n points, (n, 2) (mm).
+        levels: A factor on the outline and the height z (mm) of each ring.
+    """
     return np.stack([np.column_stack([outline * scale, np.full(len(outline), z)]) for scale, z in levels])
 
 
@@ -79,13 +84,14 @@ def sweep(path: np.ndarray, section: np.ndarray, binormal: Sequence[Number], *, 
 
     Args:
         path: Points along the path, (k, 3) (mm).
-        section: Cross-section of the tube (mm), (n, 2), or one per point, (k, n, 2). Its first axis points along the
-            cross product of path and binormal. Its second axis points along the binormal.
+        section: Outline of n points (mm), (n, 2), or one outline for each point of the path, (k, n, 2). The first
+            coordinate of an outline is along the cross product of the path's direction and `binormal`. The second
+            coordinate is along `binormal`.
         binormal: Unit vector (3,), not parallel to the path.
         closed: True if the path is closed, so that its last point is next to its first point.
 
     Returns:
-        Rings (k, n, 3) (mm).
+        One ring for each point of the path, (k, n, 3) (mm).
     """
     ahead = np.roll(path, -1, 0) - np.roll(path, 1, 0)
     if not closed:
@@ -114,13 +120,14 @@ def loft(
     """Connect rings to a surface, whose faces are counter-clockwise seen from outside.
 
     Args:
-        rings: Rings, (k, n, 3) (mm). A band of the surface connects each ring to the next one.
-        color: One colour (3,), one colour per band, or n colours per band. There are k - 1 bands, or k if `closed`.
-        ends: Colours of the faces that close the first and the last ring. An end with None stays open. By default, both
-            ends are closed and have the colours of their bands.
+        rings: k rings of n points each, (k, n, 3) (mm). A band of the surface connects each ring to the next one.
+        color: One colour (3,) for the whole surface, one for each band, or n for each band, in linear light. There are
+            k - 1 bands, or k if `closed`.
+        ends: Colours of the faces that close the first and the last ring. None in place of a colour leaves this end
+            open. By default, both ends are closed and have the colours of their bands.
         closed: True if a band also connects the last ring to the first. The surface then has no ends, as in a hoop.
         density: Mass per area (kg/m^2).
-        interior: True if the surface bounds the contents of the object.
+        interior: True if the surface bounds the contents of the object, such as the water in a bottle.
     """
     k, n = rings.shape[:2]
     bands = k if closed else k - 1
@@ -164,8 +171,8 @@ def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int 
     """Return a surface of revolution about the z axis.
 
     Args:
-        profile: Points (radius, z) of the surface (mm).
-        color: Colours as in `loft`.
+        profile: Points (radius, z) of the surface (mm). A band of the surface connects each point to the next one.
+        color: One colour (3,) for the whole surface, one for each band, or `num` for each band, in linear light.
         num: Number of points around the axis.
         kind: Keyword arguments of `loft`: `ends`, `closed`, `density` and `interior`.
     """
@@ -173,7 +180,13 @@ def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int 
 
 
 def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
-    """Return a box with a size (x, y, z) (mm) along the axes, about a centre (x, y, z) (mm)."""
+    """Return a box of one colour, along the axes.
+
+    Args:
+        size: Size along x, y and z (mm).
+        centre: Centre (x, y, z) (mm).
+        color: Colour (3,) in linear light.
+    """
     x, y, z = size
     return move(loft(rings(rectangle(x, y), [(1.0, -z / 2), (1.0, z / 2)]), color), centre)
 
@@ -181,14 +194,16 @@ def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
 def decal(
     outline: np.ndarray, color: Color, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", spin: Number = 0.0
 ) -> Part:
-    """Return a painted mark without mass. It lies at z = PAINT and faces +z, and is then moved by `move`.
+    """Return a painted mark without mass.
+
+    The mark faces +z and lies 0.04 mm above the plane z = 0. It is then rotated and shifted as in `move`.
 
     Args:
         outline: Outline of the mark, (n, 2) (mm). Each point must be visible from the mean of all points.
         color: Colour (3,) in linear light.
         shift: Shift along x, y and z (mm).
-        axis: Direction to which the mark's z axis is turned: "x", "y", "z", "-x", "-y" or "-z".
-        spin: Rotation about z before the turn (rad).
+        axis: Direction to which the mark's z axis is turned before the shift: "x", "y", "z", "-x", "-y" or "-z".
+        spin: Rotation about z before this turn (rad).
     """
     n = len(outline)
     points = np.column_stack([np.vstack([outline, outline.mean(axis=0)]), np.full(n + 1, PAINT)])
@@ -221,8 +236,8 @@ def move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", sp
     Args:
         part: Part to move.
         shift: Shift along x, y and z (mm).
-        axis: Direction to which the part's z axis is turned: "x", "y", "z", "-x", "-y" or "-z".
-        spin: Rotation about z before the turn (rad).
+        axis: Direction to which the part's z axis is turned before the shift: "x", "y", "z", "-x", "-y" or "-z".
+        spin: Rotation about z before this turn (rad).
     """
     return part._replace(vertices=part.vertices @ (_TURNS[axis] @ rotation_about_z(spin)).T + np.asarray(shift, float))
 

@@ -18,17 +18,17 @@ class Surface(NamedTuple):
 
 
 def merge(path: Path, corners: np.ndarray, colors: np.ndarray, uv: np.ndarray, texture: np.ndarray | None) -> Surface:
-    """Make a surface of separate faces. Corners at the same place become one vertex.
+    """Make a surface from separate faces. Corners at the same place become one vertex.
 
     Args:
-        path: Mesh file, for errors.
+        path: Path of the mesh file. Errors contain it.
         corners: Corners of each face, (f, 3, 3) (m).
         colors: Colour at each corner, (f, 3, 3), in linear light.
         uv: Texture coordinates at each corner, (f, 3, 2).
         texture: Texture (t, t, 3) in linear light, or None.
 
     Raises:
-        ValueError: All faces are without area.
+        ValueError: No face has an area.
     """
     grain = np.ptp(corners, axis=(0, 1)).max() * 1e-7
     _, first, index = np.unique(
@@ -41,7 +41,7 @@ def proper(path: Path, surface: Surface) -> Surface:
     """Remove faces that use a vertex twice, and vertices that no face uses.
 
     Args:
-        path: Mesh file, for errors.
+        path: Path of the mesh file. Errors contain it.
         surface: Surface to clean.
 
     Raises:
@@ -50,7 +50,7 @@ def proper(path: Path, surface: Surface) -> Surface:
     faces = surface.faces
     kept = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     if not kept.any():
-        raise ValueError(f"{path}: each face uses a vertex twice, so none has any area: give a mesh with triangles")
+        raise ValueError(f"{path}: each face uses a vertex twice, so no face has an area: give a mesh with triangles")
     used, faces = np.unique(faces[kept], return_inverse=True)
     return surface._replace(
         vertices=surface.vertices[used],
@@ -61,10 +61,10 @@ def proper(path: Path, surface: Surface) -> Surface:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Return whether faces form a closed surface, in which each edge is traversed equally often in both directions.
+    """Return whether faces (f, 3) form a closed surface, in which they run along each edge equally often in both ways.
 
-    A single part is then watertight, and all its faces have the same orientation. Where vertices of touching parts have
-    been merged, more than two faces can meet at an edge without a hole.
+    A surface of a single part then has no holes, and all of its faces have the same orientation. If several parts touch
+    and share vertices, more than two faces can meet at an edge.
     """
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)
@@ -82,7 +82,7 @@ def surface_samples(
         num: Number of points.
 
     Returns:
-        The triangle and the three barycentric weights of each point.
+        Index of the triangle of each point, and the barycentric weights of the three corners.
     """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     share = np.cumsum(np.linalg.norm(cross, axis=1))

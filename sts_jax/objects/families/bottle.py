@@ -7,7 +7,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a bottle: the bottle with its label, and the cap."""
+    """Return the parts (mm) of a random bottle that stands upright, with a label and a cap."""
     radius = rng.uniform(11, 20)  # mm, radius of the base
     height = rng.uniform(80, 120)  # mm, with the cap
     style = rng.integers(3)  # straight, with a neck or tapered: a third each

@@ -20,7 +20,7 @@ class _Size(NamedTuple):
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a camera whose lens faces -y."""
+    """Return the parts (mm) of a random camera whose lens faces -y."""
     longest = rng.uniform(70, 120)  # mm
     width = 100.0
     height = width * rng.uniform(0.55, 0.72)  # height of the housing

@@ -12,16 +12,18 @@ SHEET = 1.5  # mm, thickness of the steel
 
 
 def handle(rng: np.random.Generator, length: float, end: float, lift: float) -> tuple[Part, Color, float]:
-    """Draw the handle of a fork or a spoon.
+    """Return a random handle of a fork or a spoon, along the x axis.
+
+    The handle begins on the table at x = 0. It ends at its neck, where the tines or the bowl begin.
 
     Args:
         rng: Generator of the random dimensions and colours.
         length: Length of the whole fork or spoon (mm).
-        end: x of the end of the handle at the neck (mm). The other end lies on the table at x = 0.
+        end: Coordinate x of the neck (mm).
         lift: Height of the neck above the table (mm).
 
     Returns:
-        The handle, the colour of its steel and the width of its neck (mm).
+        The handle, the colour of the steel in linear light, and the width of the neck (mm).
     """
     arch = length * rng.uniform(0.015, 0.05)  # rise of the handle in its middle
     wide = length * rng.uniform(0.075, 0.12)  # width of its end

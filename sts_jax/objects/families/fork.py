@@ -10,7 +10,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a fork that lies on the table with its tines towards +x."""
+    """Return the parts (mm) of a random fork that lies on the table with its tines towards +x."""
     longest = rng.uniform(90, 130)  # mm
     length = 125.0
     tines = int(rng.integers(3, 5))  # 3 or 4

@@ -7,7 +7,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a computer mouse whose keys face -y."""
+    """Return the parts (mm) of a random computer mouse whose keys face -y."""
     longest = rng.uniform(60, 110)  # mm, including the first centimetre of a cable
     length = 100.0
     width = length * rng.uniform(0.54, 0.7)

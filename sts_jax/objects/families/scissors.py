@@ -8,7 +8,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw scissors that lie on the table with their tips towards +y."""
+    """Return the parts (mm) of random scissors that lie on the table with their tips towards +y."""
     longest = rng.uniform(80, 130)  # mm
     blade = rng.uniform(42, 66)  # mm, from the pivot to the tip
     half = np.radians(rng.uniform(12, 40)) / 2  # rad, half the angle between the blades

@@ -9,7 +9,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a spoon that lies on the table with its bowl towards +x."""
+    """Return the parts (mm) of a random spoon that lies on the table with its bowl towards +x."""
     longest = rng.uniform(90, 130)  # mm
     length = 125.0
     bowl = length * rng.uniform(0.29, 0.38)  # length of the bowl

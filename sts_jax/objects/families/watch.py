@@ -11,7 +11,7 @@ STRAP = 2.2  # mm, thickness of the strap before the watch is scaled to its leng
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a watch whose dial faces up, with twelve o'clock towards +y."""
+    """Return the parts (mm) of a random watch whose dial faces up, with twelve o'clock towards +y."""
     longest = rng.uniform(95, 130)  # mm, shorter than most real watches, to fit on the pad
     radius = rng.uniform(15, 20)  # mm, radius of the case
     thick = rng.uniform(7, 11)  # mm, thickness of the case

@@ -7,7 +7,7 @@ from sts_jax.objects.shapes import Part
 
 
 def parts(rng: np.random.Generator) -> list[Part]:
-    """Draw a webcam whose lens faces -y."""
+    """Return the parts (mm) of a random webcam whose lens faces -y."""
     longest = rng.uniform(55, 90)  # mm
     ball = rng.uniform() < 0.5  # the head is a ball for half of the webcams, else a bar
     head = rng.uniform(13, 18)  # half the height of the head
