@@ -61,12 +61,13 @@ def checked_masks(
     """Check the argument `present` of a `Predictor`, and return its masks as Boolean arrays.
 
     Args:
-        present: Dictionary from the name of a modality to a Boolean mask of its items, or None.
+        present: Dictionary from the name of a modality ("visual", "tactile" or "pose") to a Boolean mask of the items
+            in the batch. None for no masks.
         arrays: Inputs that were given, by the name of the modality.
-        lead: Leading axes that all inputs have. Each mask must have this shape.
+        lead: Sizes of the leading axes that all inputs have. Each mask must have this shape.
 
     Returns:
-        Masks by the name of the modality.
+        Masks by the name of the modality, an empty dictionary if `present` is None.
 
     Raises:
         ValueError: `present` is not a dictionary, a mask is for a modality that was not given, or a mask has another
@@ -82,7 +83,8 @@ def checked_masks(
         mask = checked_array(f"present[{name!r}]", value, "bool")
         if name not in arrays:
             raise ValueError(
-                f"present[{name!r}] is the mask of an input that was not given: its key must be one of {list(arrays)}."
+                f"present[{name!r}] is the mask of an input that was not given: the keys of present must be among "
+                f"{list(arrays)}."
             )
         if mask.shape != lead:
             raise ValueError(
@@ -126,7 +128,15 @@ def checked_samples(num_samples: Any, key: Any) -> int:
 
 
 def plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
-    """Mask of the items that `check_values` accepts, for arrays that may be traced, (*n,)."""
+    """Find the items of a batch that `check_values` accepts. The array may be traced.
+
+    Args:
+        name: Name of the modality. All modalities but "pose" are images.
+        array: Images (*n, height, width, 3), or poses (*n, 7): position (m) and unit quaternion.
+
+    Returns:
+        Mask of the accepted items.
+    """
     if name == "pose":
         lengths = jnp.linalg.norm(jax.lax.stop_gradient(array[..., 3:]), axis=-1)
         return (jnp.abs(lengths - 1) <= _QUAT_TOLERANCE) & (jnp.abs(array[..., :3]) <= _FARTHEST).all(-1)

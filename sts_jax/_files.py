@@ -19,14 +19,14 @@ class DamagedFileError(OSError):
 
 
 class LockedError(RuntimeError):
-    """A folder is locked by another process, or elsewhere in this one. The message names the folder and the process."""
+    """A folder is already locked, by another process or by this one. The message names the folder and the process."""
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> None:
     """Write a file atomically. An interruption leaves either the complete new file or the previous state.
 
     The content is written to a temporary file in the same folder, flushed to disk, and renamed to `path`. Missing
-    folders are created. An error that `write` raises and that is not an OSError is passed on unchanged.
+    folders are created. Errors of `write` other than an OSError are raised unchanged.
 
     Args:
         path: The file.
@@ -58,7 +58,7 @@ _IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 
 
 def remedy(error: Exception) -> str:
-    """Describe the remedy for a failed write, by the error's number. An error without a number may mean a full disk."""
+    """Describe the remedy for a failed write. It depends on the attribute `errno` of the error, if there is one."""
     number = getattr(error, "errno", None)
     if number in _FULL:
         return "Free some disk space"
@@ -88,7 +88,7 @@ def read_json(path: Path, remedy: str) -> Any:
 
     Args:
         path: The file.
-        remedy: What to do if the file is damaged. The error message ends with this text.
+        remedy: Text at the end of the error message, with the remedy for a damaged file.
 
     Returns:
         The content of the file.
@@ -106,15 +106,17 @@ def read_json(path: Path, remedy: str) -> Any:
 
 
 def claim(path: Path, content: dict) -> None:
-    """Write a JSON file, or check that an existing one has the same content.
+    """Record settings in a JSON file, or check that an existing file has the same settings.
+
+    The check keeps results of different settings out of the same folder.
 
     Args:
         path: The file.
-        content: The settings to write or to compare, of JSON types. Tuples count as lists.
+        content: The settings, of JSON types. Tuples count as lists.
 
     Raises:
-        ValueError: The existing content differs. The message names all fields that differ, both values of the first
-            three, and the remedy.
+        ValueError: The settings in the existing file differ. The message names all fields that differ, and the remedy.
+            For the first three of these fields, it contains both values.
         DamagedFileError: The existing file cannot be read or is not JSON.
         OSError: The file cannot be written.
     """
@@ -169,7 +171,7 @@ def lock(folder: Path) -> Iterator[None]:
         folder: The folder.
 
     Raises:
-        LockedError: The folder is locked already, by another process or elsewhere in this one.
+        LockedError: The folder is already locked, by another process or by this one.
         OSError: The folder cannot be created or written to.
     """
     owner, held = folder / OWNER, filelock.FileLock(folder / ".lock", timeout=0)
@@ -182,7 +184,7 @@ def lock(folder: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):  # the holder may not have written it yet, or may have just finished
             holder = owner.read_text(errors="replace") or holder
         raise LockedError(
-            f"{folder} is in use by {holder}: wait until it has finished, or choose another folder."
+            f"{folder} is in use by {holder}: wait until that process has finished, or choose another folder."
         ) from None
     except OSError as error:
         held.release()
@@ -196,7 +198,7 @@ def lock(folder: Path) -> Iterator[None]:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the entries of a folder to disk, so that new and renamed files in it survive a power failure."""
+    """Flush the list of a folder's files to disk, so that new and renamed files survive a power failure."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

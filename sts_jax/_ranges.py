@@ -18,15 +18,16 @@ _SMALLEST = float(np.finfo(np.float32).tiny)  # float32 arithmetic flushes small
 
 
 def limits(metadata: Mapping[str, Any], array: Any) -> list[tuple[Any, str]]:
-    """Compare numbers with the allowed range of a field.
+    """Compare the numbers of a dataclass's field with the range that the field allows.
 
     Args:
-        metadata: Metadata of the field, with the limits of its range.
+        metadata: Metadata of the field. The keys of its limits are "above" (>), "at_least" (>=), "below" (<) and
+            "at_most" (<=).
         array: The numbers, a NumPy array or a traced JAX array.
 
     Returns:
-        One pair for each limit, with a flag and the text for an error message. The flag is True if all numbers satisfy
-        the limit.
+        One pair (flag, text) for each limit. The flag is True if all numbers satisfy the limit, and the text describes
+        the limit for an error message.
     """
     found = []
     if "above" in metadata:

@@ -17,10 +17,12 @@ def bilinear(
     """Interpolate an image at any points.
 
     Args:
-        image: Values of the pixels, with any number of axes for channels. It has at least 2x2 pixels, unless `wrap`.
-        column: Columns of the points (pixels).
-        row: Rows of the points (pixels).
-        wrap: If True, the image repeats beyond its border.
+        image: Values of the pixels. There may be any number of axes *c for channels. If `wrap` is False, the image must
+            have at least 2x2 pixels.
+        column: Columns of the points (pixels, whole numbers at pixel centres).
+        row: Rows of the points (pixels, whole numbers at pixel centres).
+        wrap: If True, the image repeats beyond its border. If False, a point outside has the value of the nearest point
+            inside.
 
     Returns:
         Values at the points, (*n, *c).
@@ -41,15 +43,15 @@ def bilinear(
 def bilinear_batch(
     images: Float[Array, "n h w c"], column: Float[Array, "n m"], row: Float[Array, "n m"]
 ) -> Float[Array, "n m c"]:
-    """Interpolate several images at many points each. The gradient with respect to the images is fast.
+    """Interpolate each of n images at m points. The derivative with respect to the images is fast to compute.
 
     Args:
-        images: Images with channels, at least 2x2 pixels each.
-        column: Columns of the points in each image (pixels).
-        row: Rows of the points in each image (pixels).
+        images: Images with c channels, at least 2x2 pixels each.
+        column: Columns of the points in each image (pixels, whole numbers at pixel centres).
+        row: Rows of the points in each image (pixels, whole numbers at pixel centres).
 
     Returns:
-        Values at the points.
+        Values at the points. A point outside its image has the value of the nearest point inside.
     """
     count, height, width, channels = images.shape
     # The four neighbours of a point lie side by side in a table, so that one look-up finds them.
@@ -65,16 +67,17 @@ def bilinear_batch(
 def shifted(
     around: Float[Array, "a b"], columns: Float[Array, ""], rows: Float[Array, ""], shape: tuple[int, int]
 ) -> Float[Array, "h w"]:
-    """Interpolate an image at the same offset from every pixel.
+    """Shift an image by an offset, with interpolation between its pixels.
 
     Args:
-        around: The image (h, w) with a border: h + 1 rows above and below it, and w + 1 columns on each side.
+        around: The image (h, w) inside a border of h + 1 rows above and below it, and w + 1 columns left and right of
+            it. The border has the values that the shift moves into the image.
         columns: Horizontal part of the offset (pixels). It is clipped to [-w, w].
         rows: Vertical part of the offset (pixels). It is clipped to [-h, h].
         shape: Height h and width w of the image without the border (pixels).
 
     Returns:
-        Image whose pixel (row i, column j) has the value at row i + rows and column j + columns.
+        Image. Its pixel at row i and column j has the value of the given image at row i + rows and column j + columns.
     """
     height, width = shape
     columns, rows = jnp.clip(columns, -width, width), jnp.clip(rows, -height, height)

@@ -19,15 +19,16 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     Call this function once, before the first computation. It changes JAX's settings for the whole process. The commands
     in `experiments` call it. The library itself never does.
 
-    On a CPU, XLA logs an error about processor features for each program that it loads from the cache. The message is
-    harmless: XLA counts two of its own tuning preferences as features, and no processor reports these (jax#38445). Set
-    the environment variable TF_CPP_MIN_LOG_LEVEL=3 before `import jax` to silence it.
+    On a CPU, XLA logs an error about processor features for each program that it loads from the cache. This message is
+    harmless. XLA lists two of its own tuning options among the features of the processor that compiled the program, and
+    does not find them on any processor (JAX issue 38445). Set the environment variable TF_CPP_MIN_LOG_LEVEL=3 before
+    `import jax` to hide the message.
 
     Args:
         folder: Folder of the cache. None selects the folder in the environment variable JAX_COMPILATION_CACHE_DIR. If
-            that variable is empty, nothing is cached. If it is not set, the cache is a folder in `~/.cache/sts_jax`, or
-            in `$XDG_CACHE_HOME/sts_jax`. There is one such folder for each kind of processor, because a program
-            compiled for one kind may not run on another.
+            that variable is set to an empty string, nothing is cached. If the variable is not set, the cache is a
+            folder in `$XDG_CACHE_HOME/sts_jax`, by default in `~/.cache/sts_jax`. Each kind of processor has its own
+            folder there, because a program that was compiled for one kind may not run on another.
 
     Returns:
         The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.

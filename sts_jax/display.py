@@ -41,9 +41,9 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
 
     Args:
         thing: One item to draw. A `Frame` gives four panels: visual image, tactile image, depth (mm) and pressure
-            (kPa). A `Body` gives a view from outside, standing on a pad. A `Prediction` gives its predicted images. An
-            array (height, width, 3) is drawn as an image: floats in [0, 1] or uint8. Select item i of a batch with
-            `jax.tree.map(lambda x: x[i], frames)`.
+            (kPa). A `Body` gives an outside view of the object on a pad. A `Prediction` gives its predicted images. An
+            array (height, width, 3) is drawn as an image, and must have floats in [0, 1] or the type uint8. Select item
+            i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
         title: Title of the figure. The default is the description of a `Body`, and no title for other items.
 
     Returns:
@@ -133,7 +133,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
             remedies = ["save it as .npz"] * isinstance(thing, tuple(_KINDS.values()))
             remedies += ["draw it with sts.show(...).savefig(path)"] * (not isinstance(thing, Trajectory))
             raise TypeError(
-                f"only a Frame or an image can be written to a .png file, got a {type(thing).__name__}: "
+                f"thing is a {type(thing).__name__}, but only a Frame or an image can be written to a .png file: "
                 f"{', or '.join(remedies)}"
             )
         else:
@@ -143,8 +143,8 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
     elif path.suffix.lower() == ".npz":
         if not isinstance(thing, tuple(_KINDS.values())):
             raise TypeError(
-                f"only one of {', '.join(_KINDS)} can be written to an .npz file, got {type(thing).__name__}: "
-                "write an image to a .png file, and other arrays with np.savez"
+                f"thing has the type {type(thing).__name__}, but only objects of the types {', '.join(_KINDS)} can be "
+                "written to an .npz file. Write an image to a .png file, and other arrays with np.savez"
             )
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
         arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}
@@ -168,7 +168,8 @@ def load(path: str | os.PathLike[str]) -> Any:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The path is a folder, or its suffix is not `.npz`.
-        DamagedFileError: (An `OSError`.) The file is damaged, or was not written by this version of `save`.
+        OSError: The file is damaged, or was written by another program or another version of `save`
+            (`DamagedFileError`).
     """
     path = Path(path)
     if not path.exists():
@@ -215,8 +216,8 @@ def _image(thing: Any) -> np.ndarray:
     """Check that an argument is an RGB image, and return it as floats in [0, 1]."""
     if not isinstance(thing, np.ndarray | jax.Array):
         raise TypeError(
-            f"an image must be an array (height, width, 3), got {type(thing).__name__}. A Frame is accepted too, and "
-            "sts.show also draws a Body or a Prediction"
+            f"thing has the type {type(thing).__name__}, but an image must be an array (height, width, 3). A Frame is "
+            "accepted too, and sts.show also draws a Body or a Prediction"
         )
     image = np.asarray(thing)
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
@@ -225,6 +226,7 @@ def _image(thing: Any) -> np.ndarray:
         return image / 255
     if image.dtype.kind != "f" or not (np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1):
         raise ValueError(
-            f"the image is {image.dtype} in [{image.min()}, {image.max()}], but it must be uint8, or floats in [0, 1]"
+            f"the image has the type {image.dtype} and values in [{image.min()}, {image.max()}], but it must be uint8, "
+            "or floats in [0, 1]"
         )
     return image

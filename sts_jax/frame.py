@@ -72,12 +72,12 @@ def sense(
 
     With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`), and both streams
     show the object in this balanced pose. Without a wrench, the object stays in the given pose. The images show an
-    empty sensor if the whole object is below the gel's face.
+    empty sensor if no part of the object is above the plane of the gel's outer face (z > 0).
 
     The images also show an empty sensor, and `balanced` is False, in these cases:
 
     - The pose or the wrench is not finite.
-    - The squared length of the quaternion is zero or overflows.
+    - The squared length of the quaternion is zero or infinite in float32.
     - The body is traced, and one of its vertices, normals or colours is not finite.
     - The sensor is traced, and a constant is out of range (`Sensor.check`). Traced constants then have their default
       values. A sensor that is not traced raises an error instead.
@@ -95,16 +95,16 @@ def sense(
             show the largest centred part of the view.
         crop: If True, the images show only a window around the object, with the aspect ratio of `resolution`.
         moving_edges: If True, the derivative of the tactile image with respect to the pose includes the motion of the
-            imprint's edges across pixels, for fitting poses. It is then accurate on average over a few pixels. If
-            False, the derivative is that of each pixel and ignores moving edges. The images do not change.
+            imprint's edges across pixels. This derivative serves to fit poses, and is accurate on average over a few
+            pixels. If False, the derivative ignores moving edges. The images are the same in both cases.
 
     Returns:
         The images, with the pose that is drawn and the pressure on the gel.
 
     Raises:
-        ValueError: `resolution` is not two whole numbers above 0, `pose` or `wrench` has a wrong shape, or the body has
-            too many faces. These conditions are checked under `jit` too. If the sensor or the body is not traced, also:
-            a constant of the sensor is out of range (`Sensor.check`), or the body is invalid (`Body.check`).
+        ValueError: `resolution` is not two whole numbers above 0, `pose` or `wrench` has a wrong shape, the body has
+            too many faces, a constant of the sensor is out of range (`Sensor.check`), or the body is invalid
+            (`Body.check`). Traced constants and traced bodies raise an error only for a wrong shape.
         TypeError: `sensor` is not a `Sensor`, `body` is not a `Body`, or `pose` or `wrench` is not an array of numbers.
     """
     _check_kinds(sensor, body)
@@ -144,8 +144,8 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
         image = ((1 - l) V + l k T) / (1 - l + l k)
 
     V is the visual and T the tactile stream, l is `light`, and k is the exposure time of V divided by that of T
-    (`Room.exposure`). The denominator is the camera's exposure at the level l. It keeps the brightness of pixels that
-    are equally bright in both streams.
+    (`Room.exposure`). The denominator is the exposure time at level 0 divided by that at level l. A pixel that is
+    equally bright in both streams is therefore equally bright at every level.
 
     Args:
         sensor: Sensor that made the frame.
@@ -159,8 +159,8 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     Raises:
         TypeError: `sensor` is not a `Sensor`, `frame` is not a `Frame`, or `light` is not a number.
         ValueError: `light` is outside [0, 1] or is an array with axes, or a constant of the sensor is out of range
-            (`Sensor.check`). Traced values are not checked. If a traced constant of the sensor is out of range, the
-            default value of `Room.exposure` is used.
+            (`Sensor.check`). The numbers in traced values raise no error. If a traced constant of the sensor is out of
+            range, all traced constants have their default values.
     """
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
@@ -191,14 +191,15 @@ def touch(
 
     Returns:
         Image in [0, 1]. It equals `Frame.tactile` of the same imprint, except that `sense` samples small images more
-        finely (`Sensor.fine_below`). If a traced constant or a traced window is invalid, the image shows flat skin in
-        the whole view, and traced constants have their default values.
+        finely (`Sensor.fine_below`). Traced numbers cannot raise errors. If a traced constant of the sensor or a traced
+        `window` is invalid, the image shows flat skin, and `window` counts as None. If a constant is invalid, all
+        traced constants also have their default values.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
         ValueError: `imprint` is empty, is not two-dimensional or has an integer type, `window` has another shape, is
-            not finite or has no area, or a constant of the sensor is out of range (`Sensor.check`). Traced values are
-            not checked.
+            not finite or has no area, or a constant of the sensor is out of range (`Sensor.check`). The numbers in
+            traced values raise no error.
     """
     _check_sensor(sensor)
     imprint = _imprint_in_metres(imprint)
@@ -247,7 +248,8 @@ def _numbers(name: str, value: Any, wanted: str) -> Array:
     """
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         raise TypeError(
-            f"{name} is a {type(value).__name__}, but it must be an array of shape {wanted}. Unpack it with *"
+            f"{name} is a {type(value).__name__}, but it must be an array of shape {wanted}. Unpack a tuple of several "
+            "arguments with *, such as sense(sensor, body, *placement)"
         )
     try:
         return jnp.asarray(value, float)

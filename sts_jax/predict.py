@@ -67,9 +67,10 @@ class Predictor:
         """Load a trained model.
 
         Args:
-            folder: Folder of a trained model, such as `runs/freefall/models/mvae`: the `workdir` of its training, or a
-                folder that `save` wrote. Or the name of a model that comes with the library, such as `freefall`. If the
-                current directory has a folder of that name with a `config.json`, this folder is loaded.
+            folder: Folder of a trained model, such as `runs/freefall/models/mvae`, or the name of a model that comes
+                with the library, such as `freefall`. A folder is the `workdir` of a training, or was written by `save`.
+                If the current directory has a folder of the given name that contains `config.json`, the model in this
+                folder is loaded.
             resolution: Height and width of the images that you will pass (pixels). If given, a model that was trained
                 at another resolution raises an error.
             crop: View of the images that you will pass: True for the square around the object, False for the whole pad.
@@ -108,14 +109,15 @@ class Predictor:
         return cls(model, preprocessing, blank, str(folder))
 
     def save(self, folder: str | Path, *, compact: bool = False) -> None:
-        """Write the model to a folder that `load` reads. Training cannot resume from this folder.
+        """Write the model to a folder that `load` reads.
 
-        The folder has no optimiser state.
+        Training cannot resume from this folder, because the folder does not contain the state of the optimiser.
 
         Args:
             folder: New or empty folder.
             compact: If True, round the weights, which reduces their size on disk to a third. A weight changes by at
-                most 1/256 of the root mean square of its output channel, and predictions change slightly.
+                most 1/256 of the root mean square of all weights of the same output channel. Predictions change
+                slightly.
 
         Raises:
             FileExistsError: The folder is not empty, or is a file.
@@ -216,9 +218,10 @@ class Predictor:
         """Predict the last frame of trajectories without any measurement, from the model's prior distribution.
 
         Args:
-            shape: Leading axes of the predictions. The default is a single prediction.
-            condition: Known parameters of the trajectories in SI units, (*shape, c), for models that were trained with
-                them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration (s).
+            shape: Sizes of the leading axes of the predictions. The default is a single prediction.
+            condition: The c known parameters of each trajectory in SI units, (*shape, c), for models that were trained
+                with them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration
+                (s).
 
         Returns:
             The predictions.
@@ -277,7 +280,10 @@ class Predictor:
 
     @property
     def modalities(self) -> tuple[str, ...]:
-        """Names of the modalities that the model accepts, without those that were absent in its training data."""
+        """Names of the inputs that the model accepts, out of "visual", "tactile" and "pose".
+
+        A modality that was absent from all first frames of the training data is not among them.
+        """
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
     @property
@@ -306,11 +312,11 @@ class Predictor:
         tail = (7,) if name == "pose" else (height, width, 3)
         if array.ndim < len(tail) or array.shape[array.ndim - len(tail) :] != tail:
             raise ValueError(
-                f"{name} has shape {array.shape}, but {self.name} needs (..., {', '.join(map(str, tail))})"
+                f"{name} has shape {array.shape}, but {self.name} needs shape (..., {', '.join(map(str, tail))})"
                 + ("." if name == "pose" else f": render with resolution={self.preprocessing.resolution}.")
             )
         if math.prod(array.shape) == 0:
-            raise ValueError(f"{name} has shape {array.shape}, so there is no item in it: pass at least one.")
+            raise ValueError(f"{name} has shape {array.shape}, which contains no item: pass at least one item.")
         return _arguments.float32(array)
 
     def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
@@ -321,7 +327,7 @@ class Predictor:
         if array.shape != (*lead, statespace.STATE_CODE):
             raise ValueError(f"state has shape {array.shape}, but it must have shape {(*lead, statespace.STATE_CODE)}.")
         if not _arguments.traced(array) and not np.isfinite(array).all():
-            raise ValueError("state has NaN or infinite values, but every item needs its true state.")
+            raise ValueError("state has NaN or infinite values: give finite codes for every item, or leave state= out.")
         return _arguments.float32(array)
 
     def _checked_condition(
@@ -344,11 +350,12 @@ class Predictor:
         if _arguments.traced(condition):
             return condition, jnp.all(jnp.abs(condition) <= _LARGEST_CONDITION * scale, axis=-1)
         if not np.isfinite(condition).all():
-            raise ValueError("condition has NaN or infinite values, but every item needs a condition.")
+            raise ValueError("condition has NaN or infinite values: give finite numbers for every item.")
         if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
             raise ValueError(
-                f"condition has magnitudes {np.abs(condition).reshape(-1, width).max(0).tolist()}, but usual ones are "
-                f"{scale.tolist()}, and at most {_LARGEST_CONDITION:g} times these are allowed: give it in SI units."
+                f"condition has magnitudes up to {np.abs(condition).reshape(-1, width).max(0).tolist()}, but at most "
+                f"{(_LARGEST_CONDITION * scale).tolist()} is allowed, {_LARGEST_CONDITION:g} times the usual "
+                "magnitudes: give the condition in SI units."
             )
         return condition, None
 
@@ -379,6 +386,6 @@ def _check_view(name: str, config: statespace.Config, preprocessing: training.Pr
         found = getattr(preprocessing, field)
         if found != wanted:
             raise ValueError(
-                f"{name}: the state-space model needs preprocessing with {field}={wanted!r}, got {found!r}: train it "
-                f"with {field}={wanted!r}."
+                f"{name} is a state-space model and needs preprocessing with {field}={wanted!r}, but its preprocessing "
+                f"has {field}={found!r}: train the model with {field}={wanted!r}."
             )

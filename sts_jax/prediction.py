@@ -58,9 +58,10 @@ def predict(
     num_samples: int = 0,
     shape: tuple[int, ...] = (),
 ) -> Prediction:
-    """Predict with an `mvae` model, by decoding the mean of the posterior of the latent variables.
+    """Predict with a multimodal variational autoencoder (`mvae`).
 
-    The function is pure, and is compiled once per shape and subset of the inputs.
+    The mean of the posterior of the latent variables, given the inputs, is decoded to images and a pose. The function
+    is pure. It is compiled once for each combination of the names and shapes of the inputs.
 
     Args:
         graphdef: Definition of the model.
@@ -69,13 +70,14 @@ def predict(
         blank: Tactile image of the untouched sensor in [0, 1].
         inputs: Inputs by the name of the modality: images "visual" and "tactile" in [0, 1], (*n, height, width, 3),
             and "pose", (*n, 7), position (m) and unit quaternion. Any of these may be missing.
-        present: Masks by the name of the modality, False for items that are ignored. The default is to use all items.
-            Tactile images without contact are always ignored, unless the model was trained with blank tactile images
-            as inputs.
-        condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with them.
-        key: Random key that draws the samples.
+        present: Masks (*n,) by the name of the modality, False for items of the batch that are ignored. A modality
+            without a mask is used for all items. Tactile images without contact are always ignored, unless the model
+            was trained with blank tactile images as inputs.
+        condition: The c known parameters of each trajectory in SI units, (*n, c), for models that were trained with
+            them.
+        key: Random key that draws the samples. None draws no samples.
         num_samples: Number of samples to draw from the posterior. Each sample is decoded to images and a pose.
-        shape: Leading axes of the prediction if there is no input. The prediction is then made from the prior.
+        shape: Leading axes of the prediction if `inputs` is empty. The prediction is then made from the prior.
 
     Returns:
         The prediction for each item.
@@ -126,23 +128,27 @@ def predict_samples(
     shape: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,
 ) -> Prediction:
-    """Predict with a state-space model. Images are means over samples, and the pose is the centre of 256 samples.
+    """Predict with a state-space model, from samples of the final pose and of the images.
 
-    If `num_samples` is 0, the images are means over 16 samples that are drawn with a fixed key, so that every call
-    returns the same prediction.
+    The predicted images are means over `num_samples` samples, or over 16 samples if `num_samples` is 0. The predicted
+    position is the geometric median of at least 256 sampled positions. The predicted orientation is that of the most
+    central of these samples.
 
     Args:
         graphdef: Definition of the model.
         state: Parameters of the model.
         preprocessing: Preprocessing with which the model was trained.
         empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
-        inputs: All inputs of the model by the name of the modality, also those that are ignored (see `completed`).
-        present: Masks by the name of the modality, False for items that are ignored.
-        condition: Known parameters of the trajectories in SI units, (*n, c), for models that were trained with them.
-        key: Random key that draws the samples. The default is `jax.random.key(0)`.
+        inputs: All inputs of the model by the name of the modality: images (*n, height, width, 3) and poses (*n, 7).
+            `completed` adds placeholders for inputs that are not given.
+        present: Masks (*n,) by the name of the modality, False for items of the batch that are ignored.
+        condition: The c known parameters of each trajectory in SI units, (*n, c), for models that were trained with
+            them.
+        key: Random key that draws the samples. None is `jax.random.key(0)`, so that every call gives the same result.
         num_samples: Number of samples to return in `Prediction.samples`.
         shape: Leading axes *n of the inputs and the prediction.
-        calibration: Correction of the probability density of the final pose.
+        calibration: Correction of the probability density of the final pose, from `statespace.fit_calibration`. None
+            for no correction.
 
     Returns:
         The prediction for each item.
@@ -200,14 +206,16 @@ def completed(
     present: dict[str, Any],
     lead: tuple[int, ...],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Add the missing inputs of a model with masks that are False, so that one compiled program serves every subset.
+    """Add a placeholder, with a mask that is False, for each input that is not given.
+
+    The model always receives all inputs. One compiled program is therefore enough for all combinations of given inputs.
 
     Args:
         names: Names of all inputs of the model.
         resolution: Height and width of the images (pixels).
         inputs: Inputs that are given, by name.
-        present: Masks that are given, by name. An input without a mask is used for all items.
-        lead: Leading axes of the inputs.
+        present: Masks that are given, by name. A given input without a mask is used for all items of the batch.
+        lead: Sizes of the leading axes of the inputs.
 
     Returns:
         All inputs and the mask of each, by name.
@@ -241,7 +249,7 @@ def _flat(
 
 
 def flagged(prediction: Prediction, valid: Bool[Array, "*n"]) -> Prediction:
-    """Set all numbers of a prediction's invalid items to NaN. `valid` is the mask of the valid items."""
+    """Set all numbers of the invalid items of a prediction to NaN. The mask `valid` is False for these items."""
 
     def flag(leaf: Array, axes: int) -> Array:
         return jnp.where(valid.reshape(*valid.shape, *(1,) * axes), leaf, jnp.nan)

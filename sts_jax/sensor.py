@@ -46,10 +46,11 @@ class Sensor:
     fine_below: int = dataclasses.field(default=128, metadata=NOT_NEGATIVE | STATIC)
 
     def check(self) -> None:
-        """Raise an error if a constant is out of range. The constants must not be traced by `jit`: use `guard` there.
+        """Raise an error if a constant is out of range. For constants that `jit` traces, use `guard`.
 
         Every field must have the shape of its default value, be finite, and lie in the range that its class declares.
-        Lights and lamps may have any number of rows. Further conditions concern several fields:
+        The arrays of internal lights (`lights`) and external lights (`room`) may have any number of rows, one for each
+        light. There are further conditions:
 
         - The distance from the pinhole to the gel's inner face is at least `camera.near`, so that objects that press on
           the gel are drawn.
@@ -57,8 +58,8 @@ class Sensor:
         - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
         - No light shines from outside through the opaque skin: z <= 0 in every direction of `Lights` and every position
           of `Leds`.
-        - LEDs do not lie in the gel. They may lie beside the gel, where their light enters through its edges, or behind
-          the pinhole, which casts no shadow.
+        - LEDs do not lie in the gel. They may lie beside the gel, where their light enters through its edges. They may
+          also lie behind the pinhole, because the camera casts no shadow.
 
         Raises:
             ValueError: A field is out of range. The message contains the field, its value and the allowed values.
@@ -127,7 +128,7 @@ class Sensor:
 
         Raises:
             FileNotFoundError: The file does not exist.
-            OSError: The file cannot be read, is damaged or is not JSON (`DamagedFileError`).
+            OSError: The file cannot be read or is not valid JSON. The error has the type `DamagedFileError`.
             ValueError: A field is missing, unknown, of another shape or out of range (see `check`).
         """
         values = read_json(Path(path), "write it again with Sensor.save")
@@ -163,7 +164,8 @@ def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = Ma
         return type(default)(value) if isinstance(default, int | float) else jnp.asarray(value, jnp.float32)
     if not isinstance(value, dict):
         known = ", ".join(field.name for field in dataclasses.fields(default))
-        raise ValueError(f"field {name or 'sensor'} is {value!r}, but it must be an object with the fields {known}.")
+        subject = f"field {name}" if name else "the content"
+        raise ValueError(f"{subject} is {value!r}, but it must be a JSON object with the fields {known}.")
     if name == "lights":
         default, value = _of_kind(value)
     fields = {field.name: field for field in dataclasses.fields(default)}
@@ -171,7 +173,7 @@ def _typed(default: Any, value: Any, name: str, metadata: Mapping[str, Any] = Ma
     for missing in [k for k in fields if k not in value]:
         raise ValueError(f"field {prefix}{missing} is missing. Write the file again with Sensor.save.")
     for unknown in [k for k in value if k not in fields]:
-        raise ValueError(f"field {prefix}{unknown} is unknown. The known fields are {', '.join(fields)}.")
+        raise ValueError(f"field {prefix}{unknown} is unknown: use only the fields {', '.join(fields)}.")
     typed = {k: _typed(getattr(default, k), value[k], prefix + k, field.metadata) for k, field in fields.items()}
     if "colors" in typed:
         _require(_row_conditions(name, typed))
@@ -182,7 +184,7 @@ def _of_kind(value: dict[str, Any]) -> tuple[Lights | Leds, dict[str, Any]]:
     """Default lights of the kind in a file, and the values of the file without the kind."""
     kinds = ", ".join(_LIGHTS)
     if "kind" not in value:
-        raise ValueError(f"field lights.kind is missing, but it must be one of {kinds}.")
+        raise ValueError(f"field lights.kind is missing: add it with one of the values {kinds}.")
     if value["kind"] not in list(_LIGHTS):
         raise ValueError(f"field lights.kind is {value['kind']!r}, but it must be one of {kinds}.")
     return _LIGHTS[value["kind"]](), {k: v for k, v in value.items() if k != "kind"}
@@ -264,7 +266,7 @@ def _field_conditions(
         if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
             raise ValueError(f"field {name} is {value!r}, but it must be an array.")
         if static and not all(isinstance(number, int | np.integer) for number in numbers):
-            raise ValueError(f"field {name} is {value!r}, but its numbers must be integers of Python or NumPy.")
+            raise ValueError(f"field {name} is {value!r}, but its numbers must have the type int or np.integer.")
         yield from _value_conditions(default, value, name, metadata)
         return
     if type(value) is not type(default):

@@ -126,13 +126,13 @@ def test_a_body_is_drawn_from_outside():
 @pytest.mark.parametrize(
     ("path", "thing", "error", "message"),
     [
-        ("a.npz", np.zeros((2, 2, 3)), TypeError, "Trajectory can be written to an .npz file, got ndarray"),
-        ("a.png", 3.0, TypeError, "got float"),
+        ("a.npz", np.zeros((2, 2, 3)), TypeError, "type ndarray, but only .* Trajectory can be written"),
+        ("a.png", 3.0, TypeError, "thing has the type float, but an image must be"),
         (
             "a.png",
             BODY,
             TypeError,
-            r"can be written to a \.png file, got a Body: save it as \.npz, or draw it with sts\.show",
+            r"thing is a Body, but .* to a \.png file: save it as \.npz, or draw it with sts\.show",
         ),
         ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
         ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),

@@ -316,7 +316,7 @@ def test_an_error_of_the_program_keeps_its_traceback(fault, kind):
 
 
 def test_a_second_run_in_a_work_directory_is_refused(tmp_path):
-    with _files.lock(tmp_path), pytest.raises(_files.LockedError, match="wait until it has finished"):
+    with _files.lock(tmp_path), pytest.raises(_files.LockedError, match="wait until that process has finished"):
         stages.main(freefall.SMOKE, tmp_path)
     assert not (tmp_path / "config.json").exists()
 

@@ -158,7 +158,7 @@ def broken(name, change):
         (broken("pose", lambda x: x[:, :6]), r"pose has shape \(2, 6\)"),
         (broken("pose", lambda x: x + np.eye(7, dtype=np.float32)[0] * 40), "give metres"),
         (broken("pose", lambda x: x[0]), "the leading axes differ"),
-        (measurement(0), "there is no item"),
+        (measurement(0), "contains no item"),
         ({**measurement(2), "condition": np.zeros((2, 3))}, "condition has shape"),
         ({**measurement(2), "present": {"pose": np.ones(3, bool)}}, "present"),
         ({**measurement(2), "num_samples": 3}, "key is missing"),

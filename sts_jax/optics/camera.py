@@ -32,14 +32,16 @@ class Camera:
 
 
 def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"]:
-    """Window of the largest centred part of the view with the aspect ratio of an image.
+    """Compute the largest centred window in the camera's view that has the aspect ratio of an image.
+
+    A window is the rectangle on the gel's outer face that an image shows.
 
     Args:
         camera: The camera.
         resolution: Height and width of the image (pixels).
 
     Returns:
-        Left, top, width and height on the gel's outer face (m).
+        Left, top, width and height of the window (m).
     """
     ratio = resolution[1] / resolution[0]
     height = 2 * camera.distance * jnp.tan(jnp.asarray(camera.fov) / 2)
@@ -51,19 +53,21 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
 def object_window(
     camera: Camera, points: Float[Array, "v 3"], resolution: tuple[int, int], *, smallest: float = 0.005
 ) -> Float[Array, "4"]:
-    """Window around an object with the aspect ratio of an image, as in the paper (supplement, "Training Details").
+    """Compute a window around an object, as in the paper (supplement, "Training Details").
 
-    The window is the smallest one that contains the bounding box of the projected points, clipped to the full window
-    (`full_window`). It lies in the full window. If no point is in view, it is the full window.
+    A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
+    largest one. The points are projected to this face, and their bounding box is clipped to the full window. The result
+    is the smallest window within the full window that contains this box and has the aspect ratio of the image. If the
+    box is outside the full window, the result is the full window.
 
     Args:
         camera: The camera.
         points: Points of the object in the sensor frame (m). Points nearer than `Camera.near` are ignored.
         resolution: Height and width of the image (pixels).
-        smallest: Smallest length of the window's shorter side (m).
+        smallest: Smallest allowed length of the window's shorter side (m).
 
     Returns:
-        Left, top, width and height on the gel's outer face (m).
+        Left, top, width and height of the window (m).
     """
     full = full_window(camera, resolution)
     lower, size = full[:2], full[2:]

@@ -110,29 +110,29 @@ def hidden_sky(
     """Compute the share of the sky that an object hides from points on the skin.
 
     Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
-    slices at a few heights z, from its lowest to its highest point. The slice at z has the outline of that part of the
-    underside which lies below z.
+    slices at a few heights z, from its lowest to its highest point. The slice at z extends over all places where the
+    underside is below z, and fades out where the underside is between z and 2 z.
 
-    A half-plane at the height z hides the share `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2` from a point whose horizontal
-    distance from its edge is d. The matrix K_z contains the difference of f between the two edges of cell j, seen from
-    the centre of cell i. The shares are then
+    The share that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`. Here d is
+    the horizontal distance from the point to the edge of the half-plane, negative if the half-plane is above the point.
+    A strip hides the difference of f between its two edges. The shares are computed on a grid of about 30 x 30 cells:
 
-        hidden = max_z K_z slice_z K_z^T
+        hidden = max_z Y_z slice_z X_z^T
 
-    on a grid of about 30 x 30 cells, where slice_z is the covered share of each cell. Quadratic splines interpolate
+    slice_z is the share of each cell that the slice covers. Element (i, j) of X_z is the share that a strip as wide as
+    column j of the grid hides from the centre of column i. Y_z is the matrix for rows. Quadratic splines interpolate
     between the cells.
 
     Args:
-        heights: Heights of the object's underside above the gel's face (m), on a uniform grid over the pad, `inf` where
-            there is no object.
-        size: Size of the pad along x and y (m). The pad is centred on the sensor's z axis.
+        heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns
+            over the pad, `inf` where there is no object.
+        size: Width along x and height along y of the pad (m). The pad is centred on the sensor's z axis.
         top: Height of the object's highest point (m).
-        x: x of the points, which form a grid (m).
-        y: y of the points (m).
+        x: x coordinate of each column of a grid of points on the skin (m).
+        y: y coordinate of each row of this grid (m).
 
     Returns:
-        Shares from 0 to 1, one row for each y and one column for each x. Points outside the pad have the share of the
-        nearest point inside.
+        Shares from 0 to 1 at the points of the grid. Points outside the pad have the share of the nearest point inside.
     """
     blocks = [max(1, round(cells / _SKY_CELLS)) for cells in heights.shape]
     padding = [(0, -cells % block) for cells, block in zip(heights.shape, blocks, strict=True)]
@@ -187,20 +187,22 @@ def housing(
     size: tuple[Scalar, Scalar],
     distance: Scalar,
 ) -> Float[Array, "*n"]:
-    """Brightness of the housing's walls, for rays that pass beside the pad.
+    """Compute the brightness of the sensor's housing, which the camera sees beside the pad.
 
-    A dark wall stands below each edge of the pad. At the depth t below the skin, its brightness is
-    `rim exp(-t / rim_depth)`, with the constants `rim` and `rim_depth` of the room.
+    The housing has a dark wall at each edge of the pad, perpendicular to the skin, on the side of the camera. A camera
+    ray that passes beside the pad ends at a wall. The brightness of a wall decreases with the distance t from the skin:
+    `rim exp(-t / rim_depth)`. `rim` and `rim_depth` (m) are constants of the room.
 
     Args:
         room: Constants of the external light.
         on_pad: True for rays that pass through the pad.
         places: x and y at which the rays cross the plane of the gel's outer face (m).
-        size: Size of the pad along x and y (m).
-        distance: Distance of the pinhole from this plane (m).
+        size: Width along x and height along y of the pad (m).
+        distance: Distance from the pinhole to this plane (m).
 
     Returns:
-        sRGB values relative to the pad, 1 on the pad, and `rim` or less on the walls.
+        Brightness for each ray, as an sRGB value divided by the sRGB value of the pad. It is 1 on the pad, and at most
+        `rim` on the walls.
     """
     beyond = jnp.maximum(2 * jnp.abs(places[..., 0]) / size[0], 2 * jnp.abs(places[..., 1]) / size[1])
     below = distance * (1 - 1 / jnp.maximum(beyond, 1))
@@ -214,9 +216,10 @@ def empty_view(
 
     Args:
         room: Constants of the external light.
-        square_radius: Square of the distance from the pad's centre on the gel's face, where 1 is half a side of the
-            pad.
-        walls: sRGB values relative to the pad, from `housing`. Their squares approximate linear light.
+        square_radius: Squared distance from the pad's centre on the gel's face, `(2 x / width)^2 + (2 y / height)^2`
+            for a pad of this width and height. It is 1 at the middle of each edge.
+        walls: Brightness of the housing, from `housing`: an sRGB value divided by that of the pad. The square of this
+            ratio approximates the ratio in linear light.
         hidden: Share of the sky that the object hides, from `hidden_sky`. Zeros give the view of the empty sensor.
 
     Returns:
@@ -236,21 +239,23 @@ def shade(
 ) -> Float[Array, "*n 3"]:
     """Colour of an object as seen through the skin.
 
-    The colour is computed in four steps, with constants of the room:
+    The colour is computed in four steps. `ambient`, `crease`, `crease_height`, `haze`, `tint` and `milk` are constants
+    of the room.
 
-    1. Light on the object by Lambert's law: `ambient + sum_m max(0, L_m . N) c_m`, with the normal N, and the unit
-       direction L_m and colour c_m of each light.
-    2. Contact shade: this light is reduced by the share `crease hidden exp(-height / crease_height)`.
-    3. Haze: the share `exp(-height / haze)` of the object's light, multiplied by `tint`, is transmitted. The rest is
-       replaced by the background.
-    4. Milky skin: `1 - milk` of the sum is transmitted, and `milk (1 - hidden)` of the background's light is added.
+    1. Light on the object by Lambert's law: `albedo * (ambient + sum_m max(0, L_m . N) c_m)`, with the normal N, and
+       the unit direction L_m and colour c_m of each light m.
+    2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.
+    3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
+       background, `empty`, replaces the rest.
+    4. Milky skin: the share `1 - milk` of the result is transmitted. The share `milk * (1 - hidden)` of the background
+       is added, where the background is that without the object's shadow.
 
     Args:
         room: Constants of the external light.
         albedo: Linear RGB colour of the object in [0, 1].
         normals: Unit normals of the object.
-        heights: Heights of the object's points above the gel's outer face (m).
-        empty: Background at the same pixels, from `empty_view`.
+        heights: Heights of the object's points above the gel's outer face (m). Negative heights count as 0.
+        empty: Background at the same pixels, with the object's shadow, from `empty_view`.
         hidden: Share of the sky that the object hides from the skin at the same pixels, from `hidden_sky`.
 
     Returns:

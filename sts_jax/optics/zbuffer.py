@@ -92,19 +92,21 @@ def rasterise(
 
     Args:
         points: Columns and rows of the vertices on the screen (pixels, whole numbers at pixel centres).
-        order: Order of each vertex, smaller for nearer ones and affine across a face on the screen: -1 / depth for a
-            pinhole, depth for a parallel projection.
+        order: Number for each vertex, smaller for nearer vertices. It must be a linear function of column and row on
+            each face, such as -1 / depth for a pinhole, or depth for a parallel projection.
         faces: Vertex indices of each face, counter-clockwise as seen from outside the object in a right-handed frame.
             Padding faces at the end, whose three corners are the same vertex, cost almost nothing.
-        keep: Mask of the vertices that can be drawn. A face is drawn only if all its corners can be drawn.
+        keep: Mask of the vertices that may be drawn. A face is drawn only if the mask is True for all its corners.
         two_sided: If True, faces are also visible from behind.
         shape: Height and width of the image (pixels).
-        within: An order, or None. If given, a second image contains only the faces with a corner of a smaller order.
-        chunk: Number of runs of pixels that are drawn at a time.
+        within: Limit in units of `order`, or None. If given, the result has a second image that contains only near
+            faces: those with at least one corner whose order is below the limit.
+        chunk: Number of runs that are drawn at a time. A run is a part of one row of a face, up to 8 pixels long.
 
     Returns:
-        Index of the nearest face at each pixel, -1 where no face is visible. The shape is (h, w). If `within` is given,
-        it is (2, h, w), with the image of the near faces before the image of all faces. There is no gradient.
+        Index of the nearest face at each pixel, -1 where no face is visible. The shape is (h, w), the height and width
+        of the image. If `within` is given, the shape is (2, h, w): the image of the near faces, then the image of all
+        faces. The indices have no gradient.
     """
     points, order, within = jax.lax.stop_gradient((points, order, within))
     screen = _Screen(points[:, 0], points[:, 1], order, keep, faces, two_sided)
@@ -269,7 +271,7 @@ def barycentrics(
     """Barycentric weights of a face's three corners at points on the screen.
 
     Args:
-        corners: Columns and rows of the three corners (pixels).
+        corners: Three pairs (column, row), one for each corner of the face (pixels).
         column: Columns of the points (pixels).
         row: Rows of the points (pixels).
 

@@ -11,7 +11,7 @@ from sts_jax import optics
 
 
 class Corners(NamedTuple):
-    """Vertices of an object on a screen, which is an image of the camera or the gel's grid, and its faces."""
+    """Faces of an object, with the positions of their vertices in an image of the camera or in the gel's grid."""
 
     column: Float[Array, "v"]  # columns of the vertices (pixels)
     row: Float[Array, "v"]  # rows of the vertices (pixels)
@@ -26,9 +26,13 @@ def weights(
 
     Args:
         corners: Vertices and faces of the object.
-        winner: Index of the nearest face at each pixel. Negative indices, where there is no face, give face 0.
-        column: Columns of the pixels.
-        row: Rows of the pixels.
+        winner: Index of the nearest face at each pixel. A negative index, for a pixel without a face, gives the corners
+            of face 0.
+        column: Column of each pixel.
+        row: Row of each pixel.
+
+    Returns:
+        Vertex indices of the first, second and third corner, and the weights of these corners.
     """
     of_face = corners.faces[jnp.maximum(winner, 0)]
     indices = [of_face[..., k] for k in range(3)]
@@ -38,7 +42,10 @@ def weights(
 def weighted(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """Values of the nearest face's corners, times their weights. The sum of the three is the interpolated value."""
+    """Values at the three corners of the nearest face, times the weights of the corners, at each pixel.
+
+    The sum of the three products is the interpolated value. The arguments are those of `weights`.
+    """
     indices, shares = weights(corners, winner, column, row)
     return [share * corners.value[k] for share, k in zip(shares, indices, strict=True)]
 
@@ -46,5 +53,13 @@ def weighted(
 def interpolated(
     corners: Corners, images: tuple[Int[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]
 ) -> Float[Array, "h w"]:
-    """Interpolate the value on the nearest face at each pixel, given the images `(winner, column, row)`."""
+    """Interpolate the value on the nearest face at each pixel.
+
+    Args:
+        corners: Vertices and faces of the object, with the value at each vertex.
+        images: Index of the nearest face, column and row of each pixel, as for `weights`.
+
+    Returns:
+        Value at each pixel, meaningless at pixels without a face.
+    """
     return functools.reduce(operator.add, weighted(corners, *images))

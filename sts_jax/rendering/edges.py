@@ -26,18 +26,20 @@ def with_moving_edges(
 
         d imprint = rate - v . grad imprint
 
-    v is the change of the visible surface's position in the image (pixels), and `rate` is the change of its depth below
-    the gel's face (m). At the edge between two neighbouring pixels, each pixel receives half of their difference times
-    the v of the pixel that is nearer to the camera (micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge
-    Gradients"). The derivative is accurate on average over a few pixels.
+    v is the motion of the visible surface in the image (pixels), and `rate` is the change of its depth below the gel's
+    face (m). Each pair of neighbouring pixels contributes to the second term the difference of their imprints, times
+    the v of the pixel that is nearer to the camera. Each pixel of the pair receives half of this product. The pairs are
+    the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average over a
+    few pixels.
 
     Args:
         imprint: Depth of the imprint below the gel's face (m).
         corners: Vertices of the object in the image, with the value 1 / depth (1/m).
-        images: Index of the nearest face, column and row of each pixel.
+        images: Index of the nearest face, column and row of each pixel, three images (h, w).
         depth: Depth of the object from the pinhole (m), `inf` where there is no object.
         on_pad: True for pixels whose rays pass through the pad.
-        follows: True for pixels in which the imprint is the surface of the object, and not flat or clipped skin.
+        follows: True for pixels in which the imprint follows the surface of the object. False for flat skin, and where
+            the imprint is clipped to the thickness of the gel.
 
     Returns:
         The imprint.

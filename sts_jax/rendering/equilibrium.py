@@ -88,7 +88,7 @@ def underside(
     points: Float[Array, "v 3"],
     present: Bool[Array, ""],
 ) -> tuple[Float[Array, "r c"], Float[Array, "r c"]]:
-    """Heights of an object's underside above the gel's face, on the gel's grid.
+    """Heights of an object's underside above the gel's face, on the gel's grid of r rows and c columns.
 
     Args:
         gel: Constants of the gel.
@@ -98,8 +98,8 @@ def underside(
         present: False if there is no object.
 
     Returns:
-        Two height maps (m). The first contains the faces that are low enough to press on the gel. The second contains
-        all faces, which hide the sky. Both are `inf` at cells without a face above.
+        Two height maps (m). The first contains only faces that are low enough to press on the gel. The second contains
+        all faces, because all of them hide the sky. Both maps are `inf` at cells without such a face.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))

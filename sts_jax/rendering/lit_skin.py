@@ -18,18 +18,18 @@ def lit_skin(
     pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """Compute the brightness of the skin at the samples of an imprint.
+    """Compute the brightness of the skin under its internal light, for a grid of camera rays.
 
     Args:
         sensor: Constants of the sensor.
-        imprint: Depth of the imprint below the gel's face at the samples (m).
-        window: Part of the gel's face that the samples cover: left, top, width, height (m).
-        pitch: Distance between samples along x and y (m).
-        slopes: x / depth of the rays along a row, and y / depth along a column.
+        imprint: Depth of the imprint below the gel's face (m), for the ray at each row and column of the grid.
+        window: Part of the gel's face that the grid covers: left, top, width, height (m).
+        pitch: Distance between rays along x and y on the gel's face (m).
+        slopes: x / depth of the ray at each column, and y / depth of the ray at each row.
 
     Returns:
-        Three channels, not clipped. The outermost samples of the imprint are missing, because they only serve for the
-        normals of their neighbours.
+        Red, green and blue channel, not clipped to [0, 1]. The outermost ring of the grid is missing
+        (h = a - 2, w = b - 2), because it only serves for the normals at its neighbours.
     """
     coupled = sensor.skin.coupling > 0
     imprint = jax.lax.cond(coupled, tactile.couple, lambda *given: given[0], imprint, sensor.skin.coupling, pitch)

@@ -25,7 +25,8 @@ def looped(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function for which `jax.vmap` is a loop over the items on a CPU, and a batch on other devices.
 
     Args:
-        function: Function from trees of arrays to a tree of arrays. It must not close over traced values.
+        function: Function from pytrees of arrays to a pytree of arrays. It must receive all traced values as
+            arguments, and not close over any.
 
     Returns:
         Function with the same values and derivatives.

@@ -27,23 +27,25 @@ Function = Callable[[Any, Images], Images]
 def where_active(
     function: Function, active: Bool[Array, "h w"], params: Any, images: Images, otherwise: Images, *, ring: int = 0
 ) -> Images:
-    """Evaluate `jnp.where(active, function(params, images), otherwise)` on the tiles with an active pixel.
+    """Evaluate a function of images only on those tiles (squares of 4 x 4 pixels) that have an active pixel.
 
-    Derivatives are those of this expression over the whole image.
+    The result is `jnp.where(active, function(params, images), otherwise)`. Derivatives are those of this expression
+    over the whole image.
 
     Args:
-        function: Function `(params, images) -> result`. It maps a tree of images of any size (a + 2 ring, b + 2 ring)
-            to a tree of images (a, b). A pixel of the result must depend only on pixels at most `ring` rows and
-            columns away. If the images have a third axis, over tiles, the result must have it too. The function must
-            not close over traced values. Pass these in `params`.
+        function: Function `(params, images) -> result`. It must map a pytree of images of any shape
+            (a + 2 ring, b + 2 ring) to a pytree of images (a, b). A pixel of the result must depend only on pixels at
+            most `ring` rows and columns away. If the given images have a third axis, with one entry for each tile, the
+            result must have this axis too. The function must not close over traced values. Pass these in `params`.
         active: Mask of the pixels at which the result is needed.
         params: First argument of `function`.
-        images: Tree of images of shape (h + 2 ring, w + 2 ring). Images with a single row or column are broadcast.
-        otherwise: Tree of images (h, w) with the values of the other pixels, of the structure that `function` returns.
+        images: Pytree of images (h + 2 ring, w + 2 ring). An image with a single row or column is broadcast.
+        otherwise: Pytree of images (h, w) with the result at pixels that are not active. Its structure must be the
+            structure that `function` returns.
         ring: Number of neighbouring pixels in each direction that `function` needs.
 
     Returns:
-        Tree of images (h, w).
+        Pytree of images (h, w).
     """
     if min(active.shape) < TILE:
         return _dense(function, active, params, images, otherwise)
@@ -51,7 +53,7 @@ def where_active(
 
 
 def lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
-    """First row of an image of x values and first column of an image of y values. The others are equal to these."""
+    """First row of an image of x values with equal rows, first column of an image of y values with equal columns."""
     return images[0][:1], images[1][:, :1]
 
 

@@ -98,8 +98,9 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
     """Find the depth and the two tilts of an object at which the gel balances Fz, Mx and My of the wrench.
 
-    An object with heights h over the cells at x and y sinks by d, and turns by the small angles a about x and b about
-    y. With the stiffness k of the gel, its heights h' and the pressure p are then
+    The gel is a grid of cells, and each cell is an independent spring. An object with heights h over the cells at x and
+    y sinks by d, and turns by the small angles a about x and b about y. With the stiffness k of the gel, its heights h'
+    and the pressure p are then
 
         h' = h - d + a y - b x,   p = k max(0, -h')
 
@@ -111,10 +112,10 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
         E = sum k A max(0, -h')^2 / 2 - Fz d + Mx a + My b
 
-    which is convex and piecewise quadratic. Projected Newton steps with a line search find the minimum. The first
-    iterate is the pose at which the object's lowest point is at the depth `Gel.max_depth`. Below this depth, the
-    springs meet a hard bottom. It carries the rest of the load, which does not count as pressure. Derivatives are those
-    of the equilibrium, by the implicit function theorem.
+    This energy is convex and piecewise quadratic. Projected Newton steps with a line search find the minimum. The first
+    iterate is the pose at which the object's lowest point is at the depth `Gel.max_depth`. A hard bottom at this depth
+    limits the compression of the springs. The load that the bottom carries does not count as pressure. Derivatives are
+    those of the equilibrium, by the implicit function theorem.
 
     Args:
         gel: Constants of the gel.
@@ -126,7 +127,7 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
         The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
         exists within the limits of depth and tilt, the result lies within these limits and `balanced` is False. This
         happens if the object's lowest point is more than `Gel.max_depth` above the gel, if the centre of pressure of
-        the wrench lies outside the object's footprint or the pad, or if a limit is reached.
+        the wrench lies outside the object's footprint or outside the pad, or if a limit is reached.
     """
     force = wrench[2]
     pressed = force > 0

@@ -17,8 +17,8 @@ def surface_normals(
     "Simulator Details").
 
     Args:
-        points: x, y and z of the points in the sensor frame (m), with one more row or column on each side of the result
-            (a = h + 2, b = w + 2). Axes *n are separate grids.
+        points: x, y and z of the points in the sensor frame (m). The grid of points extends beyond the result by one
+            row or column on each side (a = h + 2, b = w + 2). Axes *n are separate grids.
 
     Returns:
         Unit normals towards the camera (z <= 0).
@@ -56,12 +56,14 @@ def smallest_eigenvector(
     """Unit eigenvector of the smallest eigenvalue of symmetric 3x3 matrices A, in closed form.
 
     With `m = trace(A) / 3`, `s = sqrt(trace((A - m I)^2) / 6)` and `h = det((A - m I) / s) / 2`, the smallest
-    eigenvalue is `lambda = m + s b`, where b is the smallest root of `b^3 - 3 b = 2 h`. It is computed by a polynomial
-    in `sqrt(1 - h)` and one Newton step. With the other eigenvalues lambda_1 and lambda_2, the eigenvector v is the
-    largest column of `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`, divided by its length.
+    eigenvalue is `lambda = m + s b`, where b is the smallest root of `b^3 - 3 b = 2 h`. A polynomial in `sqrt(1 - h)`
+    approximates b, and one Newton step improves it. Let lambda_1 and lambda_2 be the other eigenvalues and v the
+    eigenvector. Then `adj(A - lambda I) = (lambda_1 - lambda) (lambda_2 - lambda) v v^T`, and v is the largest column
+    of this matrix, divided by its length.
 
-    The derivative exists if lambda differs from lambda_1 and lambda_2, which may be equal, as for points spread evenly
-    in a plane. Otherwise, the result is an arbitrary unit vector with zero gradient.
+    The derivative exists if lambda differs from both lambda_1 and lambda_2. These two may be equal, for example for
+    points that are spread evenly in a plane. If lambda equals one of them, the result is an arbitrary unit vector with
+    zero gradient.
 
     Args:
         xx: Elements (0, 0) of the matrices. Six separate arrays are faster on a CPU than one.

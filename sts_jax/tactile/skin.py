@@ -25,7 +25,7 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lights:
-    """Far lights: directional lights, for any number m of lights.
+    """Far internal lights. Each light has one direction at all points, and there may be any number m of lights.
 
     The defaults are those of the paper's code: four lights in the gel's plane, one from each edge of the image.
     """
@@ -45,10 +45,10 @@ class Lights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Leds:
-    """Near lights: points at a finite distance, for any number m of lights. The defaults are our choice.
+    """Near internal lights. Each light is a point at a finite distance, and there may be any number m of lights.
 
-    By default, four LEDs shine at a grazing angle into the pad's edges, red, green, blue and white. They are as bright
-    as the camera's range allows: no pixel of the empty pad is clipped.
+    By default (our choice), a red, a green, a blue and a white LED shine at a grazing angle into the four edges of the
+    pad. They are as bright as possible without clipped pixels in the image of the untouched pad.
     """
 
     # Positions in the sensor frame (m). Defaults: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm below
@@ -73,7 +73,7 @@ class Leds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """Shape of the skin around an imprint, and shadows that pressed parts of the skin cast on other parts."""
+    """Constants for the shape of the skin around an imprint, and for shadows that pressed parts of the skin cast."""
 
     # Standard deviation of the Gaussian that smooths the imprint (m). The default is 0, as in the paper.
     coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)
@@ -147,12 +147,12 @@ def shadows(
         share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
 
     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
-    along u. The arctangent is the elevation of the horizon: the largest elevation, above the gel's plane, under which
-    other skin appears from x. The light covers the elevations from e to e + penumbra.
+    along u. Elevations are angles above the gel's plane (rad), seen from x. The arctangent is the largest elevation of
+    other skin. e is the elevation of the light's lower edge, and e + penumbra that of its upper edge.
 
     A light in the gel's plane, as in the paper, has e = 0. Flat skin and the tops of pressed parts receive no light
-    from it, because it is perpendicular to their normals. Its shadows are visible only on slopes behind other pressed
-    parts. They end where these parts appear lower than `penumbra`.
+    from it, because its direction is perpendicular to their normals. Its shadows are visible only on slopes behind
+    other pressed parts. A shadow is partial where the elevation of these parts is below `penumbra`.
 
     Args:
         skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the skin at the distance
@@ -261,5 +261,13 @@ def _unit(*parts: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], ...]:
 
 
 def darken(phong: Phong, depth: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """Brightness of the skin relative to flat skin, `exp(-depth / phong.darkening)`, at a depth of the imprint (m)."""
+    """Brightness of the skin relative to flat skin: `exp(-depth / phong.darkening)`.
+
+    Args:
+        phong: Constants of the skin's reflectance.
+        depth: Depth of the imprint (m).
+
+    Returns:
+        Factor of the brightness, 1 at depth 0.
+    """
     return jnp.exp(-depth / phong.darkening)
