@@ -195,8 +195,8 @@ def swap(one, other):
     ("endings", "message"),
     [
         ((".array_record",), r"00000-of-00002\.array_record is damaged or belongs to another shard"),
-        ((".npz",), r"00000-of-00002\.npz is shard 1 instead of shard 0"),
-        ((".array_record", ".npz"), r"00000-of-00002\.npz is shard 1 instead of shard 0"),
+        ((".npz",), r"00000-of-00002\.npz contains the data of shard 1 instead of shard 0"),
+        ((".array_record", ".npz"), r"00000-of-00002\.npz contains the data of shard 1 instead of shard 0"),
     ],
 )
 def test_swapped_shards_are_refused(copied, endings, message):
@@ -252,7 +252,7 @@ def test_an_invalid_split_is_refused(copied, change, message):
     [
         ("sensor.json", None, r"sensor\.json is missing"),
         ("sensor.json", b'{"gel"', r"sensor\.json cannot be read as JSON"),
-        ("sensor.json", b"{}", r"npz was made with another sensor\.json"),
+        ("sensor.json", b"{}", r"npz was made with a sensor\.json that differs"),
         ("split.json", b"\xff", r"split\.json cannot be read as JSON .*delete .*split\.json and start the collection"),
         ("split.json", b"7", r"split\.json must have the parts train, validation, test, got a int"),
         ("collection.json", None, r"collection\.json is missing: .* is not a collected dataset"),
@@ -279,7 +279,7 @@ def test_a_description_that_was_changed_afterwards_is_named(copied):
     path.write_text(json.dumps(content, indent=7))  # the layout does not matter
     assert dataset.load(copied).collection == content
     path.write_text(json.dumps({**content, "resolution": [32, 64]}))
-    with pytest.raises(dataset.DamagedFileError, match=r"was made with another collection\.json"):
+    with pytest.raises(dataset.DamagedFileError, match=r"was made with a collection\.json that differs"):
         dataset.load(copied)
 
 

@@ -135,14 +135,16 @@ def test_both_files_of_another_shard_are_refused(tmp_path):
     one, other = shard(tmp_path, 0), shard(tmp_path, 1)
     for ending in (".array_record", ".npz"):
         one.with_suffix(ending).write_bytes(other.with_suffix(ending).read_bytes())
-    with pytest.raises(dataset.DamagedFileError, match=r"0\.npz is shard 1 instead of shard 0: delete 0\.npz and"):
+    with pytest.raises(
+        dataset.DamagedFileError, match=r"0\.npz contains the data of shard 1 instead of shard 0: delete 0\.npz and"
+    ):
         records.read_shard(one, records.Identity(COLLECTION, SENSOR, 0))
 
 
 @pytest.mark.parametrize("changed", ["collection", "sensor"])
 def test_a_shard_of_another_collection_or_sensor_is_refused(tmp_path, changed):
     wanted = records.Identity(COLLECTION, SENSOR, 0)._replace(**{changed: "f" * 64})
-    with pytest.raises(dataset.DamagedFileError, match=rf"0\.npz was made with another {changed}\.json"):
+    with pytest.raises(dataset.DamagedFileError, match=rf"0\.npz was made with a {changed}\.json that differs"):
         records.read_shard(shard(tmp_path, 0), wanted)
 
 
@@ -174,7 +176,7 @@ def test_a_missing_array_is_named(tmp_path):
     arrays = records.read_arrays(path.with_suffix(".npz"))
     del arrays["trajectory/pose"]
     records.write_arrays(path.with_suffix(".npz"), arrays)
-    with pytest.raises(dataset.DamagedFileError, match=r"0\.npz lacks trajectory/pose: delete"):
+    with pytest.raises(dataset.DamagedFileError, match=r"0\.npz lacks the arrays trajectory/pose: delete"):
         records.read_shard(path, records.Identity(COLLECTION, SENSOR, 0))
 
 

@@ -35,7 +35,11 @@ class Collected(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Progress of `collect` in one of its two stages, which alternate from shard to shard."""
+    """Progress of `collect`, which alternates between two stages: simulation and rendering.
+
+    A shard is a pair of files with the data of some of the objects. `collect` first simulates the objects of a shard,
+    then renders their images, and then continues with the next shard.
+    """
 
     done: int  # finished trajectories of the dataset, or finished images of the current shard
     total: int  # all trajectories of the dataset, or all images of the current shard
@@ -51,24 +55,26 @@ def collect(
 ) -> Collected:
     """Simulate and render a dataset, and write it to a folder.
 
-    The function makes only the shards that the folder lacks. The same call therefore resumes an interrupted collection.
+    The dataset is written as shards. A shard is a pair of files with the data of some of the objects. The function
+    makes only the shards that the folder lacks, so a repeated call resumes an interrupted collection.
 
     Args:
         collection: The description of the dataset.
         sensor: The sensor for the simulation and the images.
         folder: The folder of the dataset, created if it is missing. It receives the shards, `collection.json`,
             `sensor.json` (for `Sensor.load`) and `split.json`.
-        progress: Function that is called when some trajectories or frames are finished.
+        progress: Function that is called with a `Progress` when some trajectories or images are finished.
 
     Returns:
-        Summary of the whole dataset, including shards of earlier calls. A trajectory is discarded and drawn again if it
-        becomes non-finite or the object sinks too deep into the pad. An object is left out if it cannot be made or
-        cannot be simulated.
+        Summary of the whole dataset, including the shards that earlier calls made. A trajectory is discarded and drawn
+        again if it becomes non-finite or the object sinks too deep into the pad. An object is left out if it cannot be
+        made or cannot be simulated.
 
     Raises:
-        ValueError: A constant of the sensor or a field of the collection is out of range, the pad lacks the symmetries
-            of the scenario, or no object of a shard can be simulated. The error is also raised if the folder contains a
-            dataset of another collection, sensor or format. The message names the constant, the field or the file.
+        ValueError: A constant of the sensor or a field of the collection is out of range, the pad is not square as
+            `symmetries=True` requires, or no object of a shard can be simulated. The error is also raised if the folder
+            contains a dataset of another collection, sensor or format. The message names the constant, the field or the
+            file.
         ImportError: `collection.parts` or a mesh file needs a package that is not installed.
         LockedError: Another process collects into the folder.
         DamagedFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.

@@ -18,8 +18,8 @@ PARTS = ("train", "validation", "test")  # the parts into which the objects are 
 class Collection:
     """Description of a dataset. A collection and a `Sensor` determine every byte of the dataset.
 
-    Scenarios and procedural classes from outside the library are an exception. The description contains their names,
-    but not their code.
+    This holds for the scenarios and object classes of the library. The description contains only the names of your own
+    scenarios and classes, so their code also determines the dataset.
     """
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
@@ -54,18 +54,19 @@ class Collection:
 
     @property
     def num_shards(self) -> int:
-        """Number of shards. A shard is written as a whole or not at all."""
+        """Number of shards. A shard is a pair of files with the data of up to `objects_per_shard` objects."""
         return math.ceil(self.num_objects / self.objects_per_shard)
 
     def check(self, sensor: Sensor) -> None:
         """Raise an error if a field is invalid, or if the sensor does not suit the collection.
 
         Args:
-            sensor: The sensor, whose pad must have the symmetries of the scenario.
+            sensor: The sensor. Its pad must be square if frames are also rendered after a quarter turn (with
+                `symmetries=True`, for a scenario that allows quarter turns).
 
         Raises:
-            ValueError: A field is out of range, a category is unknown, or the pad lacks the symmetries. The message
-                names the field.
+            ValueError: A field is out of range, a name in `categories` is unknown, or the pad is not square but must
+                be. The message names the field.
         """
         sides = [float(side) for side in sensor.gel.size]
         quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
@@ -75,7 +76,9 @@ class Collection:
                 "symmetries=False"
             )
         if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
-            raise ValueError(f"shares is {self.shares}, but the shares of the objects must be >= 0 and have sum 1")
+            raise ValueError(
+                f"shares is {self.shares}, but the shares of training, validation and test must be >= 0 and have sum 1"
+            )
         if self.meshes is not None and self.num_objects != len(self.meshes.names):
             count = len(self.meshes.names)
             raise ValueError(f"num_objects={self.num_objects}, but meshes has {count} objects: set num_objects={count}")
@@ -109,7 +112,8 @@ def class_names(collection: Collection) -> tuple[str, ...]:
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
     """Make some objects of a collection.
 
-    Each procedural object has its own random key. Object i therefore does not depend on the other indices.
+    An object without a mesh file is generated at random, from its own random key. Object i therefore does not depend on
+    the other indices.
 
     Args:
         collection: The description of the dataset.
@@ -149,10 +153,11 @@ def head(collection: Collection, count: int) -> Collection:
 def split_objects(collection: Collection) -> dict[str, np.ndarray]:
     """Split the objects of a collection into parts for training, validation and test.
 
-    The split is random and depends on `collection.seed`. Each part has nearly the same proportions of the classes.
+    The sizes of the parts follow from `collection.shares`. The split is random and depends on `collection.seed`. Each
+    part has nearly the same proportions of the classes.
 
     Returns:
-        Sorted indices of the objects for each of `train`, `validation` and `test`.
+        Sorted indices of the objects, int `(n,)`, for each of `train`, `validation` and `test`.
     """
     rng = np.random.default_rng([collection.seed, 1])
     # Each block has one object of every class that is not used up, so the parts have equal proportions of the classes.
@@ -165,11 +170,15 @@ def split_objects(collection: Collection) -> dict[str, np.ndarray]:
 
 
 def symmetries_of(collection: Collection) -> tuple[int, ...]:
-    """The symmetries of the pad in which the first and last frames of each trajectory are rendered.
+    """Return the symmetries under which the first and last frames of each trajectory are rendered.
+
+    A symmetry rotates or mirrors the object on the pad without changing the scenario. With
+    `collection.symmetries=True`, a frame is rendered once for each symmetry of the scenario. Otherwise, it is rendered
+    once, without a transformation.
 
     Returns:
-        Numbers from 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then turns by s % 4 quarter turns
-        about z. 0 is the identity.
+        Numbers of the symmetries, from 0 to 7. Symmetry s first mirrors the object (y becomes -y) if s >= 4. It then
+        rotates the object by s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
     """
     return collection.scenario.symmetries if collection.symmetries else (0,)
 

@@ -14,9 +14,10 @@ from sts_jax.dataset.symmetry import turn, turn_condition
 
 
 class Pairs(NamedTuple):
-    """First and last frames of some trajectories, in memory. The index along axis 1 is 0 for first and 1 for last.
+    """First and last frames of n trajectories, in memory.
 
-    `n` is the number of trajectories, multiplied by the number of symmetries if `Dataset.pairs` adds copies.
+    In arrays of shape `(n, 2, ...)`, index 0 of the second axis is the first frame and index 1 is the last frame.
+    `Dataset.pairs` can add turned and mirrored copies of the trajectories. The number n includes these copies.
     """
 
     visual: np.ndarray  # uint8 (n, 2, height, width, 3): images of the visual stream
@@ -47,7 +48,7 @@ class Ends(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Visual images of some objects in initial poses that are not simulated, in memory."""
+    """m views, in memory. A view is a visual image of an object in a random initial pose, without a trajectory."""
 
     visual: np.ndarray  # uint8 (m, height, width, 3): images of the visual stream
     pose: np.ndarray  # float32 (m, 7): mesh frame in the sensor frame, position (m) and quaternion
@@ -87,11 +88,11 @@ def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.nda
     """Reduce square images to a lower resolution, by means over square blocks of pixels.
 
     Args:
-        images: Images by name, uint8 `(*n, side, side, channels)`.
+        images: Arrays of images by name, uint8 `(*n, side, side, channels)`, with any number of leading axes n.
         size: New side of the images (pixels). It must divide the present side.
 
     Returns:
-        The smaller images by name, uint8 `(*n, size, size, channels)`.
+        The arrays of smaller images by name, uint8 `(*n, size, size, channels)`.
     """
     return {name: _means(image, size) for name, image in images.items()}
 
@@ -127,7 +128,7 @@ class Dataset:
         """Read the images of some stored frames.
 
         Args:
-            rows: Indices of rows of `frames`, int `(n,)`.
+            rows: Indices of the stored frames, int `(n,)`. Index i is the frame that `self.frames[i]` describes.
 
         Returns:
             The images of the n frames, in the given order.
@@ -168,7 +169,12 @@ class Dataset:
         return np.flatnonzero(counts == self.trajectory["pose"].shape[1])
 
     def strip(self, trajectory: int) -> records.Images:
-        """Read the images of one trajectory of `full_trajectories`, given its index, in the order of time."""
+        """Read the images of all frames of one trajectory, in the order of time.
+
+        Args:
+            trajectory: Index of the trajectory, one of `full_trajectories()`. For another trajectory, the result has
+                only the frames that the dataset contains.
+        """
         rows = np.flatnonzero((self.frames[:, 0] == trajectory) & (self.frames[:, 2] == 0))
         return self.images(rows[np.argsort(self.frames[rows, 1])])
 
@@ -177,8 +183,8 @@ class Dataset:
 
         Args:
             part: Name of the part: `train`, `validation` or `test`.
-            rendered: True to return only the trajectories that have images, which `pairs` needs. False to return all
-                trajectories, of which `ends` returns the poses.
+            rendered: True to return only the trajectories that have images, as `pairs` requires. False to return all
+                trajectories. `ends` accepts all of them.
 
         Raises:
             ValueError: `part` is another name.
@@ -213,13 +219,15 @@ class Dataset:
         )
 
     def views(self, part: str) -> Views:
-        """Read the visual images of the objects of one part in initial poses that are not simulated.
+        """Read the views of the objects of one part of the split.
+
+        A view is a visual image of an object in a random initial pose, without a trajectory.
 
         Args:
             part: Name of the part: `train`, `validation` or `test`.
 
         Returns:
-            The images and poses, with m = 0 if the collection has `num_views=0`.
+            The images and poses of the views. The arrays are empty if the collection has `num_views=0`.
 
         Raises:
             ValueError: `part` is another name.
@@ -246,7 +254,7 @@ class Dataset:
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
                 f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
-                "a list of whole numbers (np.flatnonzero turns a mask into indices)."
+                "a list of whole numbers: convert a Boolean mask to indices with np.flatnonzero(mask)."
             )
         outside = trajectories[(trajectories < 0) | (trajectories >= count)]
         if outside.size:
@@ -258,8 +266,8 @@ class Dataset:
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
-            symmetries: True to add the turned and mirrored copies that the collection rendered. Each trajectory is
-                directly followed by its copies.
+            symmetries: True to add the turned and mirrored copies of the frames. The dataset contains copies if its
+                collection has `symmetries=True`. Each trajectory is directly followed by its copies.
 
         Raises:
             ValueError: An index is not a whole number or is out of range, or its trajectory has no images.

@@ -50,7 +50,8 @@ def survey_meshes(
         classes: The classes to use, a subset of `mesh_classes(folder)`. Empty means all.
         scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
         up: The files' axis that becomes +z. Default: the axis in ShapeNetSem's table, y for glTF, z for other files.
-        parts: True to split an object into convex parts if its hull fits badly. This needs the package coacd.
+        parts: True to split an object into convex parts if its convex hull reaches more than 2 mm beyond its surface.
+            This needs the package coacd.
         cache: Folder that keeps the processed objects, so that later calls read them faster. None keeps nothing.
         progress: Function that is called with a line of text after each object.
 
@@ -60,8 +61,8 @@ def survey_meshes(
     Raises:
         FileNotFoundError: The folder does not exist.
         ImportError: `parts` or a mesh file needs a package that is not installed.
-        ValueError: The folder has no mesh, no usable mesh, or no mesh of one of the classes, or `scale` or `up` is out
-            of range.
+        ValueError: The folder has no mesh file that the scenario can use, the folder lacks one of the classes, or
+            `scale` or `up` is out of range.
     """
     library = objects.library(folder, cache=cache, scale=scale, up=up, parts=parts)
     unknown = sorted(set(classes) - set(library.classes))
@@ -130,6 +131,14 @@ def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
 
 @functools.lru_cache
 def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str, int]]:
-    """The `objects.library` of the folder of some meshes, and the index of each of its items by name."""
+    """Open the folder of some mesh files as an `objects.Library`, a list of objects.
+
+    Args:
+        meshes: The mesh files.
+        parts: True to split badly fitting objects into convex parts, as in `survey_meshes`.
+
+    Returns:
+        The library, and the index in `library.items` of each object by its name.
+    """
     library = objects.library(meshes.folder, cache=meshes.cache, scale=meshes.scale, up=meshes.up, parts=parts)
     return library, {item.name: index for index, item in enumerate(library.items)}

@@ -84,8 +84,10 @@ def write_shard(
 
     Args:
         path: The `.array_record` file.
-        frames: Batches of images: `Images` of the frames, then tuples `(visual,)` of the views.
-        arrays: All other data, one array for each name in ARRAYS.
+        frames: Batches of images in the order in which they are stored. First come the batches of frames, each an
+            `Images`. Then come the batches of views, each a tuple with one array of n visual images, uint8
+            `(n, height, width, 3)`. A view is a visual image of an object in an initial pose, without a trajectory.
+        arrays: All other data, one array for each name in the constant ARRAYS.
         identity: The identity of the shard, which `read_shard` checks.
 
     Raises:
@@ -116,15 +118,17 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
-        raise DamagedFileError(f"{small} lacks {', '.join(lacking)}: {again}.")
+        raise DamagedFileError(f"{small} lacks the arrays {', '.join(lacking)}: {again}.")
     there = {name.partition("/")[2]: arrays.pop(name).item() for name in names}
     if there["shard"] != identity.shard:
-        raise DamagedFileError(f"{small} is shard {there['shard']} instead of shard {identity.shard}: {again}.")
+        raise DamagedFileError(
+            f"{small} contains the data of shard {there['shard']} instead of shard {identity.shard}: {again}."
+        )
     for name in ("collection", "sensor"):
         if there[name] != getattr(identity, name):
             raise DamagedFileError(
-                f"{small} was made with another {name}.json than the one beside it: put the right {name}.json back, "
-                f"or {again}."
+                f"{small} was made with a {name}.json that differs from {path.parent / name}.json: restore the "
+                f"original {name}.json, or {again}."
             )
     if not path.is_file():
         raise _missing(path)
@@ -151,7 +155,16 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
-    """Write batches of images to an array_record file, one record per frame, as a whole or not at all."""
+    """Write images to an array_record file, one record per frame. The file is written as a whole or not at all.
+
+    Args:
+        path: The file.
+        frames: Batches of images. A batch of n frames is a tuple of arrays `(n, ...)`, one array per kind of image.
+            `Images` is such a tuple.
+
+    Raises:
+        OSError: The file cannot be written. The message names it.
+    """
 
     def write(temporary: Path) -> None:
         writer = _or_os_error(ArrayRecordWriter, str(temporary), WRITER_OPTIONS)
@@ -193,16 +206,16 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
     Args:
         path: The `.array_record` file.
-        indices: Indices of the records, int `(n,)`.
+        indices: Indices of the frames in the file, int `(n,)`.
         resolution: Height and width of every image (pixels).
-        total: Number of records that the file must have, according to the shard's arrays.
+        total: Number of records (frames and views) that the file must contain.
 
     Returns:
         The images of the n frames, in the given order.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        DamagedFileError: The file is truncated or has another number of records.
+        DamagedFileError: The file is truncated or does not contain `total` records.
     """
     height, width = resolution
     size = height * width * 3
@@ -217,7 +230,21 @@ def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int],
 
 
 def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> np.ndarray:
-    """Read the images of some views, uint8 `(n, height, width, 3)`. Arguments and errors are those of `read_images`."""
+    """Read some views of a shard. A view is a visual image of an object in an initial pose, without a trajectory.
+
+    Args:
+        path: The `.array_record` file.
+        indices: Indices of the records of the views in the file, int `(n,)`. Views are stored after the frames.
+        resolution: Height and width of every image (pixels).
+        total: Number of records (frames and views) that the file must contain.
+
+    Returns:
+        The n images in the given order, uint8 `(n, height, width, 3)`.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        DamagedFileError: The file is truncated or does not contain `total` records.
+    """
     return _read_records(path, indices, total).reshape(-1, *resolution, 3)
 
 

@@ -41,19 +41,26 @@ def render(
     views: dict[str, np.ndarray],
     report: Callable[[int], None],
 ) -> Iterator[tuple[np.ndarray, ...]]:
-    """Render the images of a shard in batches, with one thread per CPU core because one call uses only one core.
+    """Render the images of a shard in batches, on all CPU cores.
+
+    A shard contains frames of simulated trajectories, followed by views. A view is a visual image of an object in an
+    initial pose, without a trajectory.
 
     Args:
         collection: The description of the dataset.
         sensor: The sensor.
         bodies: The objects of the shard.
         trajectory: The trajectories of these objects as NumPy arrays. `trajectory.body` is an index into `bodies`.
-        frames: Rows (trajectory, frame, symmetry), int `(m, 3)`, sorted by object, with mirrored copies last.
-        views: The arrays `pose` and `body` of the views, sorted by object. `body` is an index into `bodies`.
-        report: Function that is called with the number of finished images.
+        frames: The m frames to render, int `(m, 3)`. A row contains the index of the trajectory, the index of the frame
+            in the trajectory and the number of the symmetry (see `symmetries_of`). The rows are sorted by object. The
+            mirrored frames of an object (symmetries 4 to 7) follow its other frames.
+        views: The arrays of the v views, sorted by object: `pose`, `(v, 7)`, and `body`, int `(v,)`, an index into
+            `bodies`.
+        report: Function that is called after each batch with the number of images that are finished so far.
 
     Yields:
-        Batches of images, which are first `Images` of the frames, then tuples `(visual,)` of the views.
+        Batches of images in the order in which they are stored. A batch of frames has the visual images, the tactile
+        images and the segmentations. A batch of views is a tuple with only the visual images.
     """
     size = CPU_RENDER_BATCH if jax.default_backend() == "cpu" else RENDER_BATCH
     turned = {
@@ -99,18 +106,19 @@ def render_uint8(
     resolution: tuple[int, int],
     crop: bool,
 ) -> tuple[UInt8[Array, "n h w 3"], UInt8[Array, "n h w 3"], Array]:
-    """Render frames of one object in the types of the stored images.
+    """Render n frames of one object, as 8-bit images.
 
     Args:
         sensor: The sensor.
         body: The object.
         pose: Poses of the mesh frame in the sensor frame, position (m) and quaternion.
         wrench: Wrenches of the pad on the object: force (N) and moment about the sensor's origin (N m).
-        resolution: Height and width of the images (pixels).
-        crop: True to show the square around the object instead of the whole pad.
+        resolution: Height h and width w of the images (pixels).
+        crop: True to show only a window around the object. False to show the whole pad.
 
     Returns:
-        The images of the visual and of the tactile stream, and the segmentation, bool `(n, h, w)`.
+        The visual images, the tactile images, and the segmentation, bool `(n, h, w)`, which is true in pixels that show
+        the object.
     """
 
     def one(item: tuple[Array, Array]) -> tuple[Array, Array, Array]:
@@ -130,8 +138,8 @@ def empty_frame(sensor: Sensor, collection: Collection) -> records.Images:
         collection: The description of the dataset.
 
     Returns:
-        Images without the leading axis, which are visual and tactile `(height, width, 3)`, segmentation `(height,
-        width)`.
+        The visual and the tactile image, uint8 `(height, width, 3)`, and the segmentation, bool `(height, width)`. The
+        segmentation is false everywhere.
     """
     body = make_bodies(collection, np.array([0]))[0]
     gone = jnp.array([[0.0, 0, -1, 1, 0, 0, 0]])

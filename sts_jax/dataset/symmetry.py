@@ -12,13 +12,14 @@ from sts_jax import geometry
 
 
 def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
-    """Transform a pose by a symmetry of the pad.
+    """Rotate or mirror poses by a symmetry of the pad.
 
-    A mirrored pose is the pose of the mirrored body, see `objects.mirror`.
+    Symmetries 4 to 7 mirror the object. The result is then the pose of the mirrored body, `objects.mirror(body)`.
 
     Args:
         pose: Pose of the mesh frame in the sensor frame, position (m) and quaternion.
-        symmetry: Number of the symmetry, 0 to 7.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
+            s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
     """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
@@ -29,11 +30,12 @@ def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
 
 
 def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n 6"]:
-    """Transform a wrench by a symmetry of the pad.
+    """Rotate or mirror wrenches by a symmetry of the pad.
 
     Args:
         wrench: Force (N) and moment about the sensor's origin (N m).
-        symmetry: Number of the symmetry, 0 to 7.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
+            s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
     """
     if symmetry >= 4:
         wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
@@ -43,11 +45,15 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
 
 
 def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int = 1) -> Float[Array, "*n c"]:
-    """Transform the condition of a scenario by a symmetry of the pad.
+    """Rotate or mirror conditions by a symmetry of the pad.
+
+    A condition is the input that a scenario applies to a trajectory, such as an acceleration of the pad.
 
     Args:
-        condition: Vectors (x, y) in the plane of the pad, followed by scalars, which do not change.
-        symmetry: Number of the symmetry, 0 to 7.
+        condition: The c numbers of each condition. Vectors (x, y) in the plane of the pad come first. They are followed
+            by scalars, which do not change.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
+            s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
         vectors: Number of vectors at the beginning of the condition.
     """
     if condition.shape[-1] == 0:

@@ -25,7 +25,7 @@ PENALTY = 10.0  # weight of the classifier's L2 regularisation, for features of 
 
 
 class Streams(NamedTuple):
-    """n images of both streams, and their groups."""
+    """n images of the visual stream and n of the tactile stream, with the number of their trajectory."""
 
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
@@ -33,7 +33,7 @@ class Streams(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % bootstrap interval over groups."""
+    """A value with its 95 % bootstrap interval. The bootstrap draws whole trajectories with replacement."""
 
     value: float
     low: float  # lower limit of the interval
@@ -41,31 +41,34 @@ class Estimate(NamedTuple):
 
 
 class PixelErrors(NamedTuple):
-    """Differences between matched images, in grey levels of 8-bit images (0 to 255)."""
+    """Differences between real and simulated images that show the same object in the same pose."""
 
-    mae: Estimate  # mean absolute error
-    rmse: Estimate  # root of the mean squared error
+    mae: Estimate  # mean absolute error, in grey levels of 8-bit images (0 to 255)
+    rmse: Estimate  # root of the mean squared error, in grey levels of 8-bit images (0 to 255)
     psnr: Estimate  # dB, 20 log10(255 / rmse), infinite for equal images
     ssim: Estimate  # structural similarity (Wang et al. 2004) as OpenCV computes it, 1 for equal images
 
 
 class Distance(NamedTuple):
-    """A distance between two distributions."""
+    """The distance between the distributions of real and of simulated images, with its statistical significance."""
 
     value: float
     p: float  # p-value of the hypothesis that both distributions are equal
 
 
 def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> PixelErrors:
-    """Compute the differences between matched images, with bootstrap intervals over groups.
+    """Compute the differences between real and simulated images that show the same object in the same pose.
+
+    The bootstrap of the intervals draws whole trajectories with replacement.
 
     Args:
         real: Real images, uint8 `(n, height, width, 3)`.
         simulated: Simulated images of the same shape. Image i shows the same object in the same pose as `real[i]`.
-        group: Number of the trajectory of each image, int `(n,)`.
+        group: Number of the trajectory that contains image i, int `(n,)`.
 
     Raises:
-        ValueError: The images are not uint8, there is none, their shapes differ, or `group` has another length.
+        ValueError: The images are not uint8, n is 0, the shapes of `real` and `simulated` differ, or the length of
+            `group` is not n.
     """
     _check(real, simulated, group, group)
     if real.shape != simulated.shape:
@@ -92,13 +95,14 @@ def features(images: np.ndarray) -> np.ndarray:
     change the gradients.
 
     Args:
-        images: Images, uint8 `(n, height, width, 3)`, at least `LEAST_SIDE` pixels high and wide.
+        images: Images, uint8 `(n, height, width, 3)`, at least 64 pixels high and wide.
 
     Returns:
-        Features in [0, 1], `(n, 240)`, which are 48 colours, then 64 gradients of each scale from fine to coarse.
+        Features in [0, 1], `(n, 240)`. The first 48 are the colours (16 cells, 3 channels). They are followed by the
+        gradients (16 cells, 4 directions) of the finest scale, of the middle one and of the coarsest one.
 
     Raises:
-        ValueError: The images are not uint8 or too small.
+        ValueError: The images are not uint8 or are smaller than 64 pixels.
     """
     if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
         raise ValueError(f"images must be uint8 of shape (n, height, width, 3), got {images.dtype} of {images.shape}")
@@ -115,15 +119,18 @@ def energy_distance(
 ) -> Distance:
     """Compute the normalised energy distance `1 - (E|X - X'| + E|Y - Y'|) / (2 E|X - Y|)` of two sets of features.
 
-    X and X' are two real images, and Y and Y' are two simulated ones. The distance is 0 for equal distributions and 1
-    for sets that are far apart. Each feature is divided by its standard deviation over both sets, or by one grey level
-    if that is larger.
+    X and X' are the features of two real images, and Y and Y' are those of two simulated images. E is the mean over
+    pairs of images, and `|.|` is the Euclidean norm. The distance is 0 for equal distributions and 1 for sets that are
+    far apart. Each feature is first divided by its standard deviation over both sets. If this deviation is below one
+    grey level (1/255), the feature is divided by one grey level instead.
 
-    The three means are taken over pairs of images of different groups only. The number of images and the matching of
-    the sides therefore cause no bias. For equal distributions, the estimate varies around 0 and may be negative.
+    The three means are only over pairs of images from different trajectories. Therefore, the number of images and
+    common trajectories of both sets cause no bias. For equal distributions, the estimate varies around 0 and may be
+    negative.
 
-    The p-value comes from a permutation test. A permutation swaps the two sides of each matched group at random. If the
-    sides are not matched, it assigns the groups to the sides at random.
+    The p-value comes from a permutation test. If both sets have the same trajectories, a permutation exchanges the real
+    and the simulated images of randomly selected trajectories. If they have no common trajectory, a permutation
+    distributes the trajectories to the two sets at random.
 
     Args:
         real: Features of the real images, from `features`, `(n, k)`.
@@ -133,8 +140,9 @@ def energy_distance(
         seed: Seed of the permutations.
 
     Raises:
-        ValueError: Only some groups occur on both sides, a value is not finite, a shape is wrong, or a side has fewer
-            than 2 groups.
+        ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 2 trajectories. The error
+            is also raised if the sets have some but not all trajectories in common, or all of them but different
+            numbers of images.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
     """
@@ -168,12 +176,13 @@ def told_apart(
 ) -> Estimate:
     """Compute the cross-validated accuracy of a classifier that distinguishes real from simulated images.
 
-    The classifier is a logistic regression on standardised features. There are five cross-validations of five folds,
-    whose accuracies are averaged. All images of a group are in the same fold, on both sides if they are matched, so the
-    classifier is never tested on a group that it was fitted to.
+    The classifier is a logistic regression on standardised features. The accuracy is averaged over five
+    cross-validations of five folds. All real and simulated images of a trajectory are in the same fold. The classifier
+    is therefore never tested on a trajectory to which it was fitted.
 
-    The accuracy is the mean over both sides, so 0.5 is chance. Its bootstrap interval is over the groups that were
-    tested. It does not include the variation of the groups that the classifier was fitted to.
+    The accuracy is the mean of the accuracies for real and for simulated images, so 0.5 is chance. The bootstrap of the
+    interval draws the tested trajectories with replacement. The interval does not include the variation that comes from
+    the choice of the trajectories to which the classifier is fitted.
 
     Args:
         real: Features of the real images, from `features`, `(n, k)`.
@@ -182,8 +191,9 @@ def told_apart(
         simulated_group: Number of the trajectory of each simulated image, int `(m,)`.
 
     Raises:
-        ValueError: Only some groups occur on both sides, a value is not finite, a shape is wrong, or a side has fewer
-            than 5 groups.
+        ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 5 trajectories. The error
+            is also raised if the sets have some but not all trajectories in common, or all of them but different
+            numbers of images.
         ImportError: scikit-learn is not installed.
     """
     try:
@@ -263,7 +273,8 @@ def _matched(
     for name, values, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
         if values.ndim != 2 or group.shape != values.shape[:1]:
             raise ValueError(
-                f"{name} must have the shape (n, k) and {name}_group (n,), got {values.shape} and {group.shape}"
+                f"{name} must have the shape (images, features) and {name}_group the shape (images,), "
+                f"got {values.shape} and {group.shape}"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite, got {values[~np.isfinite(values)][0]}")
@@ -274,8 +285,10 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            f"{len(common)} trajectories occur on both sides, but the sides do not match: keep only the common "
-            "trajectories, with equally many images on both sides, or give the sides different group numbers"
+            f"real_group and simulated_group have {len(common)} trajectories in common. They must have either no "
+            "common trajectory, or the same trajectories and equally many images, "
+            f"got {len(real)} and {len(simulated)} images: "
+            "keep only the common trajectories, or give the simulated images other trajectory numbers"
         )
     return True
 

@@ -38,7 +38,8 @@ def image_baselines(train: Streams, test: Streams) -> dict[str, Predicted]:
         test: The held-out trajectories.
 
     Returns:
-        The predictions for `test` by name.
+        The predictions for `test` by name. The names are "constant (mean training target)", "copy of the input" and
+        "nearest neighbour".
     """
     inputs, queries = (own.visual[:, 0].reshape(len(own.visual), -1).astype(np.float32) for own in (train, test))
     nearest = ((inputs**2).sum(1) - 2 * queries @ inputs.T).argmin(1)
@@ -58,24 +59,27 @@ def image_summary(
 ) -> dict[str, dict]:
     """Compute cross-entropy and skill of predicted images, with 95 % bootstrap intervals over trajectories.
 
-    Skill is 1 minus the ratio of the excess to that of a reference prediction. The excess is the cross-entropy minus
-    the entropy of the true image.
+    The excess of a prediction is its cross-entropy minus the entropy of the true image, so a perfect prediction has
+    excess 0. The skill is 1 minus the excess of the prediction divided by the excess of a reference prediction.
 
     Args:
-        predictions: Predictions of the last images by name, including those of `image_baselines`. A stream that a
-            predictor does not predict is None.
+        predictions: Predictions of the last images by the name of the predictor, including those of `image_baselines`.
+            A stream that a predictor does not predict is None.
         test: The held-out trajectories.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.
 
     Returns:
-        A dictionary for each stream. `floor` is the entropy of the true images, which is the smallest possible
-        cross-entropy (nats per pixel and channel). `predictors` contains three metrics for each name: `bce`, the
-        cross-entropy, `skill`, relative to the mean training image, and `skill_copy`, relative to the copy of the
-        input. Each metric is a dictionary of `value`, `low` and `high`.
+        A dictionary for each of the streams `visual` and `tactile`, with the following entries.
+
+        - `floor`: The entropy of the true images, which is the smallest possible cross-entropy (nats per pixel and
+            channel).
+        - `predictors`: The metrics of each predictor by its name. `bce` is the cross-entropy (nats per pixel and
+            channel). `skill` is the skill relative to the mean training image. `skill_copy` is the skill relative to
+            the first image. Each metric is a dictionary of `value` and of the limits `low` and `high` of its interval.
 
     Raises:
-        ValueError: A baseline is missing, or a prediction has another shape than the true images.
+        ValueError: A baseline is missing, or the shape of a prediction differs from that of the true images.
     """
     missing = [name for name in (CONSTANT, COPY) if name not in predictions]
     if missing:

@@ -23,7 +23,10 @@ _CLOSE = 1e-6  # m, least distance in the weights of the geometric median, which
 
 
 class ImageError(NamedTuple):
-    """Cross-entropy and excess of n predicted images, summed over the selected pixels of each image."""
+    """Errors of n predicted images, each summed over the selected pixels of the image.
+
+    The excess is the cross-entropy minus the entropy of the true image. It is 0 for a perfect prediction.
+    """
 
     bce: np.ndarray  # (n,): binary cross-entropy, summed over pixels and channels (nats)
     excess: np.ndarray  # (n,): `bce` minus the entropy of the target (nats)
@@ -52,15 +55,18 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
 
 
 def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = None) -> float:
-    """Compute the skill, `1 - excess / excess of the constant prediction`, with both sums over all items.
+    """Compute the skill of predicted images: 1 minus their excess divided by the excess of a reference prediction.
+
+    The excess of a predicted image is its cross-entropy minus the entropy of the true image. It is 0 for a perfect
+    prediction. Both excesses are sums over all items (held-out trajectories).
 
     Args:
         error: Errors of the predictor for n items.
-        constant: Errors of the constant prediction for the same items.
+        constant: Errors of the reference prediction for the same items. It is usually the mean training image.
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
-        The skill, or NaN if the excess of the constant prediction is 0.
+        The skill, or NaN if the excess of the reference prediction is 0.
     """
     w = np.ones(len(error.excess)) if weight is None else weight
     reference = float((w * constant.excess).sum())
@@ -128,13 +134,16 @@ def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def best_of(errors: Sequence[ImageError]) -> ImageError:
-    """Select the sample with the smallest excess of each item.
+    """Select the best of several predicted images for each item. It is the image with the smallest excess.
+
+    The excess of a predicted image is its cross-entropy minus the entropy of the true image. It is 0 for a perfect
+    prediction.
 
     Args:
-        errors: The errors of the first sample of all items, of the second sample of all items, and so on.
+        errors: A sequence of k errors. Element j has the errors of sample j for all n items.
 
     Returns:
-        The errors of the best samples.
+        The errors of the best sample of each item.
     """
     excess = np.stack([error.excess for error in errors])
     best, item = excess.argmin(0), np.arange(excess.shape[1])
@@ -180,19 +189,21 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
 def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> np.ndarray:
     """Determine whether true positions lie in the central region of their samples.
 
-    The mean of the results over all items is the coverage. It equals `level` for a calibrated predictor, for every k
-    and every distribution.
+    The mean of the results over all items is the coverage. For a calibrated predictor, its expected value is `level`,
+    for every number of samples and every distribution.
 
-    The true position and its k samples are sorted by their mean distance from each other, the most central point first.
-    If the predictor is calibrated, the true position has the distribution of the samples, so each rank r from 1 to
-    k + 1 has the same probability. The result is `level (k + 1) - (r - 1)`, limited to [0, 1]. It is 1 for inner ranks,
-    0 for outer ranks, and a fraction for the rank at the border of the region. Points of equal mean distance share the
-    mean of their results.
+    The result of an item depends on the rank of its true position. The true position and its k samples are k + 1
+    points. They are sorted by their mean distance from the other points, and the most central point has rank 1. If the
+    predictor is calibrated, the true position has the distribution of the samples. Each rank r from 1 to k + 1 then has
+    the same probability.
+
+    The result is `level (k + 1) - (r - 1)`, limited to [0, 1]. It is 1 for inner ranks, 0 for outer ranks, and a
+    fraction for the rank at the border of the region. Points with equal mean distances get the mean of their results.
 
     Args:
         samples: k samples of the positions, `(k, n, d)`, k >= 1.
         target: True positions, `(n, d)`.
-        level: Probability of the central region.
+        level: Probability of the central region (default: 0.9).
 
     Returns:
         Numbers from 0 (outside) to 1 (inside), `(n,)`.
@@ -239,9 +250,9 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
 
     Args:
         probability: Probabilities of c outcomes for n items, `(n, c)`.
-        label: Columns of the true outcomes, int `(n,)`.
-        floor: Smallest probability that is used. Smaller ones are raised to it, so that no single item dominates the
-            mean.
+        label: Index of the column of `probability` that belongs to the true outcome of each item, int `(n,)`.
+        floor: Smallest probability that is used (default: 0.001). Smaller probabilities are raised to it, so that no
+            single item dominates the mean.
 
     Returns:
         Log losses (nats), `(n,)`.
@@ -250,7 +261,10 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
 
 
 class Reliability(NamedTuple):
-    """The probabilities of likeliest outcomes and their frequencies, in bins of the probability."""
+    """Comparison of predicted probabilities and observed frequencies, for items in bins of the probability.
+
+    The probability of an item is that of its likeliest outcome.
+    """
 
     confidence: np.ndarray  # (bins,): mean probability of the likeliest outcome, NaN in empty bins
     accuracy: np.ndarray  # (bins,): share of items whose likeliest outcome is the true one, NaN in empty bins
@@ -266,7 +280,10 @@ def reliability(
         confidence: Probability of the likeliest outcome of each item, `(n,)`.
         right: True if the likeliest outcome is the true one, bool `(n,)`.
         weight: Weights of the items, `(n,)` (default: 1).
-        bins: Number of bins of equal width in [0, 1].
+        bins: Number of bins of the probability, of equal width in [0, 1] (default: 10).
+
+    Returns:
+        The mean probability, the share and the number of items of each bin.
     """
     w = np.ones(len(right)) if weight is None else weight
     place = np.minimum((confidence * bins).astype(int), bins - 1)
@@ -278,16 +295,17 @@ def reliability(
 def calibration_error(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> float:
-    """Compute the expected calibration error: the mean over items of |accuracy - confidence| of their bins.
+    """Compute the expected calibration error of the predicted outcomes.
 
-    The accuracy of a bin is the share of its items whose likeliest outcome is the true one. Its confidence is the mean
-    probability of the likeliest outcome.
+    The items are divided into bins by the probability of their likeliest outcome. The accuracy of a bin is the share of
+    its items whose likeliest outcome is the true one. The confidence of a bin is the mean probability of the likeliest
+    outcome of its items. The error is the mean of |accuracy - confidence| over the bins, weighted by their items.
 
     Args:
         confidence: Probability of the likeliest outcome of each item, `(n,)`.
         right: True if the likeliest outcome is the true one, bool `(n,)`.
         weight: Weights of the items, `(n,)` (default: 1).
-        bins: Number of bins of equal width in [0, 1].
+        bins: Number of bins of equal width in [0, 1] (default: 10).
 
     Returns:
         The error, or NaN if the sum of the weights is 0.

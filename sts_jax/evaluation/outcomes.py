@@ -13,10 +13,14 @@ OUTCOMES: tuple[enum.IntEnum, ...] = tuple(physics.Outcome)
 
 
 def named(outcome: int, outcomes: Sequence[enum.IntEnum] = OUTCOMES) -> str:
-    """Return the name of the outcome with a number, such as `fell_off`, given the outcomes of the scenario.
+    """Return the name of an outcome, such as `fell_off`.
+
+    Args:
+        outcome: Number of the outcome.
+        outcomes: The outcomes of the scenario, `scenario.outcomes` (default: all members of `physics.Outcome`).
 
     Raises:
-        KeyError: The scenario has no such outcome.
+        KeyError: None of `outcomes` has this number.
     """
     return {int(one): one.name.lower() for one in outcomes}[outcome]
 
@@ -72,14 +76,14 @@ def outcome_of_image(
 ) -> np.ndarray:
     """Determine from the last visual images whether the objects fell off.
 
-    The outcome is `FELL_OFF` if the image is almost that of the sensor without an object. The outcomes of objects that
-    stay on the pad depend on their poses, and this function does not distinguish them.
+    The outcome is `FELL_OFF` if the image shows no object. All objects that stay on the pad get the same outcome,
+    because their actual outcome depends on the pose.
 
     Args:
         visual: Images in [0, 1], `(n, height, width, 3)`.
         blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
-        threshold: Largest result of `emptiness` for an image without an object.
-        stays: Number of the outcome of all other images.
+        threshold: Largest mean absolute difference from `blank` (see `emptiness`) at which an image shows no object.
+        stays: Number of the outcome of objects that stay on the pad (default: `physics.Outcome.RESTS`).
 
     Returns:
         Numbers of the outcomes, int `(n,)`.
@@ -89,13 +93,13 @@ def outcome_of_image(
 
 
 def emptiness(visual: np.ndarray, blank: np.ndarray) -> np.ndarray:
-    """Mean absolute difference of images from that of the sensor without an object. It is 0 for an empty image.
+    """Compute the mean absolute difference between each image and the image of the sensor without an object.
 
     Args:
         visual: Images in [0, 1], `(n, height, width, 3)`.
         blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
 
     Returns:
-        Differences, `(n,)`, in [0, 1].
+        Differences in [0, 1], `(n,)`. The difference is 0 for an image without an object.
     """
     return np.abs(visual - blank).mean((1, 2, 3))

@@ -82,7 +82,7 @@ class Forecaster(Protocol):
 
     @property
     def preprocessing(self) -> training.Preprocessing:
-        """The preprocessing of the model. Its scaling of poses is needed for the input `state`."""
+        """The preprocessing of the model. It encodes poses for the input `state` (true pose, shape and mass)."""
 
     def __call__(
         self,
@@ -103,19 +103,26 @@ class Forecaster(Protocol):
         """
 
     def prior(self, shape: tuple[int, ...] = (), *, condition: Any = None) -> Any:
-        """Predict without any input but the condition, for a batch of the given shape."""
+        """Predict the last frame without a measurement, from the prior distribution of the model.
+
+        Args:
+            shape: Leading axes of the prediction.
+            condition: The input that the scenario applies, such as an acceleration of the pad, `(*shape, c)` in SI
+                units. None for scenarios without a condition.
+        """
 
 
 def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tuple[str, ...]]:
-    """List all subsets of the inputs of a model.
+    """List all non-empty subsets of the inputs of a model, from which it can predict.
 
     Args:
-        modalities: The inputs of the model, `predictor.modalities`. Without any, the only subset is the empty one.
-        state: True if the model also accepts the true state (pose, shape and mass) together with a visual image.
-            State-space models accept it.
+        modalities: The inputs of the model, `predictor.modalities`. If the model has no inputs, the result has only the
+            empty subset.
+        state: True to add the subset of the visual image and the true state (pose, shape and mass). State-space models
+            accept the true state.
 
     Returns:
-        The subsets, by descriptions such as "from visual and pose".
+        The subsets by their descriptions, such as "from visual and pose".
     """
     usable = tuple(modalities)
     if not usable:
@@ -143,25 +150,29 @@ def predict(
     """Predict the last frames of held-out trajectories with a model, from some of its inputs.
 
     The predicted outcome follows from the predicted pose. The outcome probabilities are those of the model if it
-    predicts them. Otherwise they are the shares of the outcomes among the samples, if there are samples.
+    predicts them. Otherwise, they are the shares of the outcomes among the samples, if there are samples.
 
-    A model that predicts no pose has an outcome only if the scenario has two outcomes and `validation` and `blank` are
-    given. Its outcome is then `FELL_OFF` if the predicted visual image is empty.
+    If the model predicts no pose, the outcome comes from the predicted visual image. It is `FELL_OFF` if the image
+    shows no object, and the other outcome if it shows one. This requires a scenario with two outcomes, and the
+    arguments `validation` and `blank`. Without them, the outcome is None.
 
     Args:
         predictor: The model.
-        inputs: Some of `predictor.modalities`, and possibly `state`, the true state. An empty list predicts without any
-            input.
+        inputs: Names of the inputs, some of `predictor.modalities`. Models that accept the true pose, shape and mass
+            also have the input `state`. An empty list predicts without any measurement.
         test: The held-out trajectories, with images of the resolution that the model expects.
         scenario: The scenario of the trajectories.
-        validation: Trajectories on which the threshold for an empty image is chosen.
+        validation: Trajectories for choosing the threshold that separates images with and without an object.
         blank: Visual image of the sensor without an object, in [0, 1], `(height, width, 3)`.
         num_samples: Number of samples of each prediction, or 0 for none.
+
+    Returns:
+        The predictions for all trajectories of `test`.
     """
     names = tuple(inputs)
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
-        """Predict in calls of equal size, which limits the memory. The last call is padded with its last trajectory."""
+        """Predict some trajectories at a time, which limits the memory. The last call repeats the last trajectory."""
         count = len(pairs.object)
         size, parts = min(count, _CHUNK), []
         for number, start in enumerate(range(0, count, size)):

@@ -20,10 +20,11 @@ Errors = Callable[[Predicted, Pairs], np.ndarray | None]  # returns one number p
 
 
 class Scores(NamedTuple):
-    """Errors of one predictor for n held-out trajectories. Errors of quantities that it does not predict are None.
+    """Errors of one predictor for n held-out trajectories.
 
-    For a prediction without samples, `coverage` and `best` are None, and the energy score is the position error. For a
-    prediction without outcome probabilities, `log_loss`, `confidence`, `right` and `fell_off` are None.
+    The errors of quantities that the predictor does not predict are None. For a prediction without samples, `coverage`
+    and `best` are None, and `energy` is the position error. For a prediction without outcome probabilities, `log_loss`,
+    `confidence`, `right` and `fell_off` are None.
     """
 
     visual: ImageError | None  # error of the visual images
@@ -52,7 +53,10 @@ class Scores(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The input of `Metric.statistic`: the errors of one predictor, the errors of the constant, and the true items."""
+    """The input of `Metric.statistic`: the errors of a predictor and of a constant baseline, and the true trajectories.
+
+    The constant baseline always predicts the mean last frame of the training trajectories.
+    """
 
     scores: Scores  # errors of the predictor
     constant: Scores  # errors of the constant prediction for the same items, to which the skill is relative
@@ -106,7 +110,7 @@ class Metric:
 
     @property
     def title(self) -> str:
-        """The heading of the column, with the unit."""
+        """The heading of the metric's column in tables, with the unit, such as "position (mm)"."""
         heading = self.heading or self.name.replace("_", " ")
         return f"{heading} ({self.unit})" if self.unit else heading
 
@@ -114,7 +118,7 @@ class Metric:
         """Return the metric of one predictor as a function of the weights of the items, `(n,)`.
 
         Args:
-            judged: The errors of the predictor.
+            judged: The errors of the predictor and of the constant baseline, and the true trajectories (items).
 
         Returns:
             The function, or None if the predictor does not predict the quantity.
@@ -126,7 +130,7 @@ class Metric:
 
 
 class Column(NamedTuple):
-    """A column of the short table: one metric, or several metrics with a slash between their values."""
+    """A column of the short table. It contains one metric, or several metrics whose values are separated by slashes."""
 
     heading: str
     metrics: tuple[Metric, ...]

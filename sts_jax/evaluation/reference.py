@@ -20,10 +20,10 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     - The constant is the mean last frame of the training trajectories. Its outcome is the most frequent one, and its
       outcome probabilities are the frequencies.
     - The copy predicts that the last frame equals the first one.
-    - The nearest neighbour is the last frame of one training trajectory: the one whose first visual image has the
-      smallest squared distance. If the scenario has a condition, its squared distance is added. Images and conditions
-      have the same weight, because each distance is divided by the variance in the training set, separately for each
-      number of the condition.
+    - The nearest neighbour is the last frame of the training trajectory whose first visual image has the smallest
+      squared distance. A condition is the input that some scenarios apply, such as an acceleration of the pad. If the
+      scenario has a condition, the squared distance of the conditions is added. Both distances have the same weight,
+      because each is divided by the variance in the training set (for conditions, separately for each number).
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. Its height is the median height
       of the training objects that stay on the pad. It predicts no images.
 
@@ -33,7 +33,8 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
         test: The held-out trajectories.
 
     Returns:
-        The predictions for `test`, by the names BASELINES.
+        The predictions for `test` by name. The names are "constant (mean training target)", "copy of the input",
+        "nearest neighbour" and "rests below its start".
     """
     inputs = train.visual[:, 0].reshape(len(train.visual), -1).astype(np.float32)
     queries = test.visual[:, 0].reshape(len(test.visual), -1).astype(np.float32)

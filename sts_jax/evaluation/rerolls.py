@@ -37,18 +37,21 @@ def ceiling(
 ) -> Predicted:
     """Compute the best possible prediction from the first pose and the condition, by repeated simulation.
 
-    Each item (held-out trajectory) is simulated again `times` times. Its object is released at rest in its first pose,
-    each time with newly drawn hidden values such as fill level and friction. The true last frame is one more draw from
-    the same distribution, so the prediction is calibrated. With infinitely many re-rolls, no predictor that knows only
-    shape, pose and condition has a better expected log loss or excess.
+    Each item (held-out trajectory) is simulated again `times` times. These simulations are the re-rolls. The object is
+    released at rest in its first pose, with the same condition (an input of some scenarios, such as an acceleration of
+    the pad). Each re-roll draws new values of the properties that a camera cannot see, such as fill level and friction.
 
-    The tactile image of the first frame reveals a part of the hidden values. A model that uses this image can
-    therefore exceed the ceiling.
+    The true last frame is one more draw from the same distribution, so the prediction is calibrated. With infinitely
+    many re-rolls, no predictor that knows only shape, pose and condition has a better expected log loss of the outcome
+    or a better expected cross-entropy of the images.
+
+    The tactile image of the first frame reveals a part of the properties that a camera cannot see. A model that uses
+    this image can therefore exceed the ceiling.
 
     Args:
         collection: The collection of the items.
         sensor: The sensor that renders the last frames.
-        test: The items. The last frames get the resolution of their images.
+        test: The items. The predicted images have the resolution of their images.
         times: Number of re-rolls per item, >= 1.
         key: The random key of the re-rolls.
         progress: Function that is called with the number of finished re-rolls.
@@ -74,8 +77,9 @@ def ceiling(
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
         raise RuntimeError(
-            f"a re-roll began {off:.3g} from the first pose of its item: simulate changed its keys, and _replayed in "
-            "rerolls.py must follow"
+            f"the first pose of a re-roll differs by {off:.3g} (m, or quaternion) from that of its item, but at most "
+            f"{_SAME:g} is allowed. This is an error in sts_jax: adapt _replayed in sts_jax/evaluation/rerolls.py to "
+            "the random keys that physics.simulate uses"
         )
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])

@@ -45,16 +45,18 @@ def score(
         test: The held-out items.
         outcomes: The outcomes of the scenario, `scenario.outcomes`. They are needed if the prediction has
             `outcome_probability`.
-        frequency: Frequency of each outcome among the training trajectories, `(c,)`, from `evaluation.frequency`. None
-            keeps the outcome of the prediction, or takes the likeliest one if the prediction has none.
-        metrics: Metrics whose `errors` are computed too.
+        frequency: Frequency of each of the c outcomes among the training trajectories, `(c,)`, from
+            `evaluation.frequency`. None keeps the outcome of the prediction. If the prediction has no outcome, None
+            takes the likeliest one.
+        metrics: The metrics of the evaluation. The function calls `Metric.errors` of the metrics that have it, and
+            stores the results in `Scores.further`.
 
     Returns:
         The errors of the items that are predicted.
 
     Raises:
-        ValueError: `outcome_probability` has another number of columns than `outcomes`, or the `errors` of a metric
-            are not one number per item.
+        ValueError: `outcome_probability` does not have one row per item and one column per outcome, or `errors` of a
+            metric does not return one number per item.
     """
     leaves = (predicted.visual, predicted.tactile, predicted.pose, predicted.outcome, predicted.outcome_probability)
     count = next((len(leaf) for leaf in leaves if leaf is not None), len(test.object))
@@ -73,10 +75,10 @@ def scorer(
     Args:
         scenario: The scenario of the trajectories.
         train: The training trajectories.
-        metrics: Metrics whose `errors` are computed too.
+        metrics: The metrics of the evaluation, for the argument `metrics` of `score`.
 
     Returns:
-        A function of a prediction and of the held-out items that returns their `Scores`.
+        A function that takes a prediction and the held-out trajectories, and returns the `Scores` of the prediction.
     """
     return functools.partial(
         score,
@@ -138,8 +140,8 @@ def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> di
         found[metric.name] = np.asarray(values, np.float64)
         if found[metric.name].shape != (len(test.object),):
             raise ValueError(
-                f"metric {metric.name!r}: errors has shape {found[metric.name].shape}, but it must be one number per "
-                f"item, {(len(test.object),)}: reduce the other axes"
+                f"metric {metric.name!r}: errors returned the shape {found[metric.name].shape}, but it must return one "
+                f"number per item, shape {(len(test.object),)}: reduce the other axes, for instance by a mean"
             )
     return found or None
 
@@ -154,8 +156,9 @@ def _with_probability(
     """Add the errors of the outcome probabilities."""
     if probability.shape != (len(test.outcome), len(outcomes)):
         raise ValueError(
-            f"outcome_probability has shape {probability.shape}, expected {(len(test.outcome), len(outcomes))} (one "
-            "column for each of `outcomes`): pass outcomes=scenario.outcomes"
+            f"outcome_probability has shape {probability.shape}, but it must have shape "
+            f"{(len(test.outcome), len(outcomes))} (items, outcomes), because outcomes has {len(outcomes)} members: "
+            "pass outcomes=scenario.outcomes"
         )
     number = np.array([int(outcome) for outcome in outcomes])
     likeliest = number[probability.argmax(1)]

@@ -28,24 +28,26 @@ def summarise(
 
     Args:
         scores: Scores of the predictors by name, including those of `evaluation.baselines`. A predictor may have scores
-            of the first items only. Its metrics are then means over these items.
+            of the first items only. Its metrics are then computed from these items.
         test: The held-out trajectories (items) that were scored.
-        metrics: The metrics. `score` must have been called with those that have `errors`.
-        outcomes: The outcomes of the scenario, `scenario.outcomes`, for their names.
+        metrics: The metrics to compute. Pass the same metrics to `score`, which stores the results of their function
+            `errors` in the scores.
+        outcomes: The outcomes of the scenario, `scenario.outcomes`. The summary contains their names.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.
 
     Returns:
-        A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value`,
-        `low` and `high`, or None if the predictor does not have it.
+        A dictionary that can be written as JSON, with the following entries. Each metric is a dictionary of `value` and
+        of the limits `low` and `high` of its interval. It is None if the predictor does not have the metric.
 
         - `items`: Number of items.
         - `objects`: Number of different objects among the items.
         - `outcomes`: Number of items with each true outcome, by the name of the outcome.
         - `scored`: Number of items that were scored, by the name of the predictor.
-        - `predictors`: The metrics, by the names of predictor and metric.
-        - `differences`: The metrics of a predictor minus those of a baseline, by their names. These predictors are the
-            models, not the baselines and ceilings.
+        - `predictors`: The metrics of each predictor, by the name of the predictor and then of the metric.
+        - `differences`: The metrics of each model minus those of each baseline, by the names of the model, of the
+            baseline and of the metric. A model is a predictor other than the baselines and the predictions of
+            `evaluation.ceiling`.
 
     Raises:
         ValueError: Two metrics have the same name, or `scores` lacks a baseline.
@@ -53,7 +55,9 @@ def summarise(
     keys = [metric.name for metric in metrics]
     twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
-        raise ValueError(f"metrics has two metrics of the name {', '.join(twice)}: give each metric its own name")
+        raise ValueError(
+            f"metrics has more than one metric named {' and '.join(map(repr, twice))}: give each metric its own name"
+        )
     missing = [name for name in BASELINES if name not in scores]
     if missing:
         raise ValueError(f"scores lacks {', '.join(missing)}: add the scores of each of evaluation.baselines")
@@ -62,7 +66,14 @@ def summarise(
     statistics = {name: _statistics(scores, name, scored[name], test, metrics) for name in names}
 
     def numbers(weight: np.ndarray) -> np.ndarray:
-        """All metrics, `(predictors, metrics)`, for given weights of the items. A metric that does not exist is NaN."""
+        """Compute all metrics for some weights of the items. A metric that a predictor does not have is NaN.
+
+        Args:
+            weight: Weights of the items, `(n,)`.
+
+        Returns:
+            The metrics, `(predictors, metrics)`.
+        """
         rows = [
             [np.nan if statistic is None else statistic(weight[: scored[name]]) for statistic in statistics[name]]
             for name in names

@@ -21,7 +21,7 @@ def table(
         title: Heading above the table.
         rows: Names of the predictors, in the order of the rows (default: all).
         notes: Lines below the table.
-        columns: The columns.
+        columns: The columns of metrics, from left to right.
 
     Returns:
         The text, with an explanation of the metrics above the table.
@@ -74,7 +74,9 @@ def _check(summary: dict, metrics: Sequence[Metric]) -> None:
     known: dict = next(iter(summary["predictors"].values()), {})
     missing = [metric.name for metric in metrics if metric.name not in known]
     if missing:
-        raise ValueError(f"summary lacks the metrics {', '.join(missing)}: give them to summarise too, as `metrics`")
+        raise ValueError(
+            f"summary lacks the metrics {', '.join(missing)}: add them to the argument metrics of score and summarise"
+        )
 
 
 def _head(cells: Sequence[str]) -> list[str]:

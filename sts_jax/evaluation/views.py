@@ -29,12 +29,13 @@ def outside(
 
     Args:
         body: The object.
-        pose: Pose of the mesh frame in the sensor frame, position (m) and quaternion.
+        pose: Pose of the object's mesh frame in the sensor frame, position (m) and quaternion. The mesh frame is the
+            coordinate system of the vertices. The face of the pad is the plane z = 0 of the sensor frame.
         size: Size of the pad along x and y (m).
         up: Vector of any length that points upwards, in the sensor frame. It determines the tilt of the pad (default:
             the pad is level).
-        wall: Height of the stop wall at the pad's edge of largest y (m), 0 for none.
-        resolution: Height and width of the image (pixels).
+        wall: Height of the stop wall at the edge of the pad with the largest y (m). 0 draws no wall.
+        resolution: Height h and width w of the image (pixels).
 
     Returns:
         Image, sRGB in [0, 1].

@@ -12,12 +12,12 @@ from sts_jax.evaluation.figures import drawing
 def comparison(
     path: Path, groups: Sequence[Mapping[str, np.ndarray]], labels: Sequence[str], *, title: str, heads: Sequence[str]
 ) -> None:
-    """Draw the images of n trajectories, one trajectory per row, with the columns in groups.
+    """Draw images of n trajectories as a grid. Each trajectory is a row, and neighbouring columns form groups.
 
     Args:
         path: The PNG file to write.
-        groups: Groups of columns. A group contains the images of each column by its title, in [0, 1],
-            `(n, height, width, 3)`.
+        groups: The groups from left to right. A group is a dictionary from the title of each of its columns to the
+            images of the column, `(n, height, width, 3)`, in [0, 1].
         labels: Labels of the n rows.
         title: Title of the figure.
         heads: Titles of the groups.

@@ -26,13 +26,16 @@ class Trained(NamedTuple):
 def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = None, title: str) -> None:
     """Draw the visual skill of trained models over the number of training trajectories and over the training time.
 
+    The skill measures the error of the predicted images. It is 1 for perfect images and 0 for the mean training image
+    (see `metrics.skill`).
+
     In the left panel, a line connects models with the same name and number of gradient steps. In the right panel, a
     line connects models with the same name and number of training trajectories.
 
     Args:
         path: The PNG file to write.
         points: The trained models.
-        ceiling: Skill of the best possible prediction, drawn as a horizontal line.
+        ceiling: Skill of the best possible prediction, drawn as a horizontal line. None draws no line.
         title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(10.5, 4.8), sharey=True)
@@ -81,12 +84,17 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
     """Draw the terms of the training loss over the gradient steps, with one panel per term and one line per model.
 
-    The terms are `loss`, the KL divergences `kl` and `look`, and the errors `visual`, `tactile`, `state`, `outcome` and
-    `pose`. Terms that no log contains are omitted.
+    The figure has a panel for each of these terms that at least one log contains:
+
+    - `loss`: The total loss.
+    - `kl`: The KL divergence of the latent variables from their prior (`mvae`).
+    - `look`: The KL divergence of the appearance code from its prior (`statespace`).
+    - `visual`, `tactile`, `state`, `outcome` and `pose`: The errors or negative log likelihoods of these quantities.
 
     Args:
         path: The PNG file to write.
-        logs: The training log of each model by name: one dictionary with `step` and the terms for each logged step.
+        logs: The training logs by the name of the model. A log has one dictionary for each logged gradient step, which
+            contains the number of the step as `step`, and the terms.
     """
     keys = [
         key

@@ -31,18 +31,19 @@ def predictions(
 ) -> None:
     """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
 
-    Each stream of a trajectory is a row. A red arrow on the first image shows the velocity over the pad that a freely
-    sliding object receives (`Scenario.drift`). There is no arrow if this velocity is 0. An arrow over a quarter of the
-    image is 1 m/s.
+    Each stream (visual or tactile) of a trajectory is a row. A red arrow on the first image shows the velocity relative
+    to the pad that an object without friction would have (`Scenario.drift`). A velocity of 0 has no arrow. An arrow for
+    1 m/s is as long as a quarter of the image's width.
 
     Args:
         path: The PNG file to write.
         test: The held-out trajectories.
-        predicted: Predictions for all of them, or for the first ones. A stream that is not predicted has no rows.
-        num: Number of trajectories to draw, from the first one on.
+        predicted: Predictions for all of these trajectories, or for the first ones. A stream that is not predicted has
+            no rows.
+        num: Largest number of trajectories to draw. They are the first ones of `predicted`.
         title: Title of the figure.
-        scenario: The scenario of the trajectories, which gives the names of the outcomes and the arrows. None draws no
-            arrows and uses the names of `physics.Outcome`.
+        scenario: The scenario of the trajectories, for the names of the outcomes and the arrows. None draws no arrows
+            and uses the names of `physics.Outcome`.
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
     samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
@@ -82,11 +83,15 @@ def predictions(
 
 
 def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
-    """Draw the frequency of the likeliest outcome over its predicted probability, with the number of items below.
+    """Draw how often the likeliest outcome is the true one, over its predicted probability.
+
+    The frequencies of a calibrated predictor equal the probabilities. A second plot below shows the number of held-out
+    trajectories in each bin of the probability.
 
     Args:
         path: The PNG file to write.
-        scores: Scores by name. Each predictor with outcome probabilities has a column in the figure.
+        scores: Scores by the name of the predictor. Each predictor with outcome probabilities has a column in the
+            figure.
         title: Title of the figure.
     """
     judged = {
@@ -144,8 +149,9 @@ def ends(
         size: Size of the pad along x and y (m).
         start: First pose, `(7,)`.
         truth: True last pose, `(7,)`.
-        rerolled: Last poses of simulations with newly drawn hidden values, `(m, 7)`.
-        sampled: Samples of the last pose from a model, `(k, 7)`.
+        rerolled: Last poses of m simulations from the same first pose, each with other random values of the properties
+            that a camera cannot see (such as fill level and friction), `(m, 7)`.
+        sampled: k samples of the last pose that a model predicted, `(k, 7)`.
         title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)

@@ -45,8 +45,8 @@ def strip(
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
         wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
-        num: Number of frames whose images are drawn, from the first to the last, more densely at the beginning. There
-            are fewer if two of them coincide.
+        num: Number of frames whose images are drawn. They range from the first to the last frame and are denser at the
+            beginning. A short trajectory has fewer, because each frame is drawn only once.
         title: Title of the figure.
     """
     last = len(time) - 1
@@ -95,10 +95,11 @@ def animation(
     outcome: str = "",
     side: int = 240,
 ) -> None:
-    """Write an animation of one trajectory: a view from outside, both streams, and the wrench up to each frame.
+    """Write an animation of one trajectory: a view from outside, both streams, and the wrench of the pad on the object.
 
-    A red arrow on the visual stream shows the component of the apparent gravity along the pad. It appears on a slope
-    and while the pad accelerates. The animation takes SLOWER times as long as the motion.
+    Curves below the images show the wrench from the first to the current frame. A red arrow on the visual stream shows
+    the component of the apparent gravity along the pad. It appears on a slope and while the pad accelerates. The
+    animation runs at half the speed of the motion (the constant `SLOWER` is 2).
 
     Args:
         path: The GIF file to write.

@@ -22,17 +22,19 @@ def side_by_side(
     title: str,
     names: tuple[str, str] = ("real", "simulated"),
 ) -> None:
-    """Draw real and simulated images of both streams in rows, with their difference if they are matched.
+    """Draw real and simulated images of the visual and the tactile stream side by side.
 
-    The difference is the real minus the simulated image, averaged over the channels. Red pixels are brighter in the
+    If both images of a row show the same object in the same pose, the figure also shows their difference. The
+    difference is the real minus the simulated image, averaged over the colour channels. Red pixels are brighter in the
     real image.
 
     Args:
         path: The PNG file to write.
-        real: Real images, one of each stream per row.
-        simulated: Simulated images of the same size, one of each stream per row.
-        labels: Labels of the rows.
-        matched: True if the two images of a row show the same object in the same pose.
+        real: Real images of both streams. Image i is drawn in row i.
+        simulated: Simulated images of both streams, of the same shape as the real images.
+        labels: Labels of the rows, one for each image.
+        matched: True if both images of a row show the same object in the same pose. The figure then also shows their
+            difference.
         title: Title of the figure.
         names: Titles of the columns of real and simulated images.
     """
