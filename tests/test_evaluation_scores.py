@@ -51,6 +51,11 @@ def test_image_and_condition_count_alike_whatever_their_units(unit):
     assert nearest(train, pairs([100] * 4, corners), physics.Perturbed()) == [0, 1, 2, 3]
 
 
+def test_a_constant_condition_does_not_disturb_the_nearest_image():
+    train = pairs([10, 60, 200], np.ones((3, 3)))
+    assert nearest(train, pairs([40, 150, 0], np.ones((3, 3))), physics.Perturbed()) == [1, 2, 0]
+
+
 def test_the_rule_keeps_the_start_at_the_median_height_of_objects_that_stay():
     train, test = (pairs([0] * size, np.zeros((size, 0))) for size in (4, 2))
     train = train._replace(outcome=np.array([0, 1, 0, 0], np.int32))  # 1: fell off

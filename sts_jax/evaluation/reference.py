@@ -43,7 +43,9 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     if width:
         variance = float(((inputs - inputs.mean(0)) ** 2).sum(1).mean())
         gap = test.condition[:, None] - train.condition[None]
-        distance = distance / variance + (gap**2 / train.condition.var(0)).sum(-1) / width
+        spread = train.condition.var(0)
+        spread = np.where(spread > 0, spread, 1.0)  # a constant number of the condition does not distinguish items
+        distance = distance / variance + (gap**2 / spread).sum(-1) / width
     nearest = distance.argmin(1)
     num = len(test.visual)
 

@@ -522,7 +522,8 @@ def checked_levels(levels: Sequence[int]) -> protocol.Levels:
         ValueError: There are not four levels in 0 to 255, or all are 0.
     """
     values = tuple(int(level) for level in levels)
-    if len(values) != protocol.CHANNELS or not all(0 <= value <= 255 for value in values) or not any(values):
+    allowed = values == tuple(levels) and all(0 <= value <= 255 for value in values) and any(values)
+    if len(values) != protocol.CHANNELS or not allowed:
         raise ValueError(f"levels must be four integers from 0 to 255, at least one above 0, got {tuple(levels)}")
     first, second, third, fourth = values
     return first, second, third, fourth
