@@ -126,7 +126,7 @@ def test_a_bottle_that_is_pushed_hard_goes_farther(page):
         ({"quantities": ()}, "returns a condition of 2 numbers, but scenario.quantities declares 0"),
         (
             {"quantities": (physics.Quantity("a", "s", 1.0), physics.Quantity("b", "m", 1.0, vector=True))},
-            "scenario.quantities has a, b in this order, but vectors must come before numbers",
+            "scenario.quantities has the order a, b, but vectors must come before scalars: move the vectors",
         ),
         ({"outcomes": (physics.Outcome.FELL_OFF,)}, r"scenario\.outcome returns 10\d, but the numbers .* are \[1\]"),
     ],
@@ -140,7 +140,7 @@ def test_mistakes_in_a_scenario_are_named(page, changes, match):
 def test_outcomes_of_another_enumeration_need_numbers_of_their_own(page):
     end = enum.IntEnum("Taken", {"STOPS": 0})
     wrong = type("Wrong", (page["Rolled"],), {"outcomes": (end.STOPS, physics.Outcome.FELL_OFF)})
-    with pytest.raises(ValueError, match=r"each outcome needs a unique number.* number other outcomes from 100"):
+    with pytest.raises(ValueError, match=r"each outcome needs a unique number.* give other outcomes numbers from 100"):
         wrong().check()
 
 

@@ -24,7 +24,7 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
         bodies: Bodies to simulate.
         sensor: Sensor whose pad the bodies fall on.
         scenario: Scenario to simulate.
-        counts: Numbers that must be whole and >= 1, such as `num`, by the names of the caller's arguments.
+        counts: Further arguments, such as `num=num`, that must be whole numbers >= 1. Errors name the keyword.
 
     Raises:
         BodyError: A body has bad values. BodyError is a ValueError.
@@ -54,7 +54,7 @@ def _is_frozen(scenario: Any) -> bool:
 
 
 def check_condition(scenario: Scenario, start: Start) -> None:
-    """Raise a ValueError unless conditions have as many numbers as the quantities of their scenario."""
+    """Raise a ValueError unless `start.condition` has as many numbers as `scenario.quantities` declares."""
     width, declared = start.condition.shape[-1], len(scenario.condition_scale)
     if width != declared:
         raise ValueError(
@@ -64,7 +64,7 @@ def check_condition(scenario: Scenario, start: Start) -> None:
 
 
 def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
-    """Raise a ValueError unless each outcome of n trajectories, (n,), is one of `scenario.outcomes`."""
+    """Raise a ValueError unless each number in `outcome`, (n,), is the number of a member of `scenario.outcomes`."""
     known = [int(one) for one in scenario.outcomes]
     other = sorted(set(outcome.tolist()) - set(known))
     if other:
@@ -75,21 +75,23 @@ def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
 
 
 def check_hidden(hidden: Hidden, count: int) -> Hidden:
-    """Check given hidden values, and return them as JAX arrays.
+    """Check the hidden properties that a caller passes to `simulate`, and return them as JAX arrays.
 
     Args:
-        hidden: One value of each field per trajectory.
-        count: Number of trajectories.
+        hidden: Arrays of shape (n,), and `up` of shape (n, 3), for n trajectories.
+        count: Number n of trajectories.
 
     Raises:
-        ValueError: A field has the wrong shape, or one of its values is out of range. The message names the field.
+        ValueError: A field has the wrong shape or a value out of range. The message names the field and the allowed
+            values.
     """
     arrays = {name: np.asarray(values, np.float32) for name, values in hidden._asdict().items()}
     for name, values in arrays.items():
         expected = (count, 3) if name == "up" else (count,)
         if values.shape != expected:
             raise ValueError(
-                f"hidden.{name} has shape {values.shape}, but it must be {expected}, because bodies * num is {count}"
+                f"hidden.{name} has shape {values.shape}, but it must be {expected}, with one entry for each of the "
+                f"{count} trajectories (number of bodies times num)"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"hidden.{name} has values that are not finite, but all must be finite")

@@ -35,8 +35,8 @@ def check_bodies(bodies: Sequence[Any]) -> None:
 
     Raises:
         TypeError: An item is not a `Body`.
-        BodyError: The hulls of a body are not of a size class or not finite, or its shell mass is not > 0 and finite.
-            Also raised for an error of `Body.check`.
+        BodyError: `hulls` has a shape that the simulation does not support or a value that is not finite, `shell_mass`
+            is not > 0 and finite, or `Body.check` finds an error.
     """
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):
@@ -46,15 +46,21 @@ def check_bodies(bodies: Sequence[Any]) -> None:
             )
         known = body.hulls.ndim == 3 and body.hulls.shape[1] in objects.HULL_CLASSES
         if not known or body.hulls.shape[0] not in objects.PART_CLASSES:
+            parts, points = (" or ".join(map(str, sizes)) for sizes in (objects.PART_CLASSES, objects.HULL_CLASSES))
             raise BodyError(
                 i,
-                f"hulls has shape {body.hulls.shape}, but it must be (p, n, 3) with p in {objects.PART_CLASSES} and "
-                f"n in {objects.HULL_CLASSES}",
+                f"hulls has shape {body.hulls.shape}, but it must be (p, n, 3) with p = {parts} convex parts of "
+                f"n = {points} points: make the body with objects.make or objects.load, and pass several bodies as a "
+                "sequence",
             )
         if not np.isfinite(body.hulls).all():
-            raise BodyError(i, "hulls has a non-finite vertex, but all must be finite")
+            raise BodyError(i, "hulls has a non-finite vertex, but all must be finite: repair the mesh")
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
-            raise BodyError(i, f"shell_mass is {body.shell_mass} kg, but it must be > 0 and finite: give load a mass")
+            raise BodyError(
+                i,
+                f"shell_mass is {body.shell_mass} kg, but it must be > 0 and finite: give objects.load the argument "
+                "mass (kg)",
+            )
         try:
             body.check()
         except ValueError as error:
@@ -89,7 +95,7 @@ def _faces(body: Body) -> StableFaces:
 
 
 def hulls(bodies: Sequence[Body]) -> list[Hull]:
-    """Compute the collision hull of each body.
+    """Compute the collision hull of each body: vertices, edges and faces of its convex parts.
 
     Raises:
         BodyError: The points of a hull span no volume.
@@ -104,7 +110,14 @@ def hulls(bodies: Sequence[Body]) -> list[Hull]:
 
 
 def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
-    """Compute the geometry from which the scenario draws starts, padded to a common size for all bodies.
+    """Compute the geometry of each body, from which the scenario draws random initial poses.
+
+    Args:
+        bodies: Bodies that `check_bodies` accepts.
+        scenario: Scenario in which the bodies are to start.
+
+    Returns:
+        Arrays with a leading axis of bodies. Bodies with fewer vertices or stable faces are padded.
 
     Raises:
         BodyError: A body cannot start in the scenario.
@@ -113,7 +126,7 @@ def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
     for index, own in enumerate(faces):
         reason = _refusal(own, scenario)
         if reason is not None:
-            raise BodyError(index, f"{reason}: leave it out")
+            raise BodyError(index, f"{reason}: leave this body out")
     coms = np.stack([np.asarray(body.shell_com)[None] for body in bodies])
     if scenario.by_contents:
         hidden = jax.vmap(scenario.hidden)(jax.random.split(jax.random.key(0), CONTENTS))

@@ -33,9 +33,10 @@ SKIN = 0.001  # m, points up to this height above the deepest one can be contact
 
 
 class Hull(NamedTuple):
-    """The p convex parts of an object in the mesh frame. Repeated rows pad each array to the size of its class.
+    """The p convex parts of an object in the mesh frame, each with h vertices, e edges and f triangular faces.
 
-    The axis of coordinates is before the axis of points, because XLA vectorises along the last axis.
+    Parts with fewer vertices, edges or faces repeat the last one, so that all parts have arrays of the same size. The
+    axis of coordinates is before the axis of points, because XLA vectorises along the last axis.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m
@@ -44,7 +45,7 @@ class Hull(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Contact points in the sensor frame, in MuJoCo's convention."""
+    """k contact points in the sensor frame. The fields have the meaning of those of MuJoCo's `mjContact`."""
 
     dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact
     pos: Float[Array, "k 3"]  # m, halfway between the two surfaces
@@ -52,10 +53,12 @@ class Contacts(NamedTuple):
 
 
 def hull(parts: np.ndarray) -> Hull:
-    """Compute the vertices, edges and face planes of convex parts. Their shapes depend only on the shape of `parts`.
+    """Compute the vertices, edges and face planes of p convex parts.
+
+    The result is padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part, where n is the number of points.
 
     Args:
-        parts: Points of each part, (p, n, 3) (m). Repeated points have no effect.
+        parts: n points of each of the p parts, (p, n, 3) (m). Repeated points have no effect.
 
     Raises:
         ValueError: The points of a part span no volume.
@@ -69,7 +72,9 @@ def _part(vertices: np.ndarray) -> Hull:
     try:
         found = ConvexHull(points)
     except QhullError as error:
-        raise ValueError("the collision hull spans no volume: give at least four non-coplanar points") from error
+        raise ValueError(
+            "the collision hull spans no volume: give each convex part at least four points that are not in one plane"
+        ) from error
     sides = np.sort(found.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges = points[np.unique(sides, axis=0)]
     planes = found.equations * [1, 1, 1, -1]
@@ -101,7 +106,7 @@ class _Crossing(NamedTuple):
 
 
 def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 3 h"]) -> Float[Array, "*n 3 h"]:
-    """Compute `rotation @ points` without a matrix product, because small products are slow in XLA on a CPU."""
+    """Rotate h points, the columns of `points`. A small matrix product would be slow in XLA on a CPU."""
     x, y, z = points[..., :1, :], points[..., 1:2, :], points[..., 2:, :]
     return rotation[:, :1] * x + rotation[:, 1:2] * y + rotation[:, 2:] * z
 
@@ -231,18 +236,20 @@ def collide(
 ) -> Contacts:
     """Find the contacts of an object with a box whose top is centred at the origin.
 
-    The contacts include the deepest point and the deepest point at least APART from it. The other contacts are the
-    farthest points in fixed directions. All depths are within SKIN of the largest depth.
+    The first contact is the deepest point. The second is the deepest of the points that are more than 1 mm (`APART`)
+    away from the first one. The other contacts are the points that reach farthest in `num` - 2 evenly spaced
+    directions. Deeper points have an advantage in this choice. Distances and directions are measured in `plane`. The
+    depth of a contact is at most 1 mm (`SKIN`) smaller than the largest depth.
 
     Args:
         body: Convex parts of the object.
         pose: Mesh frame in the frame of the box's top, (7,): position (m), quaternion.
-        half: Half the size of the box along x and y, (2,) (m). Its top is at z = 0, and its depth is infinite.
+        half: Half the size of the box along x and y, (2,) (m). The box has its top at z = 0 and no bottom.
         num: Number of contacts.
-        plane: Indices of the two axes of the plane in which the contacts lie far apart.
+        plane: Indices of the two axes of the plane in which the contacts lie far apart, such as (0, 1) for x and y.
 
     Returns:
-        `num` contacts in the frame of the box's top. Unused contacts have a distance of 1 m.
+        `num` contacts in the frame of the box's top. If there are fewer, the others have a distance of 1 m.
     """
     rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

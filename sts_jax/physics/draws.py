@@ -20,7 +20,7 @@ _FURTHER = 2**32 - 1  # `starts` folds it into the key. `simulate` folds in the 
 
 
 class Starts(NamedTuple):
-    """n starts of one or more bodies, ordered body by body."""
+    """Random initial poses and hidden properties of one or more bodies, n in total, ordered body by body."""
 
     pose: Float[Array, "n 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
     hidden: Hidden  # Hidden properties of each start: arrays of shape (n,), and `up` of shape (n, 3).
@@ -37,13 +37,16 @@ def draw(
     scenario: Scenario,
     pad: tuple[float, float],
 ) -> tuple[Start, Hidden]:
-    """Draw n starts and their hidden properties. Each draw depends only on the key, its body, number and attempt.
+    """Draw the starts and the hidden properties of n trajectories.
+
+    A draw depends on `key`, on its entries of `body`, `nth` and `attempt`, and on the geometry of its body. It does not
+    depend on the other draws.
 
     Args:
-        key: Key of the whole set.
-        body: Index of the body of each draw.
-        nth: Number of each draw among the draws of its body, from 0.
-        attempt: Number of earlier draws that this draw replaces.
+        key: Key of all draws.
+        body: Index of the body of each draw, (n,).
+        nth: Number of each draw among the draws of the same body, (n,), from 0.
+        attempt: Number of times that the trajectory was drawn before and failed, (n,), from 0.
         shapes: Geometry of all bodies, with a leading axis of bodies.
         scenario: Scenario that draws the starts.
         pad: Size of the pad along x and y (m).
@@ -63,11 +66,11 @@ def draw(
 def starts(
     key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
 ) -> Starts:
-    """Draw `num` random starts of each body and their hidden properties, without a simulation.
+    """Draw `num` random starts of each body without a simulation: initial poses and hidden properties.
 
-    The starts have the same distribution as the starts of `simulate`. They are independent of them, even if both
-    functions receive the same key. Start j of body i depends on `key`, i, j and the body, not on the number of other
-    starts.
+    `simulate` draws its starts from the same distribution. The starts of the two functions are independent, even if
+    both functions receive the same key. Start j of body i depends on `key`, i, j and the body, not on the number of
+    other starts.
 
     Args:
         key: Key of the whole set, from `jax.random.key`.

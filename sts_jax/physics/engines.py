@@ -27,7 +27,7 @@ Engine = Literal["mjx", "mujoco"]
 
 
 class Setup(NamedTuple):
-    """Properties of n trajectories that do not depend on the random draws."""
+    """Properties of n trajectories that are not random: their bodies, the scenario, the pad and the time steps."""
 
     bodies: list[Body]
     which: Int[np.ndarray, "n"]  # index of the body of each trajectory
@@ -48,7 +48,7 @@ Run = Callable[[np.ndarray], Rolled]  # simulates the trajectories with given in
 
 
 class Worlds(NamedTuple):
-    """Arguments of one call of `roll_worlds`. All arrays have a leading axis of n trajectories."""
+    """Arguments of `roll_worlds` for n trajectories. All arrays have a leading axis of n."""
 
     fields: dict[str, Array]  # fields of MJX's model that differ between trajectories, see `scene.drawn`
     hull: Hull
@@ -61,19 +61,41 @@ class Worlds(NamedTuple):
 def gravity_at(
     condition: Float[Array | np.ndarray, "n c"], time: Float[Array, "f s"], scenario: Scenario
 ) -> Float[Array, "n f s 3"]:
-    """Compute the gravity (m/s^2, sensor frame) of each condition in the steps that begin at given times (s)."""
+    """Compute the gravity in each time step of n trajectories.
+
+    Args:
+        condition: Condition of each trajectory, (n, c), as described by `Scenario.quantities`.
+        time: Time at which each of the s steps of each of the f frames begins, (f, s) (s).
+        scenario: Scenario whose `gravity` is called.
+
+    Returns:
+        Gravity minus the acceleration of the pad, (n, f, s, 3) (m/s^2, sensor frame).
+    """
     return jax.vmap(lambda c: jax.vmap(jax.vmap(lambda t: scenario.gravity(t, c)))(time))(condition)
 
 
 @functools.partial(jax.jit, static_argnames="scenario")
 def velocity_of(condition: Float[Array | np.ndarray, "n c"], scenario: Scenario) -> Float[Array, "n 6"]:
-    """Compute the velocity on release (m/s, rad/s, sensor frame) of each condition."""
+    """Compute `scenario.velocity` for the conditions of n trajectories, (n, c).
+
+    Returns:
+        Linear and angular velocity of each object on its release, (n, 6) (m/s, rad/s, sensor frame).
+    """
     return jax.vmap(scenario.velocity)(jnp.asarray(condition))
 
 
 @jax.jit
 def roll_worlds(worlds: Worlds, model: mjx.Model, data: mjx.Data) -> Rolled:
-    """Simulate trajectories in MJX. The hulls of all bodies have the same shape."""
+    """Simulate n trajectories in MJX.
+
+    Args:
+        worlds: Starts, hulls and gravity of the trajectories. The arrays of all hulls must have the same size.
+        model: Model of the scene (`scene.template`). The values in `worlds.fields` replace some of its fields.
+        data: Data of the same scene.
+
+    Returns:
+        Results with a leading axis of n.
+    """
 
     def one(world: Worlds) -> Rolled:
         own = model.tree_replace(world.fields)
@@ -91,18 +113,20 @@ def drawn_fields(
     constants: Contact,
     wall: float,
 ) -> dict[str, np.ndarray]:
-    """Compute the fields of MJX's model that MuJoCo derives from mass properties and friction, for each draw.
+    """Compute the fields of MJX's model that depend on mass properties and friction, for each of n draws.
+
+    MuJoCo computes these fields (`scene.set_rigid`).
 
     Args:
         bodies: All bodies.
-        which: Index of the body of each draw.
-        hidden: Hidden properties of each draw.
+        which: Index of the body of each draw, (n,).
+        hidden: Hidden properties of each draw, with a leading axis of n.
         pad: Size of the pad along x and y (m).
         constants: Contact and solver constants.
         wall: Height of the stop wall (m), 0 for none.
 
     Returns:
-        The fields by name, with a leading axis of draws.
+        The fields by name, with a leading axis of n.
 
     Raises:
         BodyError: The mass properties or the friction of a draw are out of range.
@@ -127,7 +151,21 @@ def _set_rigid(model: mujoco.MjModel, data: mujoco.MjData, body: int, rigid: Rig
 
 
 def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
-    """Return the function that simulates trajectories in MJX. The hulls in one call must have the same shape."""
+    """Return a function that simulates some of n trajectories in MJX.
+
+    Args:
+        setup: Bodies, scenario, pad and time steps of all n trajectories.
+        starts: Starts of all n trajectories.
+        hidden: Hidden properties of all n trajectories.
+        chunk: Largest number of trajectories in a call of the returned function.
+
+    Returns:
+        Function of the indices of at most `chunk` trajectories that returns their results. The hulls of the bodies of
+            these trajectories must have arrays of the same size.
+
+    Raises:
+        BodyError: The mass properties or the friction of a body are out of range.
+    """
     scenario = setup.scenario
     _, model, data = scene.template(setup.pad, scenario.contact, scenario.wall)
     fields = drawn_fields(setup.bodies, setup.which, hidden, setup.pad, scenario.contact, scenario.wall)
@@ -148,7 +186,18 @@ def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
 
 
 def in_c(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
-    """Return the function that simulates trajectories in C MuJoCo. All trajectories of one call have the same body."""
+    """Return a function that simulates some of n trajectories in C MuJoCo.
+
+    Args:
+        setup: Bodies, scenario, pad and time steps of all n trajectories.
+        starts: Starts of all n trajectories.
+        hidden: Hidden properties of all n trajectories.
+        chunk: Largest number of trajectories in a call of the returned function.
+
+    Returns:
+        Function of the indices of at most `chunk` trajectories of one body that returns their results. It raises a
+            BodyError if the mass properties or the friction of the body are out of range.
+    """
     bodies, scenario = setup.bodies, setup.scenario
     rigid = rigids(bodies, setup.which, hidden)
     starts = jax.tree.map(np.asarray, starts)

@@ -18,28 +18,28 @@ from sts_jax.physics.scene import Contact
 class Freefall(Scenario):
     """An object is released in any orientation above the level pad. In frame 0 it is at rest in the air.
 
-    The frames must last at least as long as the fall to the pad plus 0.2 s, the time at rest after which an object
-    counts as settled: `(frames - 1) / rate >= sqrt(2 height / g) + 0.2 s`, with g = 9.81 m/s^2. `check` refuses shorter
-    trajectories, because no object can have come to rest by their end. By default a trajectory lasts 1.9 s, after
-    which few objects still move (`Trajectory.settled`).
+    An object counts as settled after 0.2 s at rest. A trajectory must therefore last at least 0.2 s longer than the
+    fall to the pad: `(frames - 1) / rate >= sqrt(2 height / g) + 0.2 s`, with g = 9.81 m/s^2. `check` raises an error
+    for shorter trajectories. By default a trajectory lasts 1.9 s. Few objects still move at its end.
 
-    Values are drawn uniformly from their ranges. Source: paper, "Data Collection".
+    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
+    section "Data Collection".
     """
 
     symmetries = tuple(range(8))
     outcomes = (Outcome.RESTS, Outcome.FELL_OFF)
 
-    height: float = 0.05  # Height of the object's lowest point above the pad in frame 0 (m).
-    spread: float = 0.05  # Radius of the disc about the pad's centre from which the object's origin is drawn (m).
-    rate: float = 31.25  # Frame rate (frames/s). The default has 32 steps of 1 ms per frame.
-    frames: int = 60  # Number of frames. At the default rate, 60 frames last 1.9 s.
-    fill: tuple[float, float] = (0.0, 1.0)  # Range of the share of the interior's volume that is filled.
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
-    friction: tuple[float, float] = (0.4, 0.8)  # Range of the coefficient of friction against the pad.
-    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    height: float = 0.05  # height of the object's lowest point above the pad in frame 0 (m)
+    spread: float = 0.05  # radius of the disc about the pad's centre from which the object's origin is drawn (m)
+    rate: float = 31.25  # frame rate (frames/s, the default has 32 time steps of 1 ms per frame)
+    frames: int = 60  # number of frames (60 frames last 1.9 s at the default rate)
+    fill: tuple[float, float] = (0.0, 1.0)  # range of the share of the interior's volume that is filled
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # range of the shell's mass over its nominal mass
+    friction: tuple[float, float] = (0.4, 0.8)  # range of the coefficient of friction against the pad
+    # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = 0.0
-    # Contact and solver constants. The gel brakes rolling objects, so that round objects come to rest. Shorter time
-    # steps do not change falls.
+    # contact and solver constants (the gel brakes rolling objects, so that round objects come to rest, and time steps
+    # below the default do not change falls)
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(0.001, width=0.00005, rolling=0.002))
 
     def check(self) -> None:
@@ -56,7 +56,7 @@ class Freefall(Scenario):
             )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start: a place and an orientation. `Scenario.start` describes the arguments."""
+        """Draw one start: a random place and orientation in the air. `Scenario.start` describes the arguments."""
         del pad
         turn, radius, angle = jax.random.split(key, 3)
         quat = geometry.random_quat(turn)
@@ -64,11 +64,16 @@ class Freefall(Scenario):
         return Start(pose, jnp.asarray(self.steps), jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """Return the gravity on the level pad (m/s^2, sensor frame), which is constant."""
+        """Return the gravity on the level pad (m/s^2, sensor frame). It does not depend on the arguments."""
         del time, condition
         return jnp.array([0.0, 0.0, -G])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return `RESTS` or `FELL_OFF`, given the true or predicted poses (7,) of the first and the last frame."""
+        """Return `FELL_OFF` if the object has left the pad in the last frame, else `RESTS`.
+
+        Args:
+            first: Pose in the first frame, (7,), simulated or predicted. It has no effect.
+            last: Pose in the last frame, (7,), simulated or predicted.
+        """
         del first
         return jnp.where(fell_off(last), Outcome.FELL_OFF, Outcome.RESTS).astype(jnp.int32)

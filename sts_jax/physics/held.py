@@ -14,26 +14,25 @@ HALVINGS = 50  # bisection steps for the depth
 
 
 def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], force: float) -> Float[np.ndarray, "6"]:
-    """Compute the wrench of the pad on an object that a hand presses into the gel without tilting it.
+    """Compute the wrench of the pad on an object that a hand presses into the gel.
 
-    The hand balances all moments, so the object sinks without tilting until the gel's springs carry the force. The
-    pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is the stiffness of the gel, d is the depth of
-    the object's lowest point, and h is the height of the object's underside above this point. The pressures determine
-    the centre of pressure. `sense` finds the same balance.
+    The hand balances all moments, so the object keeps its orientation. It sinks until the pressure of the gel carries
+    `force`. The pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is `gel.stiffness`, d is the
+    depth of the object's lowest point, and h is the height of the object's underside above this point. The moment
+    follows from the pressures of all cells. Given the same pose and this wrench, `sense` finds the same balance.
 
-    A sharp corner would sink deeper than the gel allows. The hand then carries more of the weight, so that the depth
-    stays below the limit. The wrench depends only on the gel, the body, the pose and the force, not on the motion after
-    the release.
+    A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The hand then carries more of the weight, so
+    the returned force is smaller than `force`. The wrench does not depend on the motion after the release.
 
     Args:
         gel: Gel of the sensor.
         body: The object.
-        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion. The height has no effect.
-        force: Normal force that the pad is to exert (N).
+        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion. The z of the position has no effect.
+        force: Normal force that the pad exerts on the object (N).
 
     Returns:
-        Force (N) and moment about the sensor's origin (N m), (6,), without friction. All are 0 for an object beside
-        the pad.
+        Force (N) and moment about the sensor's origin (N m), (6,), without friction. All six numbers are 0 for an
+            object beside the pad.
     """
     x, y = (np.asarray(part, np.float64) for part in tactile.cell_centres(gel))
     heights = np.asarray(_heights(gel, body.vertices, body.faces, body.two_sided, jnp.asarray(pose)), np.float64)

@@ -33,38 +33,41 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 
 @dataclasses.dataclass(frozen=True)
 class Inclined(Scenario):
-    """An object is laid on the tilted pad or released just above it. Downhill is +y, with a stop wall at the edge.
+    """An object is laid on the tilted pad or released just above it. Downhill is +y.
 
-    On the slope, the weight of an object reveals little, but the centre of pressure reveals where its contents lie. The
-    contents are therefore frozen after they have settled in a random direction (`tilt`). Objects that lie flat hold and
-    objects that stand high tip, with any contents. Objects are therefore laid in poses in which the contents decide.
-    See `tries`.
+    A stop wall stands at the lower edge of the pad. The contents of an object settle in a random direction (`tilt`)
+    before the start and do not move on the slope. The centre of pressure in frame 0 then reveals where the contents
+    lie. The weight alone reveals little.
 
-    Values are drawn uniformly from their ranges. Source: paper, "Data Collection".
+    Without a choice of poses, the contents would rarely matter: flat objects hold and high objects tip, wherever their
+    contents lie. A start at rest therefore has a pose in which the contents decide whether the object tips (`tries`).
+
+    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
+    section "Data Collection".
     """
 
     symmetries = (0, 6)  # x -> -x
     outcomes = (Outcome.ROLLS, Outcome.SLIDES, Outcome.STICKS, Outcome.FELL_OFF)
 
-    slope: float = math.radians(30)  # Angle of the pad to the horizontal (rad).
-    wall: float = 0.02  # Height of the stop wall at the lower edge (m), 0 for no wall.
-    resting: float = 0.9  # Share of starts at rest on a stable face. The others are above the pad in any orientation.
-    # Range of the distance from the pad to the object's lowest point, for starts that are not at rest (m).
+    slope: float = math.radians(30)  # angle of the pad to the horizontal (rad)
+    wall: float = 0.02  # height of the stop wall at the lower edge (m, 0 for no wall)
+    resting: float = 0.9  # share of starts at rest on a stable face (the others: above the pad in any orientation)
+    # range of the distance from the pad to the object's lowest point, for starts that are not at rest (m)
     gap: tuple[float, float] = (0.001, 0.01)
-    # Number of candidate poses of a start at rest: stable faces, each with a random turn. The start has the pose in
-    # which the contents matter most for whether the object tips.
+    # number of candidate poses of a start at rest, each with a random stable face and a random turn about the
+    # vertical (the start has the pose in which the contents matter most for whether the object tips)
     tries: int = 16
-    across: float = 0.04  # Largest |x| of the object's origin at the start (m).
-    # Range of y of the object's origin at the start (m). Objects that would touch the stop wall start farther uphill.
+    across: float = 0.04  # largest |x| of the object's origin at the start (m)
+    # range of y of the object's origin at the start (m, objects that would touch the stop wall start farther uphill)
     along: tuple[float, float] = (-0.05, 0.03)
-    rate: float = 31.25  # Frame rate (frames/s).
-    frames: int = 60  # Number of frames.
-    fill: tuple[float, float] = (0.2, 0.6)  # Range of the share of the interior's volume that is filled.
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
-    friction: tuple[float, float] = (0.56, 0.76)  # Range of the coefficient of friction against the pad.
-    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    rate: float = 31.25  # frame rate (frames/s)
+    frames: int = 60  # number of frames
+    fill: tuple[float, float] = (0.2, 0.6)  # range of the share of the interior's volume that is filled
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # range of the shell's mass over its nominal mass
+    friction: tuple[float, float] = (0.56, 0.76)  # range of the coefficient of friction against the pad
+    # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = math.pi
-    contact: Contact = dataclasses.field(default_factory=Contact)  # Contact and solver constants.
+    contact: Contact = dataclasses.field(default_factory=Contact)  # contact and solver constants
     by_contents: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -83,14 +86,15 @@ class Inclined(Scenario):
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
         if not 0 <= self.resting <= 1:
-            raise ValueError(f"scenario.resting is {self.resting}, but a share must be from 0 to 1")
+            raise ValueError(f"scenario.resting is {self.resting}, but the share of starts at rest must be from 0 to 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one start uphill of the stop wall. `Scenario.start` describes the arguments.
 
-        A start at rest has the best of `tries` candidate poses. For each pose, two means are computed over random
-        contents: the margin by which the object holds, and the margin by which it tips. The best pose has the largest
-        minimum of the two means.
+        A start at rest has the best of `tries` random poses. In such a pose, some contents hold the object and others
+        tip it. Each of several random contents gives a margin m: the distance by which the centre of mass, projected
+        vertically onto the pad, lies inside the area that supports the object. It is negative if the object tips. The
+        best pose has the largest value of `min(mean(max(m, 0)), mean(max(-m, 0)))`.
         """
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting
@@ -115,15 +119,19 @@ class Inclined(Scenario):
         return Start(shape.above(place, geometry.quat_canonical(quat), height), held, jnp.zeros(0))
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """Return the gravity in the frame of the tilted pad (m/s^2), which is constant."""
+        """Return the gravity in the frame of the tilted pad (m/s^2). It does not depend on the arguments."""
         del time, condition
         return G * jnp.array([0.0, math.sin(self.slope), -math.cos(self.slope)])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the outcome, given the true or predicted poses (7,) of the first and the last frame.
+        """Return the number of the outcome, given the poses (7,) of the first and the last frame.
 
-        The first of these that is true counts: `FELL_OFF`, `ROLLS` (turned by more than 45 degrees about any axis),
-        `SLIDES` (moved by 10 mm or more along the pad), `STICKS`.
+        The outcome is the first of these that applies:
+
+        - `FELL_OFF`, if the object has left the pad,
+        - `ROLLS`, if it has turned by more than 45 degrees about any axis,
+        - `SLIDES`, if it has moved by 10 mm or more along the pad,
+        - `STICKS`, in all other cases.
         """
         same = jnp.abs(geometry.normalize(first[3:]) @ geometry.normalize(last[3:]))
         moved = geometry.norm(last[:2] - first[:2]) >= MOVED

@@ -9,10 +9,15 @@ from sts_jax.physics.scene import Contact
 
 
 def check_kind(name: str, value: object, default: object) -> None:
-    """Raise a ValueError unless the value of a field is of the same kind as the field's default.
+    """Raise a ValueError unless a field of a scenario has a value of the same kind as its default.
 
-    Kinds are whole numbers, numbers, pairs of numbers and `Contact`. Fields whose default is of another kind are not
-    checked.
+    The four kinds are: a whole number, any real number, a tuple of two numbers, and a `Contact`. A field is not checked
+    if its default is of none of these kinds.
+
+    Args:
+        name: Name of the field, for the message.
+        value: Value of the field.
+        default: Default of the field.
     """
     pair = isinstance(default, tuple) and len(default) == 2 and all(map(_is_number, default))
     if isinstance(default, Contact):
@@ -32,7 +37,13 @@ def check_kind(name: str, value: object, default: object) -> None:
 
 
 def check_range(name: str, values: tuple[float, float], *, positive: bool = True) -> None:
-    """Raise a ValueError unless (low, high) is finite with low <= high and low > 0 (>= 0 if `positive` is False)."""
+    """Raise a ValueError unless a range (low, high) is finite with low <= high and low > 0.
+
+    Args:
+        name: Name of the scenario's field, for the message.
+        values: The range, (low, high).
+        positive: If False, `low` may also be 0.
+    """
     low, high = values
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and (low > 0 if positive else low >= 0)):
         raise ValueError(
@@ -42,7 +53,7 @@ def check_range(name: str, values: tuple[float, float], *, positive: bool = True
 
 
 def check_length(name: str, value: float) -> None:
-    """Raise a ValueError unless a length (m) is finite and >= 0."""
+    """Raise a ValueError unless a length (m) is finite and >= 0. `name` is the scenario's field in the message."""
     if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"scenario.{name} is {value} m, but it must be finite and >= 0")
 

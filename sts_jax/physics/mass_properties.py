@@ -17,7 +17,7 @@ rigid_of_draws = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))  # on
 
 
 class Rigid(NamedTuple):
-    """Mass properties and friction of n draws of hidden properties, in float64."""
+    """Mass properties and friction of n objects, each with its own hidden properties, in float64."""
 
     mass: Float[np.ndarray, "n"]  # Mass (kg).
     com: Float[np.ndarray, "n 3"]  # Centre of mass in the mesh frame (m).
@@ -26,15 +26,17 @@ class Rigid(NamedTuple):
 
 
 def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) -> Rigid:
-    """Compute mass, centre of mass, inertia and friction of bodies for n draws of their hidden properties.
+    """Compute mass, centre of mass, inertia and friction of bodies with given hidden properties.
+
+    `objects.rigid` has the equations.
 
     Args:
         bodies: All bodies.
-        which: Index of the body of each draw, (n,), in ascending order.
-        hidden: Hidden properties of each draw, with a leading axis of n.
+        which: Index of the body to which each of n sets of hidden properties applies, (n,), in ascending order.
+        hidden: n sets of hidden properties: arrays of shape (n,), and `up` of shape (n, 3).
 
     Returns:
-        Arrays with a leading axis of n, in the order of the draws. `objects.rigid` has the equations.
+        Arrays with a leading axis of n, in the order of `which`.
     """
     values = jax.tree.map(np.asarray, hidden)
     found = []

@@ -45,7 +45,7 @@ _WALL_SENSOR = '<contact geom1="wall" subtree2="object" reduce="netforce" data="
 
 
 class Ends(NamedTuple):
-    """Final values of n trajectories. The fields have the same meaning as in `roll.State`."""
+    """Final values of n trajectories. The fields have the same meaning as the fields of `roll.State`."""
 
     gone: Bool[np.ndarray, "n"]
     slow: Int[np.ndarray, "n"]
@@ -82,9 +82,13 @@ class _Steps(NamedTuple):
 def compile_body(
     parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
 ) -> mujoco.MjModel:
-    """Compile the scene with the contact points and sensors that `roll` needs.
+    """Compile the scene for `roll`, with a contact point at each vertex of the hull and with contact sensors.
 
-    `scene.compile_scene` describes the arguments: parts of the hull, size of the pad, constants, height of the wall.
+    Args:
+        parts: n points of each of the p convex parts of the hull, (p, n, 3), in the mesh frame (m).
+        pad: Size of the pad along x and y (m).
+        contact: Contact and solver constants.
+        wall: Height of the stop wall (m), 0 for none.
     """
     sensors = _SENSORS.format(wall=_WALL_SENSOR if wall else "")
     spec = mujoco.MjSpec.from_string(scene.scene_xml(parts, pad, contact, wall).replace("</mujoco>", sensors))
@@ -188,18 +192,18 @@ def roll(
 ) -> tuple[Ends, Record]:
     """Simulate n trajectories of one body from their starts to the last frame, each independent of the others.
 
-    Each model has the gravity of the last step of its trajectory. In steps with another gravity, the difference acts as
-    a force on the object's centre of mass.
+    The gravity of a model is constant in MuJoCo. The function sets it to the gravity of the last time step. In steps
+    with another gravity, it applies the difference as a force on the object's centre of mass.
 
     Args:
-        models: One copy of the result of `compile_body` per trajectory. The gravity of the copy is overwritten.
-        points: Vertices of the hull in the mesh frame (m).
-        start: Starts of the n trajectories.
-        gravity: Gravity for each of the s steps of each of the f frames' intervals (m/s^2, sensor frame).
-        velocity: Velocity on release: linear, of the mesh frame's origin (m/s), and angular (rad/s), in the sensor
-            frame. None for objects at rest.
-        freeze: If True, a trajectory ends once the object has been slower than STILL_SPEED and STILL_TURN for
-            STILL_TIME. The object then keeps its pose and wrench, and its velocity becomes 0.
+        models: Models of the n trajectories, each a copy of the result of `compile_body`. Their gravity is overwritten.
+        points: h vertices of the hull in the mesh frame, (h, 3) (m).
+        start: Starts of the n trajectories, with a leading axis of n.
+        gravity: Gravity in each of the s time steps before each of the f frames, (n, f, s, 3) (m/s^2, sensor frame).
+        velocity: Velocity on release in the sensor frame, (n, 6): linear velocity of the mesh frame's origin (m/s) and
+            angular velocity (rad/s). None for objects at rest.
+        freeze: If True, an object is no longer simulated once it has been slower than 1 mm/s and 0.02 rad/s for 0.5 s
+            under constant gravity. It then keeps its pose and wrench, and its velocity becomes 0.
 
     Returns:
         Final values of each trajectory, and one record per trajectory and frame.

@@ -36,7 +36,7 @@ class Jerk(NamedTuple):
 
 
 def jerk(condition: Float[Array | np.ndarray, "*n 3"]) -> Jerk:
-    """Split a condition of `Perturbed` into acceleration and duration."""
+    """Split conditions of `Perturbed`, (..., 3), into acceleration (x, y) and duration."""
     return Jerk(condition[..., :2], condition[..., 2])
 
 
@@ -44,29 +44,32 @@ def jerk(condition: Float[Array | np.ndarray, "*n 3"]) -> Jerk:
 class Perturbed(Scenario):
     """An object stands upright on the pad, which accelerates sideways for a short time and then keeps its velocity.
 
-    The short acceleration is called a jerk. The condition describes it: acceleration of the pad along x and y (m/s^2)
-    and duration (s), from frame 0 on. The simulation runs in the pad's frame. While the pad accelerates, gravity
-    contains the opposite of its acceleration. The fill matters most for objects with a narrow base, so the defaults are
-    chosen for bottles.
+    The short acceleration begins at frame 0. It is called a jerk, although it is not a derivative of the acceleration.
+    The condition of a trajectory contains the acceleration of the pad along x and y (m/s^2) and its duration (s). The
+    simulation runs in the frame of the pad, so the acceleration of the pad is subtracted from gravity.
 
-    Values are drawn uniformly from their ranges. Source: paper, "Data Collection".
+    The share of the interior that is filled (`fill`) matters most for objects with a narrow base. The default ranges
+    are therefore chosen for bottles.
+
+    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
+    section "Data Collection".
     """
 
     symmetries = tuple(range(8))
     quantities = (Quantity("acceleration", "m/s²", 10.0, vector=True), Quantity("duration", "s", 0.1))
     outcomes = (Outcome.TOPPLES, Outcome.SLIDES, Outcome.STANDS, Outcome.FELL_OFF)
 
-    acceleration: tuple[float, float] = (4.0, 12.0)  # Range of the acceleration (m/s^2). Its direction is random.
-    duration: tuple[float, float] = (0.06, 0.12)  # Range of the duration of the acceleration (s).
-    spread: float = 0.02  # Radius of the disc about the pad's centre from which the object's origin is drawn (m).
-    rate: float = 31.25  # Frame rate (frames/s).
-    frames: int = 60  # Number of frames.
-    fill: tuple[float, float] = (0.0, 1.0)  # Range of the share of the interior's volume that is filled.
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
-    friction: tuple[float, float] = (0.5, 0.6)  # Range of the coefficient of friction against the pad.
-    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    acceleration: tuple[float, float] = (4.0, 12.0)  # range of the acceleration, in a random direction (m/s^2)
+    duration: tuple[float, float] = (0.06, 0.12)  # range of the duration of the acceleration (s)
+    spread: float = 0.02  # radius of the disc about the pad's centre from which the object's origin is drawn (m)
+    rate: float = 31.25  # frame rate (frames/s)
+    frames: int = 60  # number of frames
+    fill: tuple[float, float] = (0.0, 1.0)  # range of the share of the interior's volume that is filled
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # range of the shell's mass over its nominal mass
+    friction: tuple[float, float] = (0.5, 0.6)  # range of the coefficient of friction against the pad
+    # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = 0.0
-    contact: Contact = dataclasses.field(default_factory=Contact)  # Contact and solver constants.
+    contact: Contact = dataclasses.field(default_factory=Contact)  # contact and solver constants
     must_stand: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -77,7 +80,10 @@ class Perturbed(Scenario):
         check_range("duration", self.duration, positive=False)
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start with +z up, and one jerk as its condition. `Scenario.start` describes the arguments."""
+        """Draw one start. The object stands with its +z up, and the condition is a random jerk.
+
+        `Scenario.start` describes the arguments.
+        """
         del pad
         turn, radius, angle, push, heading, time = jax.random.split(key, 6)
         pose = shape.above(random_place(radius, angle, self.spread), random_yaw(turn), -STANDING)
@@ -88,9 +94,10 @@ class Perturbed(Scenario):
         return Start(pose, jnp.asarray(0), condition)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Return gravity minus the acceleration of the pad (m/s^2, sensor frame). `Scenario.gravity` has the arguments.
+        """Return gravity minus the acceleration of the pad (m/s^2, sensor frame).
 
-        In the time step in which the jerk ends, the acceleration is scaled by the share of the step before the end.
+        `Scenario.gravity` describes the arguments. If the jerk ends within the time step, the acceleration is
+        multiplied by the share of the step before the end.
         """
         acceleration, duration = jerk(condition)
         step = self.contact.timestep
@@ -98,15 +105,26 @@ class Perturbed(Scenario):
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return the velocity over the pad of an object without friction (m/s): -acceleration * duration."""
+        """Return the velocity after the jerk that an object without friction would have relative to the pad.
+
+        Args:
+            condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (3,).
+
+        Returns:
+            Velocity along x and y, (2,) (m/s), which is minus the acceleration times the duration.
+        """
         acceleration, duration = jerk(condition)
         return jnp.asarray(-acceleration * duration)
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the outcome, given the true or predicted poses (7,) of the first and the last frame.
+        """Return the number of the outcome, given the poses (7,) of the first and the last frame.
 
-        The first of these that is true counts: `FELL_OFF`, `TOPPLES` (+z leans by more than 45 degrees), `SLIDES`
-        (moved by 10 mm or more along the pad), `STANDS`.
+        The outcome is the first of these that applies:
+
+        - `FELL_OFF`, if the object has left the pad,
+        - `TOPPLES`, if its +z leans by more than 45 degrees from the vertical in the last frame,
+        - `SLIDES`, if it has moved by 10 mm or more along the pad,
+        - `STANDS`, in all other cases.
         """
         leans = geometry.quat_to_matrix(geometry.normalize(last[3:]))[2, 2] < math.cos(TURNED)
         moved = geometry.norm(last[:2] - first[:2]) >= MOVED

@@ -35,41 +35,42 @@ CLEARANCE = 0.002  # m, smallest distance between the points that touch the pad 
 class Released(Scenario):
     """A hand leans an object over an edge of one of its faces, holds it there on the pad and lets go at frame 0.
 
-    At one angle of lean, the object balances on the edge. It is held at a random angle near the balance. Short of the
-    balance, the object returns to its face. Beyond it, the object topples. The contents can lie anywhere in the object
-    and shift the angle of balance, so near the balance the contents decide the outcome.
+    At one angle of lean, the balance angle, the object would balance on the edge. The hand holds it at a random angle
+    near the balance angle. At a smaller angle the object returns to its face, and at a larger angle it topples. The
+    balance angle depends on the place of the contents, which can lie anywhere in the object. Near the balance angle,
+    the contents therefore decide the outcome.
 
-    In frame 0 the object is at rest. The pad carries a random share of the weight. The hand carries the rest of the
-    weight and all moments. The wrench in frame 0 is the balance of the gel under the held pose (`held.held_wrench`). It
-    does not depend on the motion after the release.
+    In frame 0 the object is at rest. The pad carries a random share of the weight (`carried`). The hand carries the
+    rest of the weight and balances all moments. The wrench in frame 0 follows from the held pose and this share
+    (`held.held_wrench`). It does not depend on the motion after the release.
 
-    Values are drawn uniformly from their ranges. Source: paper, "Real-World Dataset", where a small camera is released
-    by hand.
+    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
+    section "Real-World Dataset", where a small camera is released by hand.
     """
 
     symmetries = tuple(range(8))
     outcomes = (Outcome.TOPPLES, Outcome.RETURNS, Outcome.FELL_OFF)
 
-    # Range of the held angle minus the angle at which an object with average contents balances (rad). Negative values
-    # are short of the balance, from where the object returns to its face.
+    # range of the held angle minus the angle at which an object with average contents balances (rad, at a negative
+    # value such an object returns to its face)
     beyond: tuple[float, float] = (math.radians(-9), math.radians(9))
-    skew: float = math.radians(4)  # Largest angle in the pad's plane between the axis of the lean and the edge (rad).
-    carried: tuple[float, float] = (0.3, 0.9)  # Range of the share of the weight on the pad until the release.
-    # Radius of the disc about the pad's centre from which the object's place is drawn (m). The place is the midpoint of
-    # the centre of mass before and after a fall over the edge.
+    skew: float = math.radians(4)  # largest angle in the pad's plane between the axis of the lean and the edge (rad)
+    carried: tuple[float, float] = (0.3, 0.9)  # range of the share of the weight on the pad until the release
+    # radius of the disc about the pad's centre from which the object's place is drawn (m, the place is the midpoint
+    # between the centres of mass before and after a fall over the edge)
     spread: float = 0.015
-    # Number of candidate edges of random stable faces. The start has the suitable edge over which the centre of mass is
-    # lowest in balance, so that few objects tumble off the pad.
+    # number of candidate edges of random stable faces (the start has the suitable edge with the lowest centre of mass
+    # in balance, so that few objects tumble off the pad)
     tries: int = 16
-    rate: float = 31.25  # Frame rate (frames/s).
-    frames: int = 60  # Number of frames.
-    fill: tuple[float, float] = (0.2, 0.6)  # Range of the share of the interior's volume that is filled.
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
-    friction: tuple[float, float] = (0.5, 0.6)  # Range of the coefficient of friction against the pad.
-    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    rate: float = 31.25  # frame rate (frames/s)
+    frames: int = 60  # number of frames
+    fill: tuple[float, float] = (0.2, 0.6)  # range of the share of the interior's volume that is filled
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # range of the shell's mass over its nominal mass
+    friction: tuple[float, float] = (0.5, 0.6)  # range of the coefficient of friction against the pad
+    # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = math.pi
-    # Contact and solver constants. A gel brakes rolling objects. More rolling friction would let an object stand on its
-    # edge.
+    # contact and solver constants (a gel brakes rolling objects, but more rolling friction would let an object stand on
+    # its edge)
     contact: Contact = dataclasses.field(default_factory=lambda: Contact(rolling=0.0005))
     by_contents: ClassVar[bool] = True
 
@@ -89,16 +90,16 @@ class Released(Scenario):
             )
         check_range("carried", self.carried)
         if self.carried[1] > 1:
-            raise ValueError(f"scenario.carried is {self.carried}, but a share of the weight must be > 0 and <= 1")
+            raise ValueError(f"scenario.carried is {self.carried}, but both limits of the share must be > 0 and <= 1")
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one held pose and the share of the weight on the pad. `Scenario.start` describes the arguments.
 
-        `outcome` distinguishes toppling from returning by the angle that the object turns. An object therefore leans
-        from the narrower of the two faces at an edge, where it balances at 15 to 45 degrees. Some objects have no such
-        face, for example a cylinder on its side. They lean from another face.
+        Two faces meet at an edge. The object leans from the narrower one, where it balances at 15 to 45 degrees.
+        Returning then usually turns the object by less than 45 degrees, and toppling by more. `outcome` uses this
+        difference. An object without such an edge, for example a cylinder on its side, leans over another edge.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
@@ -126,17 +127,22 @@ class Released(Scenario):
         return Start(shape.above(place, quat, -STANDING), jnp.asarray(self.steps), jnp.zeros(0), carried)
 
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "0"]) -> Float[Array, "3"]:
-        """Return the gravity on the level pad (m/s^2, sensor frame), which is constant."""
+        """Return the gravity on the level pad (m/s^2, sensor frame). It does not depend on the arguments."""
         del time, condition
         return jnp.array([0.0, 0.0, -G])
 
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the outcome, given the true or predicted poses (7,) of the first and the last frame.
+        """Return the number of the outcome, given the poses (7,) of the first and the last frame.
 
-        The first of these that is true counts: `FELL_OFF`, `TOPPLES` (the object's upward direction turned by more than
-        45 degrees), `RETURNS`. At a right-angled edge, the held object leans by less than 45 degrees from the narrower
-        face and by more from the wider face. An object that turned by less than 45 degrees has therefore returned to
-        the narrower face. Turns about the vertical do not count.
+        The outcome is the first of these that applies:
+
+        - `FELL_OFF`, if the object has left the pad,
+        - `TOPPLES`, if it has turned by more than 45 degrees, without turns about the vertical,
+        - `RETURNS`, in all other cases.
+
+        `start` usually leans an object by less than 45 degrees from the narrower of two faces. If the faces meet at a
+        right angle, the object then turns by more than 45 degrees to reach the wider face. An object that has turned by
+        less has returned to the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

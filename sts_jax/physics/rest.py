@@ -31,7 +31,7 @@ class StableFaces(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """The pose of a body at rest and the wrench that carries it, as arguments of `sense`."""
+    """The pose of a body at rest on the pad and the wrench that carries it. Both are arguments of `sense`."""
 
     pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
     wrench: Float[Array, "6"]  # Force (N) and moment about the sensor's origin (N m) of the pad on the body.
@@ -86,10 +86,11 @@ def weight(
     shell_scale: ScalarLike = 1.0,
     up: tuple[float, float, float] = (0.0, 0.0, 1.0),
 ) -> Float[Array, "6"]:
-    """Compute the wrench of the level pad that carries a body's weight in a given pose.
+    """Compute the wrench with which the level pad carries the weight of a body in a given pose.
 
     With the mass m, gravity g and the centre of mass c in the sensor frame, the force is (0, 0, m g). Its moment about
-    the sensor's origin is c x (0, 0, m g) = (c_y m g, -c_x m g, 0). Without the moment, the body would tilt in the gel.
+    the sensor's origin is c x (0, 0, m g) = (c_y m g, -c_x m g, 0). If `sense` receives the force without the moment,
+    the body tilts in the gel.
 
     Args:
         body: One body.
@@ -125,8 +126,8 @@ def place(
 ) -> Placement:
     """Place a body at rest on the level pad, on one of its stable faces and under its own weight.
 
-    The body penetrates the pad by 0.01 mm, the depth of objects at rest in the simulation. A simulation that starts
-    with this pose therefore stays there. The gel is indented much deeper, which `sense` computes from the wrench. The
+    The body penetrates the pad by 0.01 mm, the depth of objects at rest in the simulation. In a simulation from this
+    pose, the body therefore stays at rest. `sense` computes the much larger depth in the soft gel from the wrench. The
     function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
 
     Args:
@@ -134,8 +135,8 @@ def place(
         sensor: Sensor whose `gel.size` is the size of the pad.
         face: Index of a face in `stable_faces` with the same `fill`, `shell_scale` and `up`, where 0 is the most likely
             face. "upright" is the face on which the body's +z points up.
-        yaw: Rotation about the vertical (rad). At 0, the +z of a lying body points to the top of the image. The -y of a
-            standing body, upright or upside down, points to the top of the image.
+        yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
+            If the body stands upright or upside down, its -y axis points there instead.
         position: x and y of the centre of the body's extent (m).
         fill: Share of the interior's volume that is filled, 0 to 1.
         shell_scale: Factor on the shell's mass, > 0.
@@ -147,8 +148,8 @@ def place(
 
     Raises:
         TypeError: An argument is traced, or `body` or `sensor` has the wrong type.
-        ValueError: The body has no such face or no stable face, its centre of mass does not lie above the pad, or an
-            argument is out of range or not finite.
+        ValueError: The body has no stable face or not the given one, its centre of mass does not lie above the pad, or
+            an argument is out of range or not finite.
     """
     _check_body(body)
     if not isinstance(sensor, Sensor):
@@ -193,10 +194,11 @@ def _index(faces: StableFaces, face: int | str) -> int:
             "the body rests on no face, because its centre of mass lies outside its hull or less than 0.5 mm inside "
             "the edge of every face: give `sense` a pose of your own"
         )
-    numbered = f"it rests on {count} faces, 0 (the most likely) to {count - 1}" if count > 1 else "it rests on face 0"
+    numbers = f"faces 0 (the most likely) to {count - 1}" if count > 1 else "face 0 only"
+    numbered = f"the body rests on {numbers}"
     if isinstance(face, str):
         if face != "upright":
-            raise ValueError(f"face is {face!r}, but it must be a number or 'upright': {numbered}")
+            raise ValueError(f"face is {face!r}, but it must be the index of a face or 'upright': {numbered}")
         best = int(np.argmax(faces.up[:, 2]))
         if faces.up[best, 2] < math.cos(UPRIGHT):
             raise ValueError(f"face is 'upright', but the body does not stand with its +z up: {numbered}")
@@ -225,4 +227,6 @@ def _check_numbers(
         raise ValueError(f"shell_scale is {shell_scale}, but it must be > 0")
     length = float(np.linalg.norm(np.asarray(up, float)))
     if abs(length - 1) > 1e-3:
-        raise ValueError(f"up is {up!r} with length {length:.3g}, but it must be a unit vector")
+        raise ValueError(
+            f"up is {up!r} with length {length:.3g}, but it must be a unit vector: divide the vector by its length"
+        )

@@ -21,7 +21,7 @@ GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has lef
 
 
 class State(NamedTuple):
-    """The state that one step passes to the next."""
+    """State of one trajectory, which each time step receives from the step before."""
 
     qpos: Float[Array, "7"]  # pose: position (m), quaternion
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
@@ -49,7 +49,13 @@ class Record(NamedTuple):
 
 
 def initial(pose: Float[Array, "7"], velocity: Float[Array, "6"], held: Int[Array, ""] | int = 0) -> State:
-    """Create the state of an object that is released after `held` steps with a velocity (m/s, rad/s, sensor frame)."""
+    """Create the state before the first time step.
+
+    Args:
+        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion.
+        velocity: Velocity on release in the sensor frame, (6,): linear (m/s) and angular (rad/s).
+        held: Number of time steps until the object is released.
+    """
     turn = velocity[3:] @ geometry.quat_to_matrix(pose[3:])
     zero = jnp.zeros((), jnp.int32)
     return State(
@@ -103,10 +109,20 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 
 
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
-    """Advance a state by one time step under a given gravity (m/s^2, sensor frame).
+    """Advance a state by one time step.
 
     The measured wrench is the sum over the contacts with the pad, without the wall. Its moment is about the sensor's
     origin.
+
+    Args:
+        model: Model of the scene in MJX. Its gravity is replaced.
+        data: Data of the scene in MJX. Its positions and velocities are replaced by those of `state`.
+        hull: Collision hull of the object.
+        state: State before the step.
+        gravity: Gravity during the step, (3,) (m/s^2, sensor frame).
+
+    Returns:
+        State after the step.
     """
     old = state
     model = model.tree_replace({"opt.gravity": gravity})
@@ -179,14 +195,14 @@ def roll(
     state: State,
     gravity: Float[Array, "frames steps 3"],
 ) -> tuple[State, Record]:
-    """Simulate one trajectory. Each frame is recorded at the end of its interval of time steps.
+    """Simulate one trajectory. Each frame is recorded after its interval, which is a fixed number of time steps.
 
     Args:
         model: Model of the scene in MJX.
         data: Data of the scene in MJX.
         hull: Collision hull of the object.
         state: State at the beginning of the first frame's interval.
-        gravity: Gravity for every step of every interval, (frames, steps, 3) (m/s^2, sensor frame).
+        gravity: Gravity in each time step of each frame's interval, (frames, steps, 3) (m/s^2, sensor frame).
 
     Returns:
         The last state, and one record per frame.

@@ -54,7 +54,7 @@ class Hidden(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Geometry of a body, from which a scenario draws starts. Vectors are in the mesh frame."""
+    """Geometry of a body, from which a scenario draws random initial poses. Vectors are in the mesh frame."""
 
     points: Float[Array | np.ndarray, "*n h 3"]  # Vertices of the convex parts (m), padded by repetition.
     rests: Float[Array | np.ndarray, "*n k 3"]  # Unit vector that points up on each stable face, padded by repetition.
@@ -79,7 +79,7 @@ class Shape(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The pose of a held object, the time of its release, and the input that the scenario applies."""
+    """The start of a trajectory: the initial pose, the time of release, and the condition (`Scenario.quantities`)."""
 
     pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m), quaternion.
     # Number of time steps for which the object is held, from the beginning of the interval that ends with frame 0. With
@@ -91,7 +91,7 @@ class Start(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """A quantity of a scenario's condition: a number, or a vector (x, y) in the plane of the pad."""
+    """A quantity of a condition, such as an acceleration: a number, or a vector (x, y) in the plane of the pad."""
 
     name: str  # Name in texts and figures.
     unit: str  # Unit in texts and figures.
@@ -103,43 +103,47 @@ class Scenario(abc.ABC):
     """Base class of scenarios, which define the starts, the gravity and the outcomes of trajectories.
 
     A scenario is a frozen dataclass that derives from this class. It defines `outcomes`, `start`, `gravity` and
-    `outcome`. All other members have defaults, which a class attribute, a field or a method of the dataclass replaces.
-    `start`, `gravity`, `outcome`, `velocity`, `drift` and `hidden` are pure JAX functions for one trajectory.
+    `outcome`. All other members have defaults. To replace a default, the dataclass defines a class attribute, a field
+    or a method of the same name. `start`, `gravity`, `outcome`, `velocity`, `drift` and `hidden` are pure JAX functions
+    for one trajectory.
+
+    The condition of a trajectory is an array of c numbers that `start` draws, such as the acceleration of the pad.
+    `quantities` describes them. The condition is an input of predictors, besides the first frame.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]  # for type checkers: it is a dataclass
 
-    # Possible outcomes, the most informative first. They are members of `Outcome`, or of another IntEnum with numbers
-    # that `Outcome` does not use. `Outcome.FELL_OFF` must be one of them.
+    # possible outcomes, the most informative first: members of `Outcome`, or of another IntEnum with numbers that
+    # `Outcome` does not use (`Outcome.FELL_OFF` must be one of them)
     outcomes: ClassVar[tuple[enum.IntEnum, ...]]
-    # Quantities of the condition, vectors first. The condition is an input of predictors, besides the first frame.
+    # quantities of the condition, vectors first
     quantities: ClassVar[tuple[Quantity, ...]] = ()
-    # Symmetries of the square pad under which the scenario does not change, as numbers of `dataset.turn`.
+    # symmetries of the square pad under which the scenario does not change, as numbers of `dataset.turn`
     symmetries: ClassVar[tuple[int, ...]] = (0,)
-    must_stand: ClassVar[bool] = False  # True if the scenario refuses objects that cannot stand with +z up.
-    by_contents: ClassVar[bool] = False  # True if `Shape.coms` must have centres of mass for random contents.
+    must_stand: ClassVar[bool] = False  # True if the scenario refuses objects that cannot stand with +z up
+    by_contents: ClassVar[bool] = False  # True if `Shape.coms` must have centres of mass for random contents
 
-    rate: float = 31.25  # Frame rate (frames/s).
-    frames: int = 60  # Number of frames.
-    fill: tuple[float, float] = (0.0, 1.0)  # Range of the share of the interior's volume that is filled.
-    shell_scale: tuple[float, float] = (0.9, 1.1)  # Range of the shell's mass over its nominal mass.
-    friction: tuple[float, float] = (0.4, 0.8)  # Range of the coefficient of friction against the pad.
-    # Largest angle between the object's +z and the upward direction in which its contents settled (rad).
+    rate: float = 31.25  # frame rate (frames/s)
+    frames: int = 60  # number of frames
+    fill: tuple[float, float] = (0.0, 1.0)  # range of the share of the interior's volume that is filled
+    shell_scale: tuple[float, float] = (0.9, 1.1)  # range of the shell's mass over its nominal mass
+    friction: tuple[float, float] = (0.4, 0.8)  # range of the coefficient of friction against the pad
+    # largest angle between the object's +z and the upward direction in which its contents settled (rad)
     tilt: float = 0.0
-    wall: float = 0.0  # Height of the stop wall at the edge of the pad towards +y (m), 0 for no wall.
-    contact: Contact = Contact()  # Contact and solver constants.
+    wall: float = 0.0  # height of the stop wall at the edge of the pad towards +y (m, 0 for no wall)
+    contact: Contact = Contact()  # contact and solver constants
 
     @abc.abstractmethod
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start. Consumes `key`.
+        """Draw the random start of one trajectory.
 
         Args:
-            key: Key of one trajectory.
+            key: Key for this draw alone.
             shape: Geometry of the body.
             pad: Size of the pad along x and y (m).
 
         Returns:
-            Pose, time of the release and condition.
+            Initial pose, time of the release and condition.
         """
 
     @abc.abstractmethod
@@ -148,18 +152,23 @@ class Scenario(abc.ABC):
 
         Args:
             time: Time at which the step begins (s), 0 at frame 0.
-            condition: Condition of the start, (c,), in SI units.
+            condition: The c numbers that `quantities` describes, (c,), in SI units.
         """
 
     @abc.abstractmethod
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the number of the outcome, given the true or predicted poses (7,) of the first and the last frame."""
+        """Return the number of the outcome of one trajectory.
+
+        Args:
+            first: Pose in the first frame, (7,), simulated or predicted.
+            last: Pose in the last frame, (7,), simulated or predicted.
+        """
 
     def velocity(self, condition: Float[Array, "c"]) -> Float[Array, "6"]:
         """Return the velocity of the object on its release, by default 0.
 
         Args:
-            condition: Condition of the start, (c,), in SI units.
+            condition: The c numbers that `quantities` describes, (c,), in SI units.
 
         Returns:
             Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), (6,), in the sensor frame.
@@ -168,10 +177,15 @@ class Scenario(abc.ABC):
         return jnp.zeros(6)
 
     def drift(self, condition: Float[Array, "c"]) -> Float[Array, "2"]:
-        """Return the velocity over the pad of an object without friction (m/s, x and y). Figures draw it as an arrow.
+        """Return the velocity that an object without friction would have relative to the pad.
+
+        Figures draw it as an arrow. The default is the horizontal part of `velocity`.
 
         Args:
-            condition: Condition of the start, (c,), in SI units.
+            condition: The c numbers that `quantities` describes, (c,), in SI units.
+
+        Returns:
+            Velocity along x and y, (2,) (m/s).
         """
         return self.velocity(condition)[:2]
 
@@ -182,12 +196,12 @@ class Scenario(abc.ABC):
 
     @property
     def condition_scale(self) -> tuple[float, ...]:
-        """Typical size of each number of the condition, in SI units."""
+        """Typical size of each number of the condition (`quantities`), in SI units."""
         return tuple(q.scale for q in self.quantities for _ in range(2 if q.vector else 1))
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) at the beginning of the condition. The remaining numbers are scalars."""
+        """Number of vectors (x, y) in the condition (`quantities`). They come first, before the scalars."""
         return sum(quantity.vector for quantity in self.quantities)
 
     @property
@@ -196,7 +210,10 @@ class Scenario(abc.ABC):
         return tuple(outcome for outcome in self.outcomes if outcome != Outcome.FELL_OFF)
 
     def named(self, number: int) -> str:
-        """Return the outcome with a given number in words, such as "fell off".
+        """Return the name of an outcome in words, such as "fell off".
+
+        Args:
+            number: Number of the outcome, as in `Trajectory.outcome`.
 
         Raises:
             ValueError: The scenario has no outcome with this number.
@@ -216,7 +233,7 @@ class Scenario(abc.ABC):
         return ", ".join(words)
 
     def hidden(self, key: PRNGKeyArray) -> Hidden:
-        """Draw the hidden properties of one trajectory. Consumes `key`."""
+        """Draw the hidden properties of one trajectory. `key` is for this draw alone."""
         fill, shell, friction, high, around = jax.random.split(key, 5)
 
         def draw(key: PRNGKeyArray, limits: tuple[float, float]) -> Float[Array, ""]:
@@ -245,9 +262,11 @@ class Scenario(abc.ABC):
         check_range("shell_scale", self.shell_scale)
         check_range("friction", self.friction)
         if self.fill[1] > 1:
-            raise ValueError(f"scenario.fill is {self.fill}, but a share must be <= 1")
+            raise ValueError(f"scenario.fill is {self.fill}, but both limits of the share must be from 0 to 1")
         if not 0 <= self.tilt <= math.pi:
-            raise ValueError(f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi")
+            raise ValueError(
+                f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi (give degrees as math.radians(30))"
+            )
 
 
 def _check_kinds(scenario: Scenario) -> None:
@@ -274,8 +293,8 @@ def _check_times(scenario: Scenario) -> None:
     steps = 1 / (rate * timestep)
     if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
         raise ValueError(
-            f"scenario.rate is {rate}/s, which gives {steps:.3f} steps of {timestep} s per "
-            "frame, but their number must be whole: choose another rate"
+            f"scenario.rate is {rate}/s, which gives {steps:.3f} time steps of {timestep} s per frame, but the number "
+            "of time steps must be whole: choose another scenario.rate or scenario.contact.timestep"
         )
     if scenario.frames < 1:
         raise ValueError(f"scenario.frames is {scenario.frames}, but it must be >= 1")
@@ -286,18 +305,22 @@ def _check_meanings(scenario: Scenario) -> None:
     numbers = [int(outcome) for outcome in scenario.outcomes]
     if int(Outcome.FELL_OFF) not in numbers:
         raise ValueError(
-            f"scenario.outcomes is {scenario.outcomes}, but any object can leave the pad: add physics.Outcome.FELL_OFF"
+            f"scenario.outcomes is {scenario.outcomes}, but it must contain physics.Outcome.FELL_OFF, because any "
+            "object can leave the pad: add physics.Outcome.FELL_OFF"
         )
     taken = [o for o in scenario.outcomes if not isinstance(o, Outcome) and int(o) in {int(known) for known in Outcome}]
     if taken or len(set(numbers)) < len(numbers):
         raise ValueError(
             f"scenario.outcomes has the numbers {numbers}, but each outcome needs a unique number, and 0 "
-            f"to {max(Outcome)} are reserved for physics.Outcome: number other outcomes from 100"
+            f"to {max(Outcome)} are reserved for physics.Outcome: give other outcomes numbers from 100 on"
         )
     kinds = [quantity.vector for quantity in scenario.quantities]
     if sorted(kinds, reverse=True) != kinds:
         names = ", ".join(quantity.name for quantity in scenario.quantities)
-        raise ValueError(f"scenario.quantities has {names} in this order, but vectors must come before numbers")
+        raise ValueError(
+            f"scenario.quantities has the order {names}, but vectors must come before scalars: move the vectors to the "
+            "front"
+        )
 
 
 Variant = Literal["default", "off", "wide-friction", "off-centre"]
@@ -333,13 +356,13 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     if lacking:
         raise ValueError(
             f"name is {name!r}, but the scenario {scenario} has no field {', '.join(lacking)} to change: declare each "
-            "as a field of its dataclass"
+            "of them as a field of the scenario's dataclass"
         )
     return dataclasses.replace(scenario, **changes[name])
 
 
 def fell_off(pose: Float[Array, "*n 7"]) -> Bool[Array, "*n"]:
-    """Return for each true or predicted pose, (..., 7), whether the object has left the pad."""
+    """Return for each pose, (..., 7), whether the object's origin is more than 5 mm below the face of the gel."""
     return pose[..., 2] < FELL_OFF_HEIGHT
 
 

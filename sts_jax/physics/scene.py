@@ -50,28 +50,27 @@ _SCENE = """
 class Contact:
     """The contact and solver constants of a scenario, as MuJoCo defines them."""
 
-    timestep: float = 0.0005  # Time step (s).
-    # Time constant of the contact (s), the first number of MuJoCo's solref. The default is stiff: an object is less
-    # than 0.1 mm deep in the pad at rest and about 1 mm at impact.
+    timestep: float = 0.0005  # time step (s)
+    # time constant of the contact (s), the first number of MuJoCo's solref (with the default, an object is less
+    # than 0.1 mm deep in the pad at rest and about 1 mm at impact)
     time_constant: float = 0.003
-    # Damping ratio of the contact, the second number of solref. A gel bounces little, but most dropped objects still
-    # leave the pad and touch it again.
+    # damping ratio of the contact, the second number of MuJoCo's solref (a gel bounces little, but most dropped
+    # objects still leave the pad and touch it again)
     damping_ratio: float = 0.8
-    # Impedance at first touch, the first number of MuJoCo's solimp. A contact that is stiff at first touch rattles
-    # under a sliding object, and so does a contact whose `width` is short for the time step. Its friction is then
-    # wrong by up to 10 %.
+    # impedance at first touch, the first number of MuJoCo's solimp (with a high value, or with a `width` that is short
+    # for the time step, the contact under a sliding object rattles and its friction is wrong by up to 10 %)
     soft: float = 0.02
-    hard: float = 0.99  # Impedance at the depth `width`, the second number of solimp.
-    # Depth over which the impedance rises (m), the third number of solimp. With a long `width`, an object that leans
-    # over an edge sinks in and tips early. C MuJoCo behaves in the same way.
+    hard: float = 0.99  # impedance at the depth `width`, the second number of MuJoCo's solimp
+    # depth over which the impedance rises (m), the third number of MuJoCo's solimp (with a large value, an object that
+    # leans over an edge sinks in and tips early, in both engines)
     width: float = 0.00002
-    torsional: float = 0.005  # Torsional friction (m), MuJoCo's default.
-    # Rolling friction (m). It widens the base over which an object topples by its own length, so it must be small.
+    torsional: float = 0.005  # torsional friction (m, the default of MuJoCo)
+    # rolling friction (m, must be small, because the base over which an object topples becomes wider by this length)
     rolling: float = 0.0002
-    # Stiffness of friction relative to the normal force. A high value keeps objects at rest from creeping.
+    # stiffness of friction relative to the normal force (a high value keeps objects at rest from creeping)
     impratio: float = 10.0
-    iterations: int = 8  # Largest number of Newton iterations in a step.
-    ls_iterations: int = 8  # Largest number of line-search iterations in a Newton iteration.
+    iterations: int = 8  # largest number of Newton iterations in a time step
+    ls_iterations: int = 8  # largest number of line-search iterations in a Newton iteration
 
 
 class Box(NamedTuple):
@@ -82,7 +81,7 @@ class Box(NamedTuple):
 
 
 def boxes(pad: tuple[float, float], wall: float) -> list[Box]:
-    """Return the fixed boxes: the pad, and the stop wall if its height `wall` (m) is not 0."""
+    """Return the fixed boxes: the pad of size (x, y) `pad` (m), and the stop wall if its height `wall` (m) is not 0."""
     beneath = WALL_DEPTH if wall else 0.0  # the pad extends beneath the wall
     centre, half = [0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2]
     found = [Box(np.array(centre), np.array(half))]
@@ -111,10 +110,12 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 
 
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
-    """Compile the scene for C MuJoCo, which finds the contacts itself. `set_rigid` replaces the mass properties.
+    """Compile the scene with the object's mesh for C MuJoCo. MuJoCo finds the contacts of the mesh.
+
+    The object has placeholder mass properties, which `set_rigid` replaces.
 
     Args:
-        parts: Points of the convex parts that collide, (p, n, 3), in the mesh frame (m).
+        parts: n points of each of the p convex parts that collide, (p, n, 3), in the mesh frame (m).
         pad: Size of the pad along x and y (m).
         contact: Contact and solver constants.
         wall: Height of the stop wall (m), 0 for none.
@@ -123,7 +124,7 @@ def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact,
 
 
 def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> str:
-    """Return the scene of `compile_scene`, which has the same arguments, as MuJoCo's XML."""
+    """Return the scene as MuJoCo's XML. `compile_scene` describes the arguments."""
     meshes, shapes = [], []
     for index, part in enumerate(np.unique(parts, axis=0)):
         points = " ".join(f"{x:.9g}" for x in np.unique(part, axis=0).ravel())
@@ -135,10 +136,18 @@ def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wal
 def set_rigid(
     model: mujoco.MjModel, data: mujoco.MjData, mass: float, com: np.ndarray, inertia: np.ndarray, friction: float
 ) -> None:
-    """Write an object's mass (kg), centre of mass (m), inertia about it (kg m^2) and friction into a model.
+    """Write the mass properties and the friction of an object into a model.
 
     All constants that MuJoCo derives from these values are updated, too (`mj_setConst`). Outdated constants would
     change the stiffness of the contacts.
+
+    Args:
+        model: Model of the scene. It is changed in place.
+        data: Data of the same scene, overwritten by MuJoCo.
+        mass: Mass (kg).
+        com: Centre of mass in the mesh frame, (3,) (m).
+        inertia: Inertia about the centre of mass, along the mesh axes, (3, 3) (kg m^2).
+        friction: Coefficient of sliding friction against the pad.
 
     Raises:
         ValueError: Mass, friction or a principal moment of inertia is not positive, or a value is not finite.
@@ -152,7 +161,10 @@ def set_rigid(
             raise ValueError(f"{name} is {np.asarray(value).tolist()}, but all its values must be finite")
     principal, axes = (x[..., ::-1].copy() for x in np.linalg.eigh(inertia))  # largest first, as in MuJoCo
     if principal[2] <= 0:
-        raise ValueError(f"principal moments of inertia are {principal} kg m^2, but they must be positive")
+        raise ValueError(
+            f"principal moments of inertia are {principal} kg m^2, but they must be positive: "
+            "check shell_inertia of the body"
+        )
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     body = model.body("object")
     body.mass = mass
@@ -182,10 +194,15 @@ DRAWN = (
 def template(
     pad: tuple[float, float], contact: Contact, wall: float = 0.0
 ) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
-    """Return the scene that MJX steps for every object, as models of MuJoCo and MJX and data of MJX.
+    """Return the scene that MJX uses for all objects: MuJoCo's model, MJX's model and MJX's data.
 
-    Small boxes stand in for the object, because MJX reserves four contacts with the pad for each box. `collide` finds
-    the contacts of the object itself with pad and wall.
+    The model has small boxes in place of the object. For each box, MJX reserves memory for four contacts with the pad.
+    `collide` computes the contacts of the real object with the pad and the wall.
+
+    Args:
+        pad: Size of the pad along x and y (m).
+        contact: Contact and solver constants.
+        wall: Height of the stop wall (m), 0 for none.
     """
     count = (PAD_CONTACTS + (WALL_CONTACTS if wall else 0)) // 4
     shapes = ['type="box" size=".01 .01 .01"'] * count
@@ -194,13 +211,13 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Return the values that `set_rigid` changed, by the names of `mjx.Model`'s fields and in the types of `like`."""
+    """Return the fields of a model that `set_rigid` changes, by their names in `mjx.Model`, in the dtypes of `like`."""
     fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 
 
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """Run the position stage of `mjx.forward` with the given contacts instead of the contacts of the stand-in boxes."""
+    """Run the position stage of `mjx.forward` with given contacts, which replace those of the boxes of `template`."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
     data = mjx.collision(model, data)
     # MJX has no public way to pass contacts in. If this path moves, `tree_replace` fails at the first step.
@@ -216,6 +233,14 @@ def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
 
 
 def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:
-    """Sum force (N, sensor frame) and moment about the object's origin (N m, mesh frame) over a slice of contacts."""
+    """Return the force and the moment of some contacts on the object, summed over the contacts.
+
+    Args:
+        data: Data of MJX after `step`.
+        contacts: Indices of the contacts, as a slice with start and stop.
+
+    Returns:
+        Force (N, sensor frame) and moment about the object's origin (N m, mesh frame), (6,).
+    """
     rows = slice(contacts.start * CONDIM, contacts.stop * CONDIM)
     return data._impl.efc_force[rows] @ data._impl.efc_J[rows]

@@ -65,14 +65,14 @@ def simulate(
         sensor: Sensor whose `gel.size` is the size of the pad.
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: Number of trajectories of each body.
-        hidden: Hidden properties that replace the random ones, ordered body by body. Its arrays have the shape
-            (bodies * num,), and `up` has the shape (bodies * num, 3). The starts remain those of `key`, except where
-            `resampled` is not 0.
-        progress: True shows a progress bar on standard error. MJX compiles for tens of seconds before the first chunk
-            is done. A function is called after each chunk with the number of trajectories done so far.
-        chunk: Number of trajectories that MJX steps at once. Another number compiles anew and rounds differently.
-            Larger chunks suit a GPU. C MuJoCo simulates at most this many trajectories of one body at once in each
-            thread, and its results do not depend on the number.
+        hidden: Hidden properties that replace the random ones, ordered body by body. With n trajectories in total, its
+            arrays have the shape (n,), and `up` has the shape (n, 3). The starts are the same as without this argument,
+            except where `resampled` differs.
+        progress: True shows a progress bar on standard error. A function is called after each chunk with the number of
+            trajectories done so far. With MJX, tens of seconds of compilation precede the first chunk.
+        chunk: Largest number of trajectories that are simulated at once. With MJX, each new value causes a compilation
+            and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, the number applies to
+            each thread, and the results do not depend on it.
         engine: "mujoco" is C MuJoCo on all CPU cores. It compiles nothing and is several times as fast as MJX on a CPU.
             "mjx" runs on JAX's default device. None selects the faster one: "mujoco" if `jax.default_backend()` is
             "cpu", else "mjx". Both engines draw the same starts and hidden properties from a key.
@@ -115,7 +115,9 @@ def _reported(progress: Any, count: int, engine: Engine) -> Iterator[Callable[[i
         yield progress
         return
     if not isinstance(progress, bool):
-        raise TypeError(f"progress is {progress!r}, but it must be True, False or a function of the number done")
+        raise TypeError(
+            f"progress is {progress!r}, but it must be True, False or a function of the number of trajectories done"
+        )
     first = "simulate: compiling" if engine == "mjx" else "simulate"
     with tqdm(total=count, desc=first, unit=" trajectories", disable=not progress) as bar:
 
@@ -171,8 +173,9 @@ def _accepted(
             worst = int(attempt.argmax())
             raise BodyError(
                 int(setup.which[worst]),
-                f"trajectory {nth[worst]} is non-finite or sinks more than {SUNK_LIMIT} m into pad or wall in "
-                f"{ATTEMPTS} draws: check the thickness of the hull and the mass",
+                f"trajectory {nth[worst]} of this body failed in {ATTEMPTS} draws, because it has non-finite values or "
+                f"the object sinks more than {SUNK_LIMIT} m into the pad or the stop wall: check the thickness of the "
+                "body's hull and the body's mass",
             )
     rolled = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
     return _Accepted(starts, hidden, rolled, attempt)
