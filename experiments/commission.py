@@ -36,23 +36,24 @@ V4L2_UNIT = 1e-4  # unit of the exposure of a Video4Linux device (s)
 class Config:
     """The devices, the folder, and the source of the lens."""
 
-    camera: str | None = None  # path of the camera such as /dev/v4l/by-id/..., or its URL. None: list cameras and stop
+    camera: str | None = None  # path of the camera, such as /dev/v4l/by-id/..., or URL. None: list cameras and stop
     leds: str | None = None  # serial port of the LED controller, such as /dev/ttyACM0. None: list ports and stop
     out: Folder = Path("bench")  # folder for the sensor file
     width: int = 1640  # width of the camera's images (pixels)
     height: int = 1232  # height of the camera's images (pixels)
-    fps: float | None = None  # frames per second. None: the camera's own rate
+    fps: float | None = None  # frame rate (frames/s). None: the camera's own rate
     fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the driver
-    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # duty cycles of the LEDs in the tactile stream, 0 to 255
-    # folder with PNG pictures of the board, instead of live pictures. In the first one by name, the board lies on the
-    # pad
+    # duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on)
+    levels: tuple[int, int, int, int] = (255, 255, 255, 255)
+    # folder with PNG pictures of the board, which replace live pictures. The board must lie on the pad in the picture
+    # whose name is first in alphabetical order
     board_images: Path | None = None
-    # assume a lens without error, and take no pictures of the board. The value is the field of view across the
+    # take no pictures of the board, and assume a lens without error that has this field of view across the image's
     # diagonal (degrees)
     ideal_lens: float | None = None
     pictures: int = 15  # number of live pictures of the board
     every: float | None = None  # time to wait at each step (s). None: wait for the Enter key
-    ruler: float = 100.0  # measured length of the ruler on the print (mm). It is 100 if the scale is right
+    ruler: float = 100.0  # measured length of the printed 100 mm ruler (mm). It differs if the printer scales
     print_board: Path | None = None  # write the board to this PDF or PNG file and stop
 
     @property
@@ -72,19 +73,19 @@ def check(config: Config) -> None:
     hardware.CameraConfig(config.camera or 0, config.width, config.height, fps=config.fps, fourcc=config.fourcc)
     hardware.sts.checked_levels(config.levels)
     if config.board_images is not None and config.ideal_lens is not None:
-        raise ValueError("--board-images and --ideal-lens contradict each other: leave out one of them")
+        raise ValueError("--board-images and --ideal-lens exclude each other: leave out one of them")
     if config.ideal_lens is not None and not 0 < config.ideal_lens <= 360:
-        raise ValueError(f"ideal-lens is {config.ideal_lens:g}, but it must be an angle above 0 and up to 360 degrees")
+        raise ValueError(f"--ideal-lens is {config.ideal_lens:g}, but it must be above 0 and at most 360 degrees")
     if config.every is not None and not 0 <= config.every < math.inf:
-        raise ValueError(f"every is {config.every}, but it must be >= 0 seconds")
+        raise ValueError(f"--every is {config.every}, but it must be a finite time >= 0 (s)")
     if config.pictures < hardware.calibration.FEWEST_IMAGES:
-        raise ValueError(f"pictures is {config.pictures}, but it must be >= {hardware.calibration.FEWEST_IMAGES}")
+        raise ValueError(f"--pictures is {config.pictures}, but it must be >= {hardware.calibration.FEWEST_IMAGES}")
     if not 80 <= config.ruler <= 120:
         raise ValueError(
-            f"ruler is {config.ruler:g} mm, but it must be 80 to 120 mm: measure the line of 100 mm on the print"
+            f"--ruler is {config.ruler:g} mm, but it must be 80 to 120 mm: measure the ruler on the printed page"
         )
     if config.board_images is not None and not config.board_images.is_dir():
-        raise FileNotFoundError(f"there is no folder {config.board_images}: give the folder of the board's pictures")
+        raise FileNotFoundError(f"--board-images is {config.board_images}, but this is not a folder: give another one")
     output.make_folder(config.out)
 
 
@@ -101,7 +102,7 @@ def find(config: Config) -> str:
     ports = [port for port in found.ports if port.vendor is not None]
     cameras = [str(camera) for camera in found.cameras]
     for option, given, there, names, remedy in (
-        ("--camera", config.camera, cameras, [c.source for c in found.cameras], "connect it, or give the URL of one"),
+        ("--camera", config.camera, cameras, [c.source for c in found.cameras], "connect one, or give the URL of one"),
         (
             "--leds",
             config.leds,
@@ -243,9 +244,9 @@ def check_folder(config: Config, camera: hardware.Camera, leds: hardware.Leds) -
         return  # a missing or damaged file is written anew
     if (there.camera, there.leds) != (camera.source, leds.serial_number):
         raise ValueError(
-            f"{config.out} contains the file of another sensor, of camera {there.camera} and LED controller "
-            f"{there.leds}, but the open devices are {camera.source} and {leds.serial_number}: give another --out, or "
-            "delete the file"
+            f"{config.out} contains the sensor file of the camera {there.camera} and the LED controller {there.leds}, "
+            f"but the connected devices are {camera.source} and {leds.serial_number}: give another --out, or delete "
+            "this file"
         )
 
 
@@ -338,4 +339,6 @@ if __name__ == "__main__":
             main(arguments)
     except KeyboardInterrupt:
         number = len(list((arguments.out / "board").glob("*.png")))
-        raise SystemExit(f"interrupted: {number} pictures of the board are kept for the same command") from None
+        raise SystemExit(
+            f"interrupted: {number} pictures of the board are kept. Run the command again to continue"
+        ) from None

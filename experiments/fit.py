@@ -53,7 +53,7 @@ class Config(sense.Config):
     out: Path = Path("fit.png")  # path of the picture
     resolution: tuple[int, int] = (240, 240)  # height and width of the image (pixels)
     position: tuple[float, float] = (0.0073, -0.0041)  # true x and y of the centre of the object's bounding box (m)
-    turn: float = 23.7  # true turn of the object about the vertical (degrees)
+    turn: float = 23.7  # true turn of the object about the vertical axis (degrees)
     starts: int = 10  # number of fits, each from another initial pose
 
     # These options of experiments.sense have no meaning here.
@@ -233,9 +233,9 @@ def main(config: Config) -> None:
     """
     sense.check(config)
     if config.starts < 1:
-        raise ValueError(f"starts is {config.starts}, but it must be at least 1")
+        raise ValueError(f"--starts is {config.starts}, but it must be at least 1")
     if config.force == 0:
-        raise ValueError("force is 0, but it must be > 0 to leave an imprint")
+        raise ValueError("--force is 0, but it must be > 0 (N), so that the object leaves an imprint")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     body = sense.read(config, config.mesh)
     pose, wrench, words = sense.lay(config, sensor, body)

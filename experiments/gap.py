@@ -37,14 +37,14 @@ class Config:
     simulated: Folder  # folder of the simulated images: a session, or the dataset of an experiment
     sensor: Path | None = None  # sensor file of the real images. None: the images are rectified already
     simulated_sensor: Path | None = None  # sensor file of a simulated session. None: its images are rectified already
-    # number: trajectories of equal number show the same object in the same poses, and other trajectories are ignored.
-    # none: both folders show the same object and scenario, but no single images correspond
+    # how the trajectories of both folders correspond. number: those of equal number show the same object in the same
+    # poses, and the others are ignored. none: both folders show the same object and scenario, but in other poses
     match: Literal["number", "none"] = "number"
-    # height and width to which images are reduced before the comparison (pixels). None: those of the dataset, or 240 x
-    # 320
+    # height and width to which the images are reduced before the comparison (pixels). None: those of the dataset,
+    # or 240 x 320 for two sessions
     resolution: tuple[int, int] | None = None
     names: tuple[str, str] = ("real", "simulated")  # titles of the real and the simulated images in the figure
-    rows: int = 4  # number of trajectories in the figure. Each has two rows
+    rows: int = 4  # number of trajectories in the figure, with two rows each
     out: Folder = Path("runs/gap")  # folder for gap.txt and gap.png
     debug: bool = False  # show the traceback of every error
 
@@ -113,12 +113,12 @@ def simulated_dataset(folder: Path, resolution: tuple[int, int] | None) -> Side:
     data = dataset.load(folder)
     if data.collection["crop"]:
         raise ValueError(
-            f"the images of {folder} are cropped to the object (crop=True), but real images show the whole pad: "
-            "collect the dataset with --collection.no-crop"
+            f"the images of {folder} are cropped to the object, but real images show the whole pad: collect the "
+            "dataset again with --collection.no-crop"
         )
     own = tuple(data.collection["resolution"])
     if resolution is not None and resolution != own:
-        raise ValueError(f"resolution is {resolution}, but the images of {folder} have {own}: leave out --resolution")
+        raise ValueError(f"--resolution is {resolution}, but the images of {folder} have {own}: leave out --resolution")
     pairs = data.pairs(data.rendered())
     return side(pairs.visual, pairs.tactile, pairs.trajectory, f"{folder}, a dataset of {own[0]} x {own[1]}")
 
@@ -165,11 +165,11 @@ def load(config: Config) -> tuple[Side, Side]:
         )
     if is_dataset and config.simulated_sensor is not None:
         raise ValueError(
-            f"simulated-sensor is {config.simulated_sensor}, but {config.simulated} is a dataset, whose images are "
+            f"--simulated-sensor is {config.simulated_sensor}, but {config.simulated} is a dataset, whose images are "
             "rectified: leave out --simulated-sensor"
         )
     if config.resolution is not None and min(config.resolution) < gap.LEAST_SIDE:
-        raise ValueError(f"resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {config.resolution}")
+        raise ValueError(f"--resolution must be at least {gap.LEAST_SIDE} x {gap.LEAST_SIDE}, got {config.resolution}")
     if is_dataset:
         simulated = simulated_dataset(config.simulated, config.resolution)
     else:
@@ -254,7 +254,7 @@ def main(config: Config) -> None:
         OSError: A file cannot be read or written.
     """
     if config.rows < 1:
-        raise ValueError(f"rows must be >= 1, got {config.rows}")
+        raise ValueError(f"--rows must be >= 1, got {config.rows}")
     output.make_folder(config.out)
     real, simulated = load(config)
     matched = config.match == "number"

@@ -53,13 +53,15 @@ class Config:
     camera: str | None = None  # path or URL of the camera. None: the camera of the sensor file
     leds: str | None = None  # serial port of the LED controller. None: found by the serial number in the sensor file
     replay: tuple[Path, ...] = ()  # play back the folder of a recording, or a visual and a tactile video
-    twin: bool = False  # start a digital twin. This is the default if no other source is given
+    twin: bool = False  # use a digital twin. This is the default if no other source is given
 
     # name of a model of the library (released, inclined, freefall or perturbed), or the folder of another model
     model: str = "released"
-    # scenario of a model that is given by its folder. It determines the names of the outcomes
+    # scenario of the model if --model is a folder. It determines the names of the predicted outcomes
     scenario: Literal["freefall", "inclined", "perturbed", "released"] | None = None
-    condition: tuple[float, ...] = ()  # condition of the scenario that the model receives, SI units. Empty: zeros
+    # known quantities of the scenario that the model receives (SI units), such as the acceleration (x, y) and the
+    # duration for perturbed. Empty: zeros
+    condition: tuple[float, ...] = ()
     flat: bool = True  # remove vignetting: divide the images by the images of the empty pad in the sensor file
 
     # number of successive images of one stream before the lights switch. A larger number gives more images per second,
@@ -106,23 +108,24 @@ def check(config: Config) -> None:
         if there
     ]
     if len(given) > 1 or (config.twin and config.sensor is not None):
-        raise ValueError(f"{' and '.join(given if len(given) > 1 else ['--twin', '--sensor'])} exclude each other")
+        options = " and ".join(given if len(given) > 1 else ["--twin", "--sensor"])
+        raise ValueError(f"{options} exclude each other: choose one source of images")
     if len(config.replay) > 2:
         raise ValueError(
-            f"replay has {len(config.replay)} paths, but it takes a folder, or a visual and a tactile video"
+            f"--replay has {len(config.replay)} paths, but it takes one folder, or a visual and a tactile video"
         )
     if config.sensor is None and (config.camera is None) != (config.leds is None):
         missing = "--camera" if config.camera is None else "--leds"
-        raise ValueError(f"{missing} is missing: without a sensor file, both --camera and --leds are needed")
+        raise ValueError(f"{missing} is missing: both --camera and --leds are needed, or a sensor file with --sensor")
     if config.sensor is not None and not hardware.sensor_file.sensor_file(config.sensor).exists():
         raise ValueError(
-            f"sensor is {config.sensor}, but there is no sensor file: give another one, or write it with `python -m "
-            "experiments.commission`"
+            f"--sensor is {config.sensor}, but there is no sensor file: give another path, or write the file with "
+            "`python -m experiments.commission`"
         )
     if config.dwell < 1:
-        raise ValueError(f"dwell must be >= 1, got {config.dwell}")
+        raise ValueError(f"--dwell must be >= 1, got {config.dwell}")
     if config.seconds is not None and not config.seconds > 0:
-        raise ValueError(f"seconds must be > 0, got {config.seconds}")
+        raise ValueError(f"--seconds must be > 0, got {config.seconds}")
     if config.record is not None and config.replay:
         raise ValueError("--record and --replay exclude each other: copy the folder of the recording instead")
 

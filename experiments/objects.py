@@ -43,11 +43,12 @@ class Config:
     out: Path = Path("objects.png")  # path of the picture
     seed: int = 0  # seed of the objects
     num: int = 10  # number of objects per class
-    categories: tuple[str, ...] = sts.objects.CATEGORIES  # object classes
+    categories: tuple[str, ...] = sts.objects.CATEGORIES  # object classes to draw
     view: Literal["quarter", "side", "above", "below"] = "quarter"  # direction from which the objects are seen
     size: int = 160  # side of one object's picture (pixels)
-    parts: bool = False  # decompose objects whose hull fits badly into convex parts
-    shuffle: bool = False  # random order, with numbers instead of names. The names are written to OUT with suffix .txt
+    parts: bool = False  # decompose an object into convex parts if its convex hull fits badly
+    # draw the objects in random order, with numbers instead of names. The names are written to OUT with the suffix .txt
+    shuffle: bool = False
 
 
 @jax.jit(static_argnames=("size",))
@@ -105,7 +106,7 @@ def main(config: Config) -> None:
         OSError: The picture cannot be written.
     """
     if config.num < 1:
-        raise ValueError(f"num is {config.num}, but it must be at least 1 object per class")
+        raise ValueError(f"--num is {config.num}, but it must be at least 1 object per class")
     families = {category: sts.objects.find_family(category) for category in config.categories}
     output.check_picture(config.out)
     key = jax.random.key(config.seed)

@@ -40,12 +40,14 @@ NARROWEST = 160  # smallest width of a panel (pixels). Smaller images are magnif
 class Config:
     """The object, its pose and load, and the picture."""
 
-    mesh: Annotated[str, tyro.conf.Positional]  # path of a mesh file, name of an object class, or `classes` for all
+    # path of a mesh file, name of an object class such as bottle, or `classes` for one object of each class
+    mesh: Annotated[str, tyro.conf.Positional]
     out: Path = Path("sense.png")  # path of the picture
     sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
     resolution: tuple[int, int] = (480, 640)  # height and width of the images (pixels)
     crop: bool = False  # show only a window around the object, in the image's aspect ratio
-    light: float = 0.5  # share of the LEDs' full power in the image between visual and tactile, 0 to 1
+    # brightness of the LEDs in the image between the visual and the tactile one, as a share of full power, 0 to 1
+    light: float = 0.5
 
     rest: int = 0  # index of the face on which the object rests. 0 is the most likely one
     position: tuple[float, float] = (0.0, 0.0)  # x and y of the centre of the object's bounding box (m)
@@ -73,7 +75,7 @@ def check(config: Config) -> None:
         OSError: The picture cannot be written.
     """
     if min(config.resolution) < 1:
-        raise ValueError(f"resolution is {config.resolution}, but height and width must be at least 1 pixel")
+        raise ValueError(f"--resolution is {config.resolution}, but height and width must be at least 1 pixel")
     numbers = {
         "position": config.position,
         "height": (config.height,),
@@ -84,10 +86,10 @@ def check(config: Config) -> None:
     }
     for name, values in numbers.items():
         if not all(math.isfinite(value) for value in values):
-            raise ValueError(f"{name} is {getattr(config, name)}, but it must be finite")
+            raise ValueError(f"--{name} is {getattr(config, name)}, but it must be finite")
     for name, value in (("mass", config.mass), ("force", config.force)):
         if value is not None and (value < 0 or (name == "mass" and value == 0)):
-            raise ValueError(f"{name} is {value}, but it must be > 0" + (" or 0" if name == "force" else ""))
+            raise ValueError(f"--{name} is {value}, but it must be " + (">= 0 (N)" if name == "force" else "> 0 (kg)"))
     output.check_picture(config.out)
 
 
@@ -105,7 +107,8 @@ def read(config: Config, name: str) -> sts.objects.Body:
     if name not in sts.objects.CATEGORIES:
         path = Path(name)
         if not path.exists() and not path.suffix:
-            raise FileNotFoundError(f"{name} is neither a file nor a class ({', '.join(sts.objects.CATEGORIES)})")
+            classes = ", ".join(sts.objects.CATEGORIES)
+            raise FileNotFoundError(f"{name} is neither a file nor an object class ({classes})")
         return sts.objects.load(
             path,
             longest_side=config.longest_side,
@@ -118,7 +121,7 @@ def read(config: Config, name: str) -> sts.objects.Body:
     for option in ("longest_side", "scale", "up", "faces", "texture"):
         if getattr(config, option) is not None:
             raise ValueError(
-                f"{option} is for mesh files, but {name} is a class: leave out --{option.replace('_', '-')}"
+                f"--{option.replace('_', '-')} is for mesh files, but {name} is an object class: leave out this option"
             )
     index = sts.objects.CATEGORIES.index(name)
     body = sts.objects.make(jax.random.fold_in(jax.random.key(config.seed), index), name)
@@ -142,7 +145,7 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
         raise ValueError(
-            f"rest is {config.rest}, but the object can rest on {len(shares)} faces: give --rest 0 to {len(shares) - 1}"
+            f"--rest is {config.rest}, but the object can rest on {len(shares)} faces: give 0 to {len(shares) - 1}"
         )
     rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
     turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)

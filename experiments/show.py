@@ -32,7 +32,7 @@ SCENARIOS = {
 class Config:
     """Scenario, number of trajectories, and size of the pictures."""
 
-    scenario: Annotated[str, tyro.conf.Positional]  # freefall, inclined, perturbed or released
+    scenario: Annotated[str, tyro.conf.Positional]  # name of the scenario: freefall, inclined, perturbed or released
     num: int = 4  # number of trajectories, each with another object
     seed: int = 0  # seed of the objects and the trajectories
     out: Path = Path("show")  # folder for the pictures
@@ -49,7 +49,7 @@ def main(config: Config) -> None:
     if config.scenario not in SCENARIOS:
         raise ValueError(f"scenario is {config.scenario!r}, but it must be one of {', '.join(SCENARIOS)}")
     if config.num < 1:
-        raise ValueError(f"num is {config.num}, but it must be at least 1")
+        raise ValueError(f"--num is {config.num}, but it must be at least 1")
     output.make_folder(config.out)
     sensor = sts.Sensor()
     collection = dataclasses.replace(SCENARIOS[config.scenario], num_objects=config.num, seed=config.seed)

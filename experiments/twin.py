@@ -29,7 +29,7 @@ class Config:
     """The camera, the object and the connections of the twin."""
 
     resolution: tuple[int, int] = (480, 640)  # height and width of the frames (pixels)
-    rate: float = 30.0  # frames per second
+    rate: float = 30.0  # frame rate of the camera (frames/s)
     # field of view of the fisheye lens across the image's diagonal (degrees). The paper's device has 160. None: frames
     # without lens distortion
     field_of_view: float | None = 160.0
@@ -40,8 +40,8 @@ class Config:
     object_class: Annotated[str, tyro.conf.arg(name="class")] = "camera"
     sensor: Path | None = None  # file with the sensor's constants, written by Sensor.save. None: the paper's sensor
     seed: int = 0  # seed of the object, the trajectories and the noise
-    # hold and release the object at random. The value is the mean time of holding plus that of resting (s). None: the
-    # object moves by command only
+    # hold and release the object at random times. The value is the mean time of holding plus that of resting
+    # afterwards (s). None: the object moves by command only
     release_every: float | None = None
     # rendered poses per second of a moving object. None: 10 up to 640 x 480 pixels, fewer for larger frames
     motion_rate: float | None = None
@@ -51,7 +51,9 @@ class Config:
     http_port: int = 0  # TCP port of the HTTP server. 0 selects a free one
     log: Path | None = None  # write the ground truth of each frame to this file, as JSON lines
     record: Path | None = None  # write all frames to this file, as motion JPEG
-    attached: bool = False  # stop when the standard input ends, for a program that starts the twin through a pipe
+    # stop when the standard input ends. If another program starts the twin with a pipe as its standard input, the twin
+    # then ends together with this program
+    attached: bool = False
 
 
 def make(config: Config) -> twin.Twin:
@@ -62,9 +64,10 @@ def make(config: Config) -> twin.Twin:
         OSError: The sensor file cannot be read, or a file cannot be written.
     """
     if config.object_class not in sts.objects.CATEGORIES:
-        raise ValueError(f"class is {config.object_class!r}, but it must be one of {', '.join(sts.objects.CATEGORIES)}")
+        classes = ", ".join(sts.objects.CATEGORIES)
+        raise ValueError(f"--class is {config.object_class!r}, but it must be one of {classes}")
     if min(config.resolution) < 1:
-        raise ValueError(f"resolution is {config.resolution}, but height and width must be at least 1 pixel")
+        raise ValueError(f"--resolution is {config.resolution}, but height and width must be at least 1 pixel")
     sensor = sts.Sensor() if config.sensor is None else sts.Sensor.load(config.sensor)
     scene = twin.ObjectScene(
         sts.objects.make(jax.random.key(config.seed), config.object_class),

@@ -191,7 +191,7 @@ def test_an_interrupted_run_resumes_and_writes_a_file_that_opens_the_sensor(peer
         commission.claim_pictures(config, camera)
     with (
         hardware.Leds.connect(peer.path) as leds,
-        pytest.raises(ValueError, match=r"file of another sensor, of camera .*give another"),
+        pytest.raises(ValueError, match=r"contains the sensor file of the camera .*give another"),
     ):
         commission.check_folder(config, camera, leds)
 
@@ -427,9 +427,9 @@ def test_the_board_is_printed(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"board_images": "missing"}, "there is no folder missing"),
-        ({"board_images": ".", "ideal_lens": 160.0}, "contradict each other"),
-        ({"ideal_lens": 0.0}, "ideal-lens is 0"),
+        ({"board_images": "missing"}, "--board-images is missing, but this is not a folder"),
+        ({"board_images": ".", "ideal_lens": 160.0}, "exclude each other: leave out one"),
+        ({"ideal_lens": 0.0}, "--ideal-lens is 0"),
         ({"levels": (0, 0, 0, 0)}, "at least one above 0"),
         ({"pictures": 3}, "pictures is 3, but it must be >= 6"),
         ({"ruler": 10.0}, "ruler is 10 mm"),

@@ -84,7 +84,7 @@ def test_the_wrench_moves_with_the_pose():
         ({"starts": 0}, "starts is 0, but it must be at least 1"),
         ({"force": 0.0}, "force is 0, but it must be > 0"),
         ({"position": (0.3, 0.0), "resolution": SMALL}, "scissors leaves no imprint in view"),
-        ({"mesh": "teapot"}, "teapot is neither a file nor a class"),
+        ({"mesh": "teapot"}, "teapot is neither a file nor an object class"),
         ({"resolution": (0, 64)}, "at least 1 pixel"),
     ],
 )

@@ -154,7 +154,7 @@ def test_an_error_of_the_thread_reaches_the_caller():
 def test_unfit_models_are_refused():
     with pytest.raises(ValueError, match="takes no visual images"):
         Live(StubPredictor(modalities=("tactile",)), views(), (), (), lambda: None)
-    with pytest.raises(ValueError, match=r"condition has 2 numbers, but .* needs 3"):
+    with pytest.raises(ValueError, match=r"--condition has 2 numbers, but the model .* needs 3"):
         Live(StubPredictor(condition=3), views(), (), (1.0, 2.0), lambda: None)
 
 
@@ -232,8 +232,8 @@ def test_files_of_panels(tmp_path, monkeypatch):
     [
         ({"twin": True, "replay": ("a",)}, "--twin and --replay exclude each other"),
         ({"twin": True, "sensor": "a"}, "--twin and --sensor exclude each other"),
-        ({"sensor": "none"}, "sensor is none, but there is no sensor file: give another one, or write it with"),
-        ({"replay": ("a", "b", "c")}, "replay has 3 paths, but it takes a folder, or a visual and a tactile video"),
+        ({"sensor": "none"}, "--sensor is none, but there is no sensor file: give another path, or write"),
+        ({"replay": ("a", "b", "c")}, "--replay has 3 paths, but it takes one folder, or a visual and a tactile video"),
         ({"camera": "http://127.0.0.1/"}, "both --camera and --leds are needed"),
         ({"seconds": 0.0}, "seconds must be > 0, got 0"),
         ({"dwell": 0}, "dwell must be >= 1, got 0"),

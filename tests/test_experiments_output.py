@@ -34,13 +34,13 @@ MAINS = {
 def test_a_picture_that_cannot_be_written_is_refused_before_any_work(name, tmp_path, monkeypatch):
     for path, kind, message in (
         (tmp_path, IsADirectoryError, "is a folder: give the name of a picture"),
-        (tmp_path / "nowhere" / "a.png", FileNotFoundError, r"nowhere does not exist: make it for a\.png"),
+        (tmp_path / "nowhere" / "a.png", FileNotFoundError, r"nowhere of a\.png does not exist: make this folder"),
         (tmp_path / "a.xyz", ValueError, r"has the suffix '\.xyz', but it must be one of \.png"),
     ):
         with pytest.raises(kind, match=message):
             MAINS[name](path)
     monkeypatch.setattr(tempfile, "TemporaryFile", forbidden)  # whoever runs the tests may write everywhere
-    with pytest.raises(PermissionError, match=r"cannot be written to \(Permission denied\): give another --out"):
+    with pytest.raises(PermissionError, match=r"cannot be written to \(Permission denied\): give another path"):
         MAINS[name](tmp_path / "a.png")
     assert not list(tmp_path.iterdir())
 
@@ -49,7 +49,7 @@ def test_a_picture_that_cannot_be_written_is_refused_before_any_work(name, tmp_p
 def test_a_folder_that_cannot_be_written_is_refused_before_any_work(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file", tmp_path / "file" / "inner"):
-        with pytest.raises(OSError, match=r"cannot be made \(.*\): give another --out"):
+        with pytest.raises(OSError, match=r"cannot be made \(.*\): give another path"):
             show.main(show.Config("perturbed", out=path))
     monkeypatch.setattr(tempfile, "TemporaryFile", forbidden)
     with pytest.raises(PermissionError, match=r"cannot be written to \(Permission denied\)"):

@@ -79,7 +79,7 @@ def test_an_earlier_model_stays_if_the_new_one_is_refused(models, workdir, monke
 
 @pytest.mark.parametrize("name", ["", "..", "runs/falls", "free fall"])
 def test_a_name_with_other_characters_is_refused(models, workdir, name):
-    with pytest.raises(ValueError, match="it takes only letters, digits and underscores"):
+    with pytest.raises(ValueError, match="it must consist of letters, digits and underscores"):
         ship.ship(workdir, name)
 
 

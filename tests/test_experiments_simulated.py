@@ -51,7 +51,7 @@ def test_an_interrupted_collection_of_the_twin_equals_an_uninterrupted_one(tmp_p
     assert "has 5 trajectories already" in capsys.readouterr().err
     for options, message in (
         ({"seed": 1}, "TWIN1"),
-        ({"size": (320, 240)}, "describes images of 160 x 120"),
+        ({"size": (320, 240)}, "is for images of 160 x 120 pixels"),
         ({"levels": (9, 9, 9, 9)}, "levels"),
     ):
         with pytest.raises(SystemExit, match=message):

@@ -106,7 +106,7 @@ def test_trajectories_without_any_contact_are_an_error(tmp_path):
     data = recorded.read(TINY, tmp_path / "work")
     blank = np.broadcast_to(data.empty["tactile"], data.train.tactile.shape).copy()
     data = data._replace(train=data.train._replace(tactile=blank))
-    with pytest.raises(ValueError, match="no first tactile image of the training trajectories shows a contact"):
+    with pytest.raises(ValueError, match="none of the initial tactile images for training shows a contact"):
         list(recorded.jobs(TINY, data))
 
 

@@ -316,7 +316,7 @@ def test_object_is_held_moves_and_lies_still_as_simulated(held):
     body, scene = held
     phases, frames = [], []
     with twin.Twin(scene, imperfections=PERFECT) as device:
-        with pytest.raises(ValueError, match="Send hold first"):
+        with pytest.raises(ValueError, match="send 'hold' first"):
             device.command("release")
         for count, name in [(3, None), (3, "hold"), (80, "release"), (3, "clear")]:
             if name:
@@ -491,7 +491,7 @@ def test_commands_and_state_over_http(held):
         with urllib.request.urlopen(server.url + "/state", timeout=30) as answer:
             state = json.load(answer)
         assert state["pose"] == list(device.state.pose)
-        for path, code, words in (("/release", 400, "Send hold first"), ("/jump", 404, "is not one of GET /camera")):
+        for path, code, words in (("/release", 400, "send 'hold' first"), ("/jump", 404, "is not one of GET /camera")):
             with pytest.raises(urllib.error.HTTPError) as found:
                 post(server, path)
             with found.value as answer:

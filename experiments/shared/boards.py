@@ -75,11 +75,11 @@ class Pictures:
                 with Image.open(path) as picture:
                     image = np.asarray(picture.convert("RGB"))
             except (OSError, UnidentifiedImageError) as error:
-                raise ValueError(f"{path} cannot be read ({error}): delete it, or take it again") from error
+                raise ValueError(f"{path} cannot be read ({error}): delete this picture, or take it again") from error
             if image.shape[1::-1] != size:
                 raise ValueError(
                     f"{path} has {image.shape[1]} x {image.shape[0]} pixels, but the camera's size is {size[0]} x "
-                    f"{size[1]}: give the size of both with --width and --height, or take the pictures again"
+                    f"{size[1]}: give the size of the pictures with --width and --height, or take the pictures again"
                 )
             pictures = pictures.with_one(path.name, hardware.find_board(image, board))
         return pictures

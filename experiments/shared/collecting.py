@@ -24,15 +24,16 @@ class Collect:
     twin: bool = False  # use the digital twin instead of devices. Nobody needs to act, and there is no page
     seed: int = 0  # seed of the twin's object and trajectories
     sensor: Path | None = None  # sensor file of experiments.commission, or its folder
-    # width and height of the images (pixels). None: those of the sensor file, 640 x 480 with --twin, otherwise 1640 x
-    # 1232
+    # width and height of the images (pixels). None: those of the sensor file, 640 x 480 with --twin,
+    # otherwise 1640 x 1232
     size: tuple[int, int] | None = None
     fourcc: str | None = None  # pixel format of the camera, such as MJPG. None: that of the sensor file or the driver
     lock: bool = True  # lock the exposure and the white balance of the camera
-    # duty cycles of the four LED channels in the tactile stream, 0 to 255. None: those of the sensor file, or 255
+    # duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on). None: those of the sensor
+    # file, or 255
     levels: tuple[int, int, int, int] | None = None
-    # stop when the session has this number of confirmed trajectories, earlier ones included. None: never stop, or with
-    # --twin stop at 100
+    # stop when the session has this number of confirmed trajectories, earlier ones included. None: stop at 100 with
+    # the option --twin, and never without it
     count: int | None = None
     note: str = ""  # text that is stored with each trajectory, such as the object's name
     headless: bool = False  # show instructions in this terminal instead of on a page
@@ -57,7 +58,7 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
         OSError: The sensor file cannot be read.
     """
     if config.count is not None and config.count < 1:
-        raise ValueError(f"count must be >= 1, got {config.count}")
+        raise ValueError(f"--count must be >= 1, got {config.count}")
     if config.sensor is not None:
         return commissioned(config, config.sensor)
     if config.camera is None or config.leds is None:
@@ -65,7 +66,7 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
         raise ValueError(
             f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
             f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
-            f"{', '.join(port.device for port in ports) or 'none'}. Name both, or give a sensor file with --sensor"
+            f"{', '.join(port.device for port in ports) or 'none'}. Give both options, or a sensor file with --sensor"
         )
     width, height = config.size or (1640, 1232)
     camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
@@ -172,8 +173,8 @@ def keep(file: Path, workdir: Path) -> None:
     if copy.exists():
         if hardware.Device.load(copy) != device:
             raise ValueError(
-                f"{copy} differs from {file}, so the sensor was commissioned anew: choose another --workdir, because "
-                "all trajectories of a session are rectified with one sensor file"
+                f"{copy} differs from {file}, but one sensor file must describe all trajectories of a session: choose "
+                "another --workdir"
             )
         return
     for background in (device.background_visual, device.background_tactile):

@@ -47,11 +47,12 @@ class Args:
     workdir: Folder  # folder for the results
     # configuration of the preset. Each of its fields is an option
     config: Annotated[Config, tyro.conf.arg(name="")]
-    preset: Literal["smoke", "default", "long", "paper"] = "default"  # configuration from which the options start
-    only: stages.Stage | None = None  # run only this stage
+    preset: Literal["smoke", "default", "long", "paper"] = "default"  # set of default values for the options
+    only: stages.Stage | None = None  # run only this stage of the experiment
     plan: bool = False  # measure each stage for a short time, print its expected duration, and stop
-    # ranges of the hidden properties: the scenario's own (default), the middle of each range only (off), a wider range
-    # of friction (wide-friction), or contents that lie on any side of the object (off-centre)
+    # ranges of the hidden properties fill, shell mass and friction: those of the scenario (default), only the middle of
+    # each range (off), a wider range of friction (wide-friction), or contents that may lie on any side of the
+    # object (off-centre)
     hidden: sts.physics.Variant = "default"
     objects: Folder | None = None  # folder of mesh files or of ShapeNetSem, whose objects replace the procedural ones
     # classes of the objects. Empty: those of the experiment, or all classes of --objects if it has none of these
@@ -62,7 +63,7 @@ class Args:
     # axis of the files in --objects that points up. None: that of ShapeNetSem's table, or y for glTF and z for other
     # files
     up: Literal["x", "y", "z"] | None = None
-    parts: bool = False  # decompose objects whose collision hull fits badly into convex parts
+    parts: bool = False  # decompose an object into convex parts if its convex hull fits badly
     debug: bool = False  # show the traceback of every error
 
 
@@ -199,8 +200,8 @@ def with_meshes(
     say(f"{len(meshes.names)} objects can be used. {path} lists these and the objects left out")
     if len(meshes.names) < LEAST_OBJECTS:
         raise ValueError(
-            f"objects is {folder}, which has {len(meshes.names)} usable objects, but the split into training, "
-            f"validation and test needs at least {LEAST_OBJECTS}: add objects. {path} lists why others are left out"
+            f"--objects {folder} has {len(meshes.names)} usable objects, but the split into training, validation and "
+            f"test needs at least {LEAST_OBJECTS}: add objects. {path} lists the other objects and their problems"
         )
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))

@@ -36,14 +36,14 @@ class Config:
     collection: dataset.Collection  # the dataset
     training: TrainConfig  # training of the paper's models
     state_training: TrainConfig  # training of the state-space model
-    model: Literal["statespace", "paper"] = "statespace"  # train the state-space model, or the paper's four models
-    # number of gradient steps of each of the paper's models. None: training.epochs determines the numbers
+    model: Literal["statespace", "paper"] = "statespace"  # models to train: the state-space model, or the paper's four
+    # numbers of gradient steps, one for each of the paper's models. None: each is trained for training.epochs epochs
     steps: tuple[int, ...] | None = None
-    # modalities that the paper's models learn to predict from a subset of the modalities: all, or only those of the
-    # subset (own, as in the paper)
+    # modalities that the paper's models learn to predict when only some modalities are given: all of them, or only
+    # the given ones (own, as in the paper)
     targets: Literal["all", "own"] = "all"
     rotation: Literal["matrix", "quaternion"] = "matrix"  # representation of rotations in the networks
-    # do not use a tactile image without contact as an input. False: use the blank image, as in the paper
+    # leave out tactile images without contact as inputs. False: use these blank images, as in the paper
     mask_blank_touch: bool = True
     # data that is held out for validation and test: whole objects (object), or a random share of all trajectories, so
     # that each object is also in the training data (trajectory, as in the paper). Each split has its own models and
@@ -53,10 +53,10 @@ class Config:
     image_size: int = 64  # side of the images that are predicted and evaluated (pixels)
     # number of samples of each prediction of the state-space model. The paper's models are evaluated by their mean
     num_samples: int = 16
-    # number of simulations of each held-out start with newly drawn hidden properties (re-rolls). The mean of their
-    # results is the ceiling in the tables
+    # number of simulations of each held-out start, each with newly drawn hidden properties such as
+    # friction (re-rolls). The tables show the score of their mean result as the ceiling
     rerolls: int = 16
-    num_rerolled: int = 256  # number of held-out starts with re-rolls, from the first one on
+    num_rerolled: int = 256  # number of held-out starts that are re-rolled, from the first one on
 
 
 # The same for all scenarios. The presets set `steps`.
@@ -146,8 +146,8 @@ def check(config: Config) -> None:
         )
     if config.model == "statespace" and collection.crop:
         raise ValueError(
-            "collection.crop must be False for the state-space model, which finds the object itself, got True: give "
-            "--collection.no-crop, or --model paper"
+            "collection.crop must be False for the state-space model, because it locates the object in the whole "
+            "image, got True: give --collection.no-crop, or --model paper"
         )
     allowed = image_sizes(config)
     if not allowed:
@@ -165,7 +165,7 @@ def check(config: Config) -> None:
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(
             f"steps must have {len(names)} numbers, one for each of {', '.join(names)}, got {config.steps}: give "
-            "--steps with as many numbers, or --steps None for training.epochs"
+            f"--steps with {len(names)} numbers, or --steps None to train each model for --training.epochs epochs"
         )
     unknown = [split for split in config.splits if split not in SPLITS]
     if unknown or not config.splits:

@@ -134,12 +134,12 @@ class Live:
             ValueError: The model cannot use visual images, or `condition` has the wrong length.
         """
         if "visual" not in predictor.modalities:
-            raise ValueError(f"{predictor!r} takes no visual images as inputs: give another --model")
+            raise ValueError(f"the model {predictor!r} takes no visual images as inputs: give another --model")
         width = predictor.model.config.condition
         if len(condition) not in (0, width):
             raise ValueError(
-                f"condition has {len(condition)} numbers, but {predictor!r} needs {width}: change or leave out "
-                "--condition"
+                f"--condition has {len(condition)} numbers, but the model {predictor!r} needs {width}: change this "
+                "option, or leave it out"
             )
         self._predictor, self._views, self._outcomes = predictor, views, outcomes
         self._condition = np.asarray(condition or (0.0,) * width, np.float32) if width else None

@@ -83,7 +83,7 @@ class PanelFile:
             output.check_picture(path)
         else:
             known = ", ".join((*output.PICTURES, *VIDEOS))
-            raise ValueError(f"save is {path}, but its suffix must be one of {known}")
+            raise ValueError(f"--save is {path}, but its suffix must be one of {known}")
         self._panels: list[np.ndarray] = []  # panels of which the picture shows some
         self._writer: cv2.VideoWriter | None = None
         self._next_s = -float("inf")  # time at which the next panel is due (s)
@@ -107,7 +107,7 @@ class PanelFile:
             height, width = image.shape[:2]
             self._writer = cv2.VideoWriter(str(self._path), _CODEC, _RATE, (width, height))
             if not self._writer.isOpened():
-                raise OSError(f"{self._path} cannot be written as a video: give another --save")
+                raise OSError(f"OpenCV cannot write a video to {self._path}: give another path with --save")
         self._writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 
     def close(self) -> bool:

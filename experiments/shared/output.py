@@ -20,14 +20,14 @@ def check_picture(path: Path) -> None:
         raise ValueError(f"{path} has the suffix {path.suffix!r}, but it must be one of {', '.join(PICTURES)}")
     if not path.parent.is_dir():
         raise FileNotFoundError(
-            f"the folder {path.parent} does not exist: make it for {path.name}, or give another --out"
+            f"the folder {path.parent} of {path.name} does not exist: make this folder, or give another path"
         )
     _write(path.parent)
     if path.exists():
         try:
             path.open("ab").close()
         except OSError as error:
-            raise type(error)(f"{path} cannot be overwritten ({error.strerror}): give another --out") from error
+            raise type(error)(f"{path} cannot be overwritten ({error.strerror}): give another path") from error
 
 
 def make_folder(path: Path) -> None:
@@ -39,7 +39,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise type(error)(f"the folder {path} cannot be made ({error.strerror}): give another --out") from error
+        raise type(error)(f"the folder {path} cannot be made ({error.strerror}): give another path") from error
     _write(path)
 
 
@@ -48,4 +48,4 @@ def _write(folder: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise type(error)(f"the folder {folder} cannot be written to ({error.strerror}): give another --out") from error
+        raise type(error)(f"the folder {folder} cannot be written to ({error.strerror}): give another path") from error

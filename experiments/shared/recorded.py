@@ -27,15 +27,15 @@ class Config:
     # number of trajectories that the digital twin collects if the work directory has none of a device
     count: int = 100
     size: tuple[int, int] = (640, 480)  # width and height of the twin's images (pixels)
-    # number of gradient steps of each of the three models. None: training.epochs determines the numbers
+    # numbers of gradient steps, one for each of the three models. None: each is trained for training.epochs epochs
     steps: tuple[int, int, int] | None = None
-    # modalities that the models learn to predict from a subset of the modalities: all, or only those of the
-    # subset (own, as in the paper)
+    # modalities that the models learn to predict when only some modalities are given: all of them, or only the given
+    # ones (own, as in the paper)
     targets: Literal["all", "own"] = "all"
     # also train with the final pair as an input, so that the models learn that an object at rest stays at rest
     rest: bool = True
-    shifts: int = 15  # number of copies of each training trajectory, in which the object lies at another place
-    largest_shift: int = 8  # largest shift of a copy (pixels). At 64 pixels, a pixel is 2.3 mm wide
+    shifts: int = 15  # number of shifted copies of each training trajectory
+    largest_shift: int = 8  # largest shift of a copy (pixels). In images of 64 pixels, one pixel is 2.3 mm wide
     image_size: int = 64  # side of the images that are used and predicted (pixels). The paper uses 64
     held_out: float = 0.2  # share of the trajectories for validation. The paper uses 0.2
     seed: int = 0  # seed of the split into training and validation
@@ -62,8 +62,8 @@ def check(config: Config) -> None:
         raise ValueError(f"held_out must be a share above 0 and below 1, got {config.held_out}")
     if config.shifts < 0 or not 0 <= config.largest_shift < config.image_size:
         raise ValueError(
-            f"shifts must be >= 0 and largest_shift in [0, {config.image_size}) pixels, got {config.shifts} and "
-            f"{config.largest_shift}"
+            f"shifts must be >= 0 and largest_shift must be 0 to {config.image_size - 1} pixels, got shifts = "
+            f"{config.shifts} and largest_shift = {config.largest_shift}"
         )
     if config.count < LEAST:
         raise ValueError(f"count must be >= {LEAST}, got {config.count}")
@@ -151,14 +151,14 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
     path = workdir / "sensor.json"
     if not path.exists():
         raise FileNotFoundError(
-            f"the sensor file {path} is missing, which contains the lens and names the images of the empty pad: copy "
-            "the sensor file and the background images of `python -m experiments.commission` into the work directory"
+            f"the sensor file {path} is missing: copy this file and the background images (images of the empty pad), "
+            "which `python -m experiments.commission` has written, into the work directory"
         )
     device = hardware.Device.load(path)
     if device.background_visual is None or device.background_tactile is None:
         raise ValueError(
-            f"{path} names no background images, but they are needed to find contacts: run `python -m "
-            "experiments.commission` again, and copy the sensor file and its images into the work directory"
+            f"{path} names no background images (images of the empty pad), but they are needed to find contacts: run "
+            "`python -m experiments.commission` again, and copy the sensor file and its images into the work directory"
         )
     return device, sts.Sensor.load(path)
 
@@ -182,8 +182,9 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
         arrays, own = training.image_arrays(visual, tactile, modalities, preprocessing, blank)
         if own.absent:
             raise ValueError(
-                "no first tactile image of the training trajectories shows a contact: draw the images with `python -m "
-                "experiments.real review --sheet review.png`, and compare them with the background of sensor.json"
+                "none of the initial tactile images for training shows a contact: draw the images with `python -m "
+                "experiments.real review --sheet review.png`, and compare them with the tactile background image that "
+                "sensor.json names"
             )
         schedule = config.training
         if config.steps is not None:

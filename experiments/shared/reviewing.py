@@ -94,7 +94,7 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
     recordings = hardware.load_recordings(folder)
     if unknown := set(numbers) - set(recordings.numbers):
         raise ValueError(
-            f"{folder} has no confirmed trajectories {sorted(unknown)}: give other --numbers, or leave them out"
+            f"{folder} has no confirmed trajectories with the numbers {sorted(unknown)}: give other --numbers"
         )
     if not recordings.numbers:
         raise ValueError(f"{folder} has no confirmed trajectory to draw: collect some first")

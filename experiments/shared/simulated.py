@@ -36,7 +36,8 @@ class Simulated:
     workdir: Path  # work directory. The trajectories go to its folder `dataset`, the sensor file is `sensor.json`
     count: int = 100  # number of confirmed trajectories, earlier ones included, after which the collection ends
     size: tuple[int, int] = (640, 480)  # width and height of the images (pixels)
-    levels: tuple[int, int, int, int] = (255, 255, 255, 255)  # duty cycles of the LEDs in the tactile stream, 0 to 255
+    # duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on)
+    levels: tuple[int, int, int, int] = (255, 255, 255, 255)
     seed: int = 0  # seed of the object, the trajectories and the noise
     note: str = ""  # text that is stored with each trajectory
     guide: GuideConfig = dataclasses.field(default_factory=GuideConfig)  # thresholds and times of the guide
@@ -144,8 +145,9 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
     there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
     if (there.width, there.height, there.levels) != (*config.size, config.levels):
         raise ValueError(
-            f"{file} describes images of {there.width} x {there.height} with levels {there.levels}, but the options "
-            f"are {config.size[0]} x {config.size[1]} with levels {config.levels}: choose another --workdir"
+            f"{file} is for images of {there.width} x {there.height} pixels and LED levels of {there.levels}, but the "
+            f"options are --size {config.size[0]} {config.size[1]} and levels of {config.levels}: choose another "
+            "--workdir"
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)

@@ -58,7 +58,7 @@ class Site(abc.ABC):
             self._server = http.server.ThreadingHTTPServer((host, port), Handler)
         except (OSError, OverflowError) as error:
             raise OSError(
-                f"the page cannot be served at {host}:{port} ({error}): give another --host or --port, or --headless."
+                f"the page cannot be served at {host}:{port} ({error}): give another --host or --port, or --headless"
             ) from error
         self._server.daemon_threads = True
         self.host, self.port = host, self._server.server_port

@@ -30,8 +30,8 @@ class Train:
     config: Annotated[Config, tyro.conf.arg(name="")]
     workdir: Folder = Path("runs/real")  # work directory with the folder `dataset` and the sensor file `sensor.json`
     name: str = "table2"  # folder in the work directory for the results
-    preset: Literal["smoke", "default", "paper"] = "default"  # configuration from which the options start
-    only: stages.Stage | None = None  # run only this stage
+    preset: Literal["smoke", "default", "paper"] = "default"  # set of default values for the options
+    only: stages.Stage | None = None  # run only this stage of the experiment
     plan: bool = False  # measure each stage for a short time, print its expected duration, and stop
     debug: bool = False  # show the traceback of every error
 
@@ -49,7 +49,7 @@ def learn(args: Train) -> None:
     """
     recorded.check(args.config)
     if args.name != Path(args.name).name or args.name in ("", "dataset"):
-        raise ValueError(f"name must be a folder name without a path and not 'dataset', got {args.name!r}")
+        raise ValueError(f"--name must be the name of a folder, not a path and not 'dataset', got {args.name!r}")
     sts.enable_compilation_cache()
     folder = args.workdir / args.name
     if args.plan or (args.preset == "paper" and not (folder / "metrics.json").exists()):

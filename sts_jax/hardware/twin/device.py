@@ -25,7 +25,7 @@ _TICK_S = 0.005  # period with which the watchdog is checked on the virtual cloc
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The state of a twin at one time."""
+    """The state of a `Twin` at one time: its scene, its lights and its camera."""
 
     now_s: float  # time on the twin's clock (s)
     phase: str  # phase of the scene: empty, held, moving or still
@@ -39,7 +39,7 @@ class State:
 
 
 class Made(NamedTuple):
-    """One frame that the camera has produced."""
+    """One frame of the twin's camera: its ground truth and its JPEG image."""
 
     exposure: Exposure  # ground truth of the frame
     jpeg: bytes  # image of the frame, as a client receives it
@@ -53,10 +53,11 @@ class Twin:
     a camera stream.
 
     ```python
+    body = sts_jax.objects.make(jax.random.key(0), "bottle")
     with Twin(ObjectScene(body)) as twin:
-        twin.command("hold")
-        twin.set((255, 255, 255, 255))
-        truth, image = twin.capture()
+        twin.command("hold")  # place the bottle on the pad
+        twin.set((255, 255, 255, 255))  # turn all lights on
+        truth, image = twin.capture()  # ground truth and image of the next frame
     ```
     """
 
@@ -112,7 +113,7 @@ class Twin:
                 f"at most {1 / rate:.4f} s: lower rate or exposure_s"
             )
         if release_every is not None and not 0 < release_every < math.inf:
-            raise ValueError(f"release_every must be positive and finite, got {release_every}")
+            raise ValueError(f"release_every must be None or a positive and finite time (s), got {release_every}")
         self.scene = scene
         self.rate = rate
         self.blender = photometry.Blender(self.imperfections, exposure=scene.exposure, warp=warp, seed=seed)
@@ -134,7 +135,7 @@ class Twin:
 
     @property
     def serial_number(self) -> str:
-        """Serial number of the LED controller: `TWIN` followed by the seed."""
+        """Serial number of the LED controller: `TWIN` followed by the seed of the twin, such as `TWIN0`."""
         return self._serial_number
 
     @property
@@ -156,7 +157,7 @@ class Twin:
             )
 
     def run_on(self, clock: Callable[[], float]) -> None:
-        """Replace the virtual clock by another one, and boot the controller again.
+        """Replace the virtual clock by another one, and reset the LED controller, the lights and the camera.
 
         Args:
             clock: Function that returns the time of the new clock (s), such as `time.monotonic`.
@@ -176,7 +177,7 @@ class Twin:
         """Move the object in the scene.
 
         On the real clock, this method first renders the images that the command needs, which may take seconds. On the
-        virtual clock, `capture` renders a pose when a frame shows it for the first time.
+        virtual clock, `capture` renders each pose when it is needed for the first time.
 
         Args:
             command: `hold` holds the object on the pad in the first pose of the next trajectory, `release` lets it go,
@@ -186,7 +187,8 @@ class Twin:
             The state after the command.
 
         Raises:
-            ValueError: The command is unknown or not possible in the present phase, or no simulated trajectory settles.
+            ValueError: The command is unknown, the scene cannot change, `release` comes without a held object, or the
+                object comes to rest in no simulated trajectory.
         """
         with self._commands:
             if self._clock is not None:
@@ -196,10 +198,10 @@ class Twin:
         return self.state
 
     def operate(self) -> None:
-        """Hold or release the object if this is due.
+        """Hold or release the object if its next random time has come.
 
-        `step` and `Served` call this method regularly. It acts at random times if `release_every` was given, and does
-        nothing otherwise.
+        `step` and `Served` call this method regularly. It does nothing unless the argument `release_every` of `Twin`
+        was given: the mean time for which an object is held plus the mean time for which it then rests (s).
         """
         if self._release_every is None:
             return
@@ -211,7 +213,7 @@ class Twin:
             self.command("release" if phase == Phase.HELD else "hold")
 
     def receive(self, data: bytes) -> bytes:
-        """Pass bytes of the host to the LED controller, and return the bytes that the controller sends."""
+        """Pass bytes from the host to the LED controller, and return the bytes that the controller sends back."""
         with self._lock:
             now = self.now_s
             sent = self._controller.receive(data, now)
@@ -219,17 +221,21 @@ class Twin:
         return sent
 
     def tick(self) -> bytes:
-        """Let the controller's watchdog check the time, and return the bytes that the controller sends."""
+        """Run the LED controller's watchdog, and return the bytes that the controller sends.
+
+        The watchdog turns the lights off if no request has arrived within its period, 1 s by default.
+        """
         return self.receive(b"")
 
     def inject(self, fault: faults.Fault) -> None:
         """Simulate a fault of the camera or a restart of the LED controller.
 
         Args:
-            fault: Fault of one of the kinds `stall`, `repeat`, `black`, `resize` and `reboot`.
+            fault: Fault of the kind `stall`, `repeat`, `black`, `resize` or `reboot`. `Fault` describes the kinds.
 
         Raises:
-            ValueError: The fault concerns a connection. Only a served twin has connections, see `Served.inject`.
+            ValueError: The fault is of another kind, which concerns a connection. Only a served twin has connections,
+                so use `Served.inject`.
         """
         if fault.kind == "reboot":
             with self._lock:
@@ -250,33 +256,34 @@ class Twin:
             )
 
     def end_s(self, index: int) -> float:
-        """The time at which the exposure of frame `index` ends (s)."""
+        """The time on the twin's clock at which the exposure of frame `index`, counted from 0, ends (s)."""
         return self._epoch_s + self.imperfections.exposure_s + index / self.rate
 
     def next_index(self, after: int, now_s: float) -> int:
-        """The number of the next frame whose delivery is still possible.
+        """Return the number of the first frame that is delivered at a given time or later.
+
+        Frames up to the number `after` are skipped. The random part of the delay (`Imperfections.jitter_s`) is ignored.
 
         Args:
-            after: Number of an earlier frame.
-            now_s: Time before which the frame must not be delivered (s).
+            after: Number of the last frame to skip, or -1.
+            now_s: Earliest time of delivery on the twin's clock (s).
 
         Returns:
-            The smallest number that is greater than `after` and whose frame, without jitter, is delivered at `now_s` or
-            later.
+            A number greater than `after`.
         """
         elapsed = now_s - self.imperfections.lag_s - self.end_s(0)
         return max(after + 1, math.ceil(elapsed * self.rate - 1e-6))
 
     def make(self, index: int) -> Made | None:
-        """Produce a frame whose exposure has ended, and write it to the log.
+        """Produce a frame, and write it to the files `log` and `record` of the twin.
 
-        Only one thread may call this method.
+        Call this method when the exposure of the frame has ended (`end_s`), and always from the same thread.
 
         Args:
-            index: Number of the frame. It must be greater than in the call before.
+            index: Number of the frame, from 0. It must increase from call to call.
 
         Returns:
-            The frame, or None while the fault `stall` lasts.
+            The frame, or None while the fault `stall` stops the camera.
         """
         constants = self.imperfections
         end = self.end_s(index)
@@ -320,7 +327,10 @@ class Twin:
         return made
 
     def step(self, seconds: float) -> None:
-        """Advance the virtual clock. The watchdog and `release_every` act whenever they are due.
+        """Advance the virtual clock.
+
+        Meanwhile, the LED controller turns the lights off if no request arrives for 1 s. If the argument
+        `release_every` of `Twin` was given, the object is held and released at random times.
 
         Args:
             seconds: Time by which the clock advances, >= 0 (s).
@@ -331,8 +341,8 @@ class Twin:
         """
         if self._clock is not None:
             raise RuntimeError(
-                "the twin is served on the real clock, which advances by itself: read it through hardware.STS, or make "
-                "a new Twin for step, capture, set and ping"
+                "step, capture, set and ping need a twin on its virtual clock, but this twin is served on the real "
+                "clock: read its images through hardware.STS, or make a new Twin"
             )
         if not 0 <= seconds < math.inf:
             raise ValueError(f"seconds must be >= 0 and finite, got {seconds}")
@@ -343,7 +353,7 @@ class Twin:
             self.operate()
 
     def capture(self) -> tuple[Exposure, np.ndarray]:
-        """Advance the virtual clock until the next frame is delivered.
+        """Advance the virtual clock until the next frame is delivered, and return this frame.
 
         Returns:
             The ground truth of the frame, and its image as uint8 RGB of shape (height, width, 3), decoded from its
@@ -360,13 +370,13 @@ class Twin:
                 return made.exposure, photometry.decode(made.jpeg)
 
     def set(self, levels: Sequence[int]) -> Lit:
-        """Set the lights, and advance the virtual clock by the duration of the request (`ANSWER_S`).
+        """Set the lights, and advance the virtual clock by 4 ms (`ANSWER_S`), the duration of a request.
 
         Args:
             levels: Duty cycles of the four LED channels, 0 (off) to 255 (always on).
 
         Returns:
-            The controller's answer, as `hardware.Leds.set` returns it.
+            The controller's answer with the applied levels, as from `hardware.Leds.set`.
 
         Raises:
             ValueError: There are not four levels, or one is out of range.
@@ -376,12 +386,12 @@ class Twin:
         return self._request(protocol.Set(self._next_sequence(), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
-        """Ask the controller for the current levels, and advance the virtual clock by `ANSWER_S`.
+        """Ask the LED controller for its current levels, and advance the virtual clock by 4 ms (`ANSWER_S`).
 
-        A request also resets the watchdog, which turns the lights off after 1 s without one.
+        The controller turns the lights off after 1 s without a request. Regular calls of this method keep them on.
 
         Returns:
-            The controller's answer, as `hardware.Leds.ping` returns it.
+            The controller's answer with the current levels, as from `hardware.Leds.ping`.
 
         Raises:
             RuntimeError: The twin runs on the real clock.
@@ -389,7 +399,7 @@ class Twin:
         return self._request(protocol.Ping(self._next_sequence()))
 
     def close(self) -> None:
-        """Stop the scene's rendering thread and close the log. Closing twice is allowed."""
+        """Stop the scene's rendering thread, and close the files of the log. Closing twice is allowed."""
         self.scene.close()
         self._log.close()
 
@@ -427,4 +437,4 @@ class Twin:
         for reply in map(protocol.decode_reply, lines):
             if isinstance(reply, protocol.State):
                 return Lit(reply.levels, reply.counter, reply.boot, sent_s, self.now_s)
-        raise AssertionError(f"the emulated controller answered {lines!r}")
+        raise AssertionError(f"the emulated LED controller must answer a request with its state, got {lines!r}")

@@ -11,7 +11,9 @@ KINDS = (*DEVICE_KINDS, *LINE_KINDS, "drop")
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """One simulated fault.
+    """One simulated fault of the camera, the LED controller or a connection.
+
+    The effect depends on the field `kind`. `count` and `seconds` in the table are the other two fields.
 
     | kind | effect |
     |---|---|
@@ -21,12 +23,12 @@ class Fault:
     | `resize` | `count` frames have half the width and height |
     | `deaf` | `count` requests do not reach the LED controller |
     | `lost` | `count` answers of the LED controller are lost |
-    | `late` | `count` answers come `seconds` later |
-    | `doubled` | `count` answers come twice |
-    | `garbled` | a bit of each of `count` answers is flipped |
+    | `late` | `count` answers of the LED controller are sent `seconds` later |
+    | `doubled` | `count` answers of the LED controller are sent twice |
+    | `garbled` | one bit is flipped in each of `count` answers of the LED controller |
     | `drop` | all connections to the camera are closed |
     | `vanish` | the serial port vanishes and returns after `seconds` |
-    | `reboot` | the LED controller restarts: its lights are off, and its boot number increases |
+    | `reboot` | the LED controller restarts: the lights go off, and its count of boots increases |
     """
 
     kind: str  # one of the kinds in the table
@@ -54,14 +56,14 @@ class Queue:
         self._waiting: list[Fault] = []
 
     def add(self, fault: Fault) -> None:
-        """Append a fault as often as its `count` states."""
+        """Append a fault `fault.count` times."""
         self._waiting += [fault] * fault.count
 
     def take(self, *kinds: str) -> Fault | None:
-        """Remove and return the first fault of one of these kinds, or of any kind if none is given.
+        """Remove and return the oldest fault of one of the given kinds, or of any kind if no kind is given.
 
         Returns:
-            The fault, or None if no such fault waits.
+            The fault, or None if the queue contains no such fault.
         """
         for i, fault in enumerate(self._waiting):
             if not kinds or fault.kind in kinds:
@@ -70,6 +72,6 @@ class Queue:
 
 
 def garble(line: bytes) -> bytes:
-    """A line of the protocol with one flipped bit. Its checksum is therefore wrong."""
+    """Return a line of the LED protocol with one bit flipped, so that its checksum is wrong."""
     middle = len(line) // 2
     return line[:middle] + bytes([line[middle] ^ 1]) + line[middle + 1 :]

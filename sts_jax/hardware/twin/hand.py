@@ -11,14 +11,15 @@ _UNMOVED_S = 3.0  # time without motion after a release after which the object c
 
 
 class Hand(AutomaticPerson):
-    """Moves the twin's object as `hardware.collect` instructs, and confirms every trajectory.
+    """A program that takes the place of the person in `hardware.collect`, and moves the object of a twin.
 
-    `hardware.collect` guides a person by means of a `View`, and the hand decides by these views alone. If an object
-    stays where it was after its release, the hand confirms the release, as a person would. If a held pose causes no
-    visible contact, the hand skips the pose and its trajectory number in the session.
+    `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
+    confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person
+    would. If `hardware.collect` detects no contact while a pose is held, the hand continues with the next pose, and the
+    session leaves out the number of this trajectory.
 
-    Trajectory n of the session is therefore trajectory n of the scene, provided that the scene starts with the
-    session's next number (`ObjectScene(first=hardware.next_recording(folder))`).
+    Trajectory n of the session is therefore trajectory n of the scene, if the scene starts with the session's next
+    number (`ObjectScene(first=hardware.next_recording(folder))`).
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
@@ -44,13 +45,14 @@ class Hand(AutomaticPerson):
         self._unseen = 0  # held poses in a row without a visible contact
 
     def show(self, view: View) -> None:
-        """Send the twin the command that the instruction in a view requires.
+        """Receive a view from `hardware.collect`, and send the command that its instruction requires to the twin.
 
         Args:
-            view: Newest images and instruction of `hardware.collect`.
+            view: Newest images and instruction.
 
         Raises:
-            ValueError: One stage lasts longer than `patience_s`, or ten held poses in a row cause no visible contact.
+            ValueError: The instruction stays the same for longer than the argument `patience_s` of `Hand`, or no
+                contact is detected in ten held poses in a row.
         """
         super().show(view)
         entered, self._seen = view.stage is not self._seen, view.stage
@@ -70,13 +72,18 @@ class Hand(AutomaticPerson):
                 self._held_s, self._unseen = None, 0
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
-                f"the guide still shows the instruction `{view.instruction}` after {self._now_s - self._since_s:.1f} s "
-                f"(contact: {view.contact}, still: {view.still}), so its thresholds do not suit the twin's images: "
-                "change the GuideConfig that hardware.collect receives"
+                f"hardware.collect still shows the instruction `{view.instruction}` after "
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): its thresholds "
+                "do not suit the twin's images, so change the argument config (a GuideConfig)"
             )
 
     def action(self) -> Action | None:
-        """Confirm each reviewed trajectory, and each release after which nothing moves. None: no action now."""
+        """Return the next action of the person, which `hardware.collect` asks for.
+
+        Returns:
+            `Action.CONFIRM` if a trajectory waits for its review, or if the object has not moved in the 3 s after its
+            release. Otherwise None.
+        """
         if self._seen is Stage.RELEASE and self._now_s - self._since_s > _UNMOVED_S:
             return Action.CONFIRM
         return super().action()

@@ -32,9 +32,9 @@ class LightHistory:
 
         s(t) = a + (s0 - a) exp(-(t - t0) / tau)
 
-    The share is s0 at t0. Its new value a is the mean of the four levels divided by 255, and tau is `rise_s`. LEDs are
-    dimmed by pulses at 31 kHz. These pulses are far shorter than an exposure, so only their mean matters. The object
-    is not thread-safe.
+    The share is s0 at t0. Its new value a is the mean of the four levels divided by 255, and tau is the argument
+    `rise_s`. LEDs are dimmed by pulses at 31 kHz. These pulses are far shorter than an exposure, so only their mean
+    matters. A `LightHistory` is not thread-safe.
     """
 
     def __init__(self, rise_s: float = 0.0):
@@ -52,33 +52,37 @@ class LightHistory:
         self._changes = [_Change(-math.inf, 0.0, 0.0)]
 
     def set(self, time_s: float, levels: protocol.Levels) -> None:
-        """Record a change of the levels. Levels of unchanged mean are ignored.
+        """Record a change of the LED levels. A change that keeps the mean of the four levels has no effect.
 
         Args:
             time_s: Time of the change (s), not earlier than that of the last change.
-            levels: Duty cycles of the four channels, 0 to 255.
+            levels: Duty cycles of the four LED channels, 0 (off) to 255 (always on).
 
         Raises:
-            ValueError: `time_s` is earlier than the last change.
+            ValueError: `time_s` is earlier than the time of the last change.
         """
         last, target = self._changes[-1], sum(levels) / (255 * len(levels))
         if time_s < last.time_s:
-            raise ValueError(f"time_s must be at least that of the last change, {last.time_s}, got {time_s}")
+            raise ValueError(f"time_s must be at least that of the last change, {last.time_s} s, got {time_s} s")
         if target != last.target:
             self._changes.append(_Change(time_s, self._share(last, time_s), target))
 
     def over(self, start_s: float, end_s: float) -> Light:
-        """The brightness between two times. The mean is an exact integral.
+        """The brightness of the LEDs between two times.
 
         Args:
             start_s: Begin of the interval (s).
             end_s: End of the interval (s), later than `start_s`.
 
+        Returns:
+            The mean, smallest and largest brightness. The mean is the exact integral over the interval divided by its
+            length.
+
         Raises:
             ValueError: `start_s` is not less than `end_s`.
         """
         if not start_s < end_s:
-            raise ValueError(f"start_s must be less than end_s, got {start_s} and {end_s}")
+            raise ValueError(f"start_s must be less than end_s, got start_s = {start_s} and end_s = {end_s}")
         first = bisect.bisect_right(self._changes, start_s, key=lambda change: change.time_s) - 1
         integral, shares = 0.0, []
         for i in range(first, len(self._changes)):

@@ -13,8 +13,9 @@ from typing import Any, BinaryIO, TextIO
 class Exposure:
     """The ground truth of one frame.
 
-    All times are on the twin's clock. If the twin is served, this clock is `time.monotonic`. A repeated frame (fault
-    `repeat`) has an index and a time of delivery of its own, and all other fields of the frame that it repeats.
+    All times are on the twin's clock. If the twin is served, this clock is `time.monotonic`. If the fault
+    `repeat` delivers an earlier frame again, `index`, `due_s` and `fault` belong to the new delivery. All other fields
+    are those of the earlier frame.
     """
 
     index: int  # number of the frame, from 0
@@ -32,7 +33,7 @@ class Exposure:
 
 
 class Log:
-    """Writes the ground truth of each frame as a JSON line, and the frames themselves into a motion JPEG file."""
+    """Writes two files: the ground truth of each frame as a line of JSON, and all frames as motion JPEG."""
 
     def __init__(self, path: str | os.PathLike | None, record: str | os.PathLike | None):
         """Create the files.
@@ -55,7 +56,7 @@ class Log:
             self._files = files.pop_all()  # keeps the files open after this block, because both could be opened
 
     def write(self, exposure: Exposure, jpeg: bytes) -> None:
-        """Write one frame to both files without buffering."""
+        """Write the ground truth and the JPEG image of a frame. Other programs can read them immediately."""
         with self._lock:
             if self._jpegs is not None:
                 self._jpegs.write(jpeg)
@@ -70,12 +71,13 @@ class Log:
 
 
 def read_log(path: str | os.PathLike) -> list[Exposure]:
-    """Read the frames of a log in the order in which they were written.
-
-    The log may still grow. An incomplete last line is ignored.
+    """Read the log of a twin. The twin may still be writing it: an incomplete last line is ignored.
 
     Args:
-        path: Path that `Twin` received as `log`.
+        path: Path that `Twin` received as its argument `log`.
+
+    Returns:
+        The ground truth of the frames, in the order in which they were written.
 
     Raises:
         OSError: The file cannot be read.

@@ -16,7 +16,7 @@ _STRIP = 1 << 18  # number of values that are processed at once, so that they st
 
 @dataclasses.dataclass(frozen=True)
 class Imperfections:
-    """Deviations of the twin's camera and lights from ideal ones. All defaults are our choice."""
+    """Deviations of the twin's camera and lights from ideal ones. The defaults are our choice, not measured."""
 
     exposure_s: float = 0.012  # time during which the camera integrates the light of one frame (s)
     # time from the end of the exposure to the delivery of the frame (s). We assume 0.015 to 0.12 s for real cameras
@@ -53,9 +53,10 @@ class Imperfections:
 
 
 class Ends(NamedTuple):
-    """The two images of a scene between which the light blends: LEDs off, and LEDs at full power.
+    """Two images of a scene: with the LEDs off, and with the LEDs at full power.
 
-    Both are in linear light, uint16 of shape (height, width, 3), where 65535 is full scale.
+    `Blender.blend` mixes them to an image at any brightness of the LEDs. Both are in linear light, uint16 of shape
+    (height, width, 3), where 65535 is full scale.
     """
 
     visual: np.ndarray  # image with the LEDs off
@@ -63,7 +64,7 @@ class Ends(NamedTuple):
 
 
 class Warp(NamedTuple):
-    """The mapping from a rendered image to the raw image of a camera with lens distortion. See `lens_warp`."""
+    """The mapping from a rendered image to the raw image of a camera with lens distortion, made by `lens_warp`."""
 
     maps: tuple[np.ndarray, np.ndarray]  # maps for `cv2.remap`, with n x n samples per raw pixel, which are averaged
     size: tuple[int, int]  # (height, width) of the raw image (pixels)
@@ -75,17 +76,17 @@ class Warp(NamedTuple):
             image: Rendered image in linear light, shape (height, width, 3).
 
         Returns:
-            Raw image of the same type. Pixels that look beyond the edge of `image` are 0.
+            Raw image of shape (*size, 3) and the data type of `image`. Pixels whose view is outside `image` are 0.
         """
         sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)
 
 
 class Blender:
-    """Makes camera frames from the images of a scene without and with light.
+    """Makes camera frames from two images of a scene, with the LEDs off and with the LEDs at full power.
 
-    Call `ends` once for each pose, because it takes as long as a few frames. Call `frame` for each frame, from one
-    thread at a time.
+    First, call `ends` with both images. This takes as long as making a few frames, so do it only once for each pose of
+    the object. Then call `frame` for each frame. Only one thread at a time may call `frame`.
     """
 
     def __init__(self, imperfections: Imperfections, *, exposure: float = 1.0, warp: Warp | None = None, seed: int = 0):
@@ -125,15 +126,19 @@ class Blender:
             visual: Image with the LEDs off (`Frame.visual`), sRGB in [0, 1], shape (height, width, 3).
             tactile: Image with the LEDs at full power (`Frame.tactile`), of the same form.
 
+        Returns:
+            Both images, for `blend` and `frame`.
+
         Raises:
-            ValueError: An image has another shape.
+            ValueError: The shape of an image is not (height, width, 3).
         """
         return Ends(self._end(visual), self._end(tactile))
 
     def blend(self, ends: Ends, light: float) -> np.ndarray:
         """Make a frame without noise.
 
-        Without leakage, vignetting and lens distortion, the frame equals the image of `sts_jax.expose` up to rounding.
+        If `Imperfections.leakage` and `Imperfections.vignetting` are 0 and there is no lens distortion, the frame
+        equals the image of `sts_jax.expose` up to rounding.
 
         Args:
             ends: Images of the scene, as `Blender.ends` returns them.
@@ -148,7 +153,7 @@ class Blender:
         return self._to_srgb[self._mixed(ends, light)]
 
     def frame(self, ends: Ends, light: float) -> np.ndarray:
-        """Make a frame with noise.
+        """Make a frame with the read noise and the shot noise of `Imperfections`.
 
         Args:
             ends: Images of the scene, as `Blender.ends` returns them.
@@ -202,7 +207,7 @@ class Blender:
 
 
 def encode(image: np.ndarray, quality: int) -> bytes:
-    """Encode an image as JPEG.
+    """Encode an image as JPEG, and return the bytes of the file.
 
     Args:
         image: Image, uint8 RGB of shape (height, width, 3).
@@ -213,7 +218,10 @@ def encode(image: np.ndarray, quality: int) -> bytes:
     """
     done, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ValueError(f"OpenCV cannot encode an image of shape {image.shape} and type {image.dtype}")
+        raise ValueError(
+            "image must be uint8 of shape (height, width, 3), so that OpenCV can encode it as JPEG, got "
+            f"{image.dtype} of shape {image.shape}"
+        )
     return data.tobytes()
 
 

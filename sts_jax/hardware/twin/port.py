@@ -17,10 +17,10 @@ _SPEED = termios.B115200  # baud rate of the protocol
 
 
 class LedPort:
-    """A pseudo-terminal that answers requests of the LED protocol, in a thread of its own.
+    """The serial port of the twin's LED controller: a pseudo-terminal that answers requests in its own thread.
 
-    As on a real serial line, a host that opens the port at another baud rate than 115200 receives unreadable bytes, and
-    its requests are not executed.
+    The host must open the port at 115200 baud. At another rate it receives unreadable bytes, and its requests are not
+    executed, as on a real serial line.
     """
 
     def __init__(self, twin: Twin, link: str | os.PathLike | None = None):
@@ -53,7 +53,7 @@ class LedPort:
         return self._name if self._link is None else str(self._link)
 
     def inject(self, fault: faults.Fault) -> None:
-        """Simulate a fault of the kind `deaf`, `lost`, `late`, `doubled`, `garbled` or `vanish`."""
+        """Simulate a fault of the kind `deaf`, `lost`, `late`, `doubled`, `garbled` or `vanish` (see `Fault`)."""
         with self._lock:
             if fault.kind == "vanish":
                 self._absent_s = fault.seconds
@@ -61,7 +61,7 @@ class LedPort:
                 self._queue.add(fault)
 
     def close(self) -> None:
-        """End the thread, close the pseudo-terminal and remove the link."""
+        """End the thread, close the pseudo-terminal, and remove the symbolic link if there is one."""
         self._stop.set()
         self._thread.join()
         self._close()
@@ -69,7 +69,7 @@ class LedPort:
     def _open(self) -> None:
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
             raise FileExistsError(
-                f"link is {self._link}, which exists and is not a symbolic link: choose another name for the port"
+                f"link is {self._link}, but this file exists and is not a symbolic link: choose another path"
             )
         # The slave stays open in this process, because reading the master fails while nobody has opened the slave.
         self._master, self._slave = os.openpty()

@@ -28,7 +28,7 @@ _NOWHERE = np.array([0, 0, -1, 1, 0, 0, 0], np.float32)  # pose of an object tha
 
 
 class Phase(enum.StrEnum):
-    """Phase of the scene."""
+    """The phase of a scene: no object is there, or the object is held, moves, or lies still."""
 
     EMPTY = "empty"  # no object is on the pad
     HELD = "held"  # a hand, which is not rendered, holds the object on the pad in an unstable pose
@@ -37,7 +37,7 @@ class Phase(enum.StrEnum):
 
 
 class Seen(NamedTuple):
-    """The state of the scene at one time."""
+    """The state of a scene at one time: its phase, and the pose of the object."""
 
     phase: Phase  # phase of the scene
     trajectory: int  # number of the current trajectory, from 0. In an empty scene, number of the last one, or -1
@@ -48,7 +48,9 @@ class Seen(NamedTuple):
 class Scene(abc.ABC):
     """Base class of the scenes in front of the twin's camera.
 
-    `Twin` never calls `at` and `command` at the same time.
+    A subclass defines `at`, which returns the state of the scene at a time, and `ends`, which returns the images of a
+    state. A scene that can change also defines `command`. The other methods are optional. `Twin` never calls `at` and
+    `command` at the same time.
     """
 
     exposure: float = 1.0  # exposure of the visual stream divided by that of the tactile stream (`Room.exposure`)
@@ -58,39 +60,44 @@ class Scene(abc.ABC):
         """Return the state of the scene at a time.
 
         Args:
-            time_s: Time on the twin's clock (s). It may lie before the last commands, but only a few of them.
+            time_s: Time on the twin's clock (s). It may be earlier than the last few commands, because a frame is made
+                after its exposure.
         """
 
     @abc.abstractmethod
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the images of a state of the scene without light and at full light.
+        """Return two images of the scene in a state: with the LEDs off, and with the LEDs at full power.
 
-        The images are rendered now unless `prepare` has done so before.
+        The images are rendered now unless `prepare` has rendered them before.
 
         Args:
             seen: State of the scene, as `at` returns it.
-            blender: Camera that converts the rendered images.
+            blender: Blender of the twin. `Blender.ends` converts the rendered images.
+
+        Returns:
+            The converted images.
         """
 
     def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Render the images that a command needs, so that later calls of `ends` return at once.
+        """Render the images that a command will need, so that later calls of `ends` return at once.
 
         This method may be called from any thread.
 
         Args:
-            command: `hold`, `release` or `clear`.
-            blender: Camera that converts the rendered images.
+            command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
+            blender: Blender of the twin, which converts the rendered images.
         """
 
     def command(self, command: str, time_s: float) -> None:
-        """Change the scene.
+        """Change the scene. The base class refuses every command.
 
         Args:
-            command: `hold`, `release` or `clear`.
+            command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
             time_s: Time on the twin's clock from which the change applies (s). It must not decrease between calls.
 
         Raises:
-            ValueError: The command is unknown or not possible in the current phase, or `time_s` has decreased.
+            ValueError: The command is unknown or not possible in the current phase of the scene, or `time_s` is earlier
+                than in the previous call.
         """
         raise ValueError(
             f"command is {command!r}, but a {type(self).__name__} does not change: use a scene with an object, such as "
@@ -98,10 +105,12 @@ class Scene(abc.ABC):
         )
 
     def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Start a thread that renders images before they are needed. A twin on its virtual clock does not need it.
+        """Start a thread that renders images before they are needed.
+
+        `Served` calls this method. A twin on its virtual clock does not need the thread.
 
         Args:
-            blender: Camera that converts the rendered images.
+            blender: Blender of the twin, which converts the rendered images.
         """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
@@ -163,13 +172,13 @@ class _Motion(NamedTuple):
 
 
 class ObjectScene(Scene):
-    """A scene with an object that is held on the pad and released, once in each trajectory of a scenario.
+    """A scene with one object, which is held on the pad and released as often as commands require.
 
-    The scene is empty at first. The command `hold` places the object in the first pose of the next trajectory,
-    `release` lets it go, and `clear` takes it away. After the release, the scene shows `motion_rate` poses of the
-    trajectory per second until the object is at rest, and the last pose from then on.
+    The pad is empty at first. The command `hold` places the object in the first pose of the next simulated trajectory,
+    `release` lets it go, and `clear` takes it away. After the release, the object follows the trajectory. The scene
+    shows `motion_rate` poses per second until the object is at rest, and the last pose from then on.
 
-    A simulated trajectory in which the object has not come to rest at the end is skipped.
+    Simulated trajectories that end before the object has come to rest are skipped.
     """
 
     def __init__(
@@ -226,10 +235,10 @@ class ObjectScene(Scene):
         return self._scenario
 
     def outcome(self, trajectory: int) -> str:
-        """The outcome of a trajectory in words, such as "topples" (`Scenario.named`).
+        """The outcome of a trajectory in words, such as "topples", as `Scenario.named` returns it.
 
         Args:
-            trajectory: Number of the trajectory, from 0. It is simulated now if this has not happened yet.
+            trajectory: Number of the trajectory, from 0. A trajectory that was not simulated before is simulated now.
 
         Raises:
             ValueError: No trajectory of the scenario comes to rest.
@@ -253,13 +262,13 @@ class ObjectScene(Scene):
         return Seen(phase, number, frame, tuple(float(value) for value in motion.pose[frame]))
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the images of a state without light and at full light, see `Scene.ends`. Each is rendered once."""
+        """Return both images of a state (`Scene.ends`). The images of each pose are rendered only once."""
         if seen.phase is Phase.EMPTY:
             return self._render(-1, 0, blender)
         return self._render(seen.trajectory, seen.frame, blender)
 
     def prepare(self, command: str, blender: Blender) -> None:
-        """Render the images that a command needs, see `Scene.prepare`."""
+        """Render the images that the command `hold`, `release` or `clear` will need, see `Scene.prepare`."""
         number = self._events[-1][2]
         match command:
             case "hold":
@@ -271,10 +280,16 @@ class ObjectScene(Scene):
                 self._render(-1, 0, blender)
 
     def command(self, command: str, time_s: float) -> None:
-        """Hold, release or remove the object, see `Scene.command`.
+        """Hold, release or remove the object.
+
+        Args:
+            command: `hold` holds the object in the first pose of the next trajectory, `release` lets it go, and `clear`
+                takes it away.
+            time_s: Time on the twin's clock from which the change applies (s). It must not decrease between calls.
 
         Raises:
-            ValueError: The command is unknown, `release` comes without a held object, or `time_s` has decreased.
+            ValueError: The command is unknown, `release` comes without a held object, `time_s` is earlier than in the
+                previous call, or no trajectory of the scenario comes to rest.
         """
         last_s, _, number = self._events[-1]
         if time_s < last_s:
@@ -289,7 +304,7 @@ class ObjectScene(Scene):
                 self._events.append((time_s, Phase.EMPTY, number))
             case "release":
                 raise ValueError(
-                    f"command is 'release', but no object is held, because the phase is '{phase}'. Send hold first"
+                    f"command is 'release', but there is no held object in the phase '{phase}': send 'hold' first"
                 )
             case _:
                 raise ValueError(f"command must be 'hold', 'release' or 'clear', got {command!r}")
@@ -299,7 +314,7 @@ class ObjectScene(Scene):
         self._wake.set()
 
     def start(self, blender: Blender) -> None:
-        """Start a thread that renders the empty pad, the current trajectory and the next one (`Scene.start`)."""
+        """Start a thread that renders the empty pad, the current trajectory and the next one in advance."""
         if self._thread is None:
             self._stop.clear()
             self._wake.set()
@@ -307,7 +322,7 @@ class ObjectScene(Scene):
             self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread. If it is rendering an image, it completes this image first."""
+        """Stop the thread that `start` has started. If the thread is rendering an image, it completes this image."""
         self._stop.set()
         self._wake.set()
         if self._thread is not None:
@@ -338,8 +353,8 @@ class ObjectScene(Scene):
                 attempts = 0 if found else attempts + 1
                 if attempts == _ATTEMPTS:
                     raise ValueError(
-                        f"the object comes to rest in none of {_ATTEMPTS * _BATCH} trajectories, which have "
-                        f"scenario.frames = {self._scenario.frames} frames each: give the scenario more frames"
+                        f"the object comes to rest in none of {_ATTEMPTS * _BATCH} simulated trajectories of "
+                        f"{self._scenario.frames} frames each: give the scenario more frames (scenario.frames)"
                     )
                 self._motions += found
             return self._motions[number]

@@ -18,13 +18,14 @@ class Served:
     """A running server through which other processes use a twin as if it were a real sensor.
 
     ```python
+    body = sts_jax.objects.make(jax.random.key(0), "bottle")
     with Twin(ObjectScene(body)) as twin, Served(twin) as served:
-        print(served.description)
-        ...
+        print(served.description)  # the addresses for other processes
+        input("Press Enter to stop.")
     ```
 
     The server runs in threads of this process: one each for the serial port, the camera, the rendering, the random
-    releases of `release_every`, and each HTTP connection. `close` stops all of them.
+    holds and releases (argument `release_every` of `Twin`), and each HTTP connection. `close` stops all of them.
     """
 
     def __init__(
@@ -107,7 +108,7 @@ class Served:
         )
 
     def inject(self, fault: faults.Fault) -> None:
-        """Simulate a fault of the camera, the LED controller or a connection."""
+        """Simulate a fault of the camera, the LED controller or a connection. `Fault` describes all kinds."""
         if fault.kind in faults.DEVICE_KINDS:
             self._twin.inject(fault)
         elif fault.kind == "drop":
@@ -116,7 +117,10 @@ class Served:
             self._leds.inject(fault)
 
     def close(self) -> None:
-        """Stop all threads, close the serial port and all sockets, and remove the link. Closing twice is allowed."""
+        """Stop all threads, close the serial port and all sockets, and remove the symbolic link to the port.
+
+        Closing twice is allowed.
+        """
         if self._stop.is_set():
             return
         self._stop.set()

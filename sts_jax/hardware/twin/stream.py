@@ -24,7 +24,7 @@ _KEPT = 32  # largest number of frames that wait for their delivery
 
 
 class CameraThread:
-    """Produces frames at the camera's rate while a client is connected."""
+    """A thread that produces frames at the camera's rate while at least one client is connected."""
 
     def __init__(self, twin: Twin):
         """Start the thread."""
@@ -53,14 +53,14 @@ class CameraThread:
             self._clients -= 1
 
     def following(self, index: int) -> Made | None:
-        """The frame that a client gets next. Waits for at most 0.1 s.
+        """Return the frame that a client receives next. Waits at most 0.1 s for it.
 
         Args:
-            index: Number of the client's last frame.
+            index: Number of the frame that the client received last, or -1.
 
         Returns:
-            The newest frame that is due for delivery. If none is due, the next one that will be. None if no later frame
-            was produced in time.
+            The newest later frame whose time of delivery has come. If this time has come for none of the later frames,
+            the first of them. None if there is no later frame.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
@@ -102,7 +102,7 @@ class CameraThread:
 
 
 class WebServer(http.server.ThreadingHTTPServer):
-    """The HTTP server of the camera stream, the state and the commands."""
+    """The HTTP server of a twin. It sends the camera stream and the state, and receives commands and faults."""
 
     daemon_threads = False  # `server_close` waits for the threads of all connections
     allow_reuse_address = True
@@ -124,7 +124,7 @@ class WebServer(http.server.ThreadingHTTPServer):
         super().__init__(address, _Handler)
 
     def drop(self) -> None:
-        """Close all connections that receive frames."""
+        """Close all connections that receive the camera stream."""
         _shut_down(self.streams)
 
     def server_close(self) -> None:

@@ -22,18 +22,20 @@ _ATTEMPTS = 10  # images of one stream without a proof of their light after whic
 class VirtualSensor:
     """Reads pairs of visual and tactile images from a twin on its virtual clock.
 
-    It replaces `hardware.STS` in `hardware.collect`.
+    `hardware.collect` accepts it in place of `hardware.STS`.
 
     ```python
+    body = sts_jax.objects.make(jax.random.key(0), "bottle")
     with Twin(ObjectScene(body)) as twin:
         sensor = VirtualSensor(twin)
         pair = sensor.read()
     ```
 
-    Each image is proven to be exposed under one constant light, as with `STS`. The settling time runs from the
-    controller's acknowledgement of a switch of the lights until all arriving frames show only the new light. `read`
-    uses a frame if it arrives after the settling time and if the controller's next answer proves that the lights have
-    not changed since the switch. Earlier frames are never rendered. Faults of the camera are not detected.
+    Each image is exposed under one constant light, as with `STS`. To ensure this, `read` waits for the settling time
+    after each switch of the lights. This time begins when the LED controller confirms the switch, and it ends when all
+    arriving frames show only the new light. `read` then takes the next frame, and asks the controller if the lights
+    have changed since the switch. Frames that arrive during the settling time are not rendered. Faults of the camera
+    are not detected.
     """
 
     def __init__(
@@ -66,12 +68,12 @@ class VirtualSensor:
 
     @property
     def settling(self) -> Settling:
-        """The settling times for which `read` waits after a switch of the lights."""
+        """The times for which `read` waits after the lights were switched on or off."""
         return self._settling
 
     @property
     def levels(self) -> protocol.Levels:
-        """Duty cycles of the channels in the tactile stream, 0 to 255."""
+        """Duty cycles of the four LED channels in the tactile stream, 0 (off) to 255 (always on)."""
         return self._levels
 
     @property
@@ -80,13 +82,13 @@ class VirtualSensor:
         return Origin(CAMERA, self._twin.serial_number, *self._size, self._levels)
 
     def read(self) -> Pair:
-        """Take an image of each stream. Both arrive after the call.
+        """Take a visual and a tactile image. Both are frames that arrive after this method was called.
 
         Returns:
             The visual and the tactile image.
 
         Raises:
-            LightError: In ten attempts, the controller's answers never proved that the lights were constant.
+            LightError: The LED controller did not confirm in any of ten attempts that the lights stayed constant.
         """
         first = self._stream
         one = self._shot(first)
@@ -111,7 +113,7 @@ class VirtualSensor:
             self._lit = None
         raise LightError(
             f"the lights changed in each of {_ATTEMPTS} attempts to take a {stream} image: lower the settling time of "
-            f"{settled_s:g} s, because the controller turns its lights off after 1 s without a request"
+            f"{settled_s:g} s below 1 s, because the LED controller turns its lights off after 1 s without a request"
         )
 
     def _set(self, stream: Stream) -> Lit:
