@@ -28,9 +28,9 @@ def conv(
     Along each axis, the output is `y[i] = sum_a x[stride i + a - padding] kernel[a]`, summed over the input channels.
 
     Args:
-        x: Images. Their values outside the image count as 0.
+        x: Images, with zeros outside their borders.
         kernel: Weights. `size` must be a multiple of `stride`.
-        stride: Distance between neighbouring output pixels (input pixels).
+        stride: Distance between the places of two neighbouring output pixels in the input, in pixels.
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
 
     Returns:
@@ -47,14 +47,16 @@ def conv(
 def conv_transpose(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
-    """Apply the transpose of `conv` to images: each input pixel adds its multiple of the kernel to the output.
+    """Convolve images with the transpose of the linear map `conv`, which enlarges images if `stride` is above 1.
 
-    Along each axis, `y[stride i + a - padding] += x[i] kernel[a]`, summed over the input channels.
+    The kernel is multiplied by each input pixel, and the products are added to the output. Along each axis, this is
+    `y[stride i + a - padding] += x[i] kernel[a]`, summed over the input channels.
 
     Args:
         x: Images.
-        kernel: Weights. `size` must be a multiple of `stride`. The third axis has the channels of `x`, as in `conv`.
-        stride: Distance in the output between the contributions of neighbouring input pixels (output pixels).
+        kernel: Weights. `size` must be a multiple of `stride`. The third axis belongs to the channels of `x`, and the
+            fourth axis to the channels of the output.
+        stride: Distance between the places of two neighbouring input pixels in the output, in pixels.
         padding: Number of rows and columns that are cut from each side of the output.
 
     Returns:

@@ -30,7 +30,11 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 
 
 class Terms(NamedTuple):
-    """The loss of a batch and its parts. The parts are unweighted means over all samples and subsets that count."""
+    """The loss of a batch and its parts.
+
+    The parts are not weighted by `beta` and `Modality.weight`. Each part is a mean over the pairs of a sample and a
+    subset of the modalities. Pairs that do not count in the loss are left out, see the docstring of the module.
+    """
 
     loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch
     kl: Float[Array, ""]  # divergence from the prior (nats)
@@ -74,13 +78,18 @@ def loss(
     asked: Literal["all", "own"] = "all",
     absent: tuple[str, ...] = (),
 ) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
-    """Compute the loss of one batch in training mode, see the docstring of the module.
+    """Compute the loss of one batch in training mode: a negative evidence lower bound, see the docstring of the module.
 
-    Each modality is encoded once. Subsets that are equal after the `absent` modalities are removed are computed once
-    and weighted by their number. Naming a modality in `absent` therefore gives the same loss as masking it in every
-    sample, in less time. All subsets are decoded in one stacked call and share batch statistics, in which each subset
-    has the weight that it has in the loss. Subsets that have the same present modalities in a sample use the same noise
-    for `z`.
+    The loss is a sum over all non-empty subsets of the modalities. For each subset, the model predicts the targets from
+    the inputs of the modalities in the subset.
+
+    The `absent` modalities are removed from all subsets. If several subsets are then equal, the term of one subset is
+    computed and multiplied by the number of equal subsets. Naming a modality in `absent` gives the same loss as masking
+    it in every sample, in less time.
+
+    For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
+    mean and one variance for this call, in which every subset has the same weight as in the loss. If two subsets have
+    the same present modalities in a sample, they use the same noise for the latent `z`.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -91,14 +100,14 @@ def loss(
             absent.
         targets: Targets `x_T` of all modalities, `(batch, *shape)`. Images are in [0, 1].
         present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
-            a mask is present in all samples. Masked values have no influence and may be NaN.
-        target_present: Masks of the targets in the same form. A masked target adds 0 to the loss, which remains a mean
-            over the whole batch.
+            a mask is present in all samples. Values of samples whose mask is False have no influence and may be NaN.
+        target_present: Masks of the targets by modality, `(batch,)`. True means that the sample has the target. A
+            target whose mask is False adds 0 to the loss, which remains a mean over the whole batch.
         condition: Numbers that are appended to the latent of each sample, `(batch, condition)`. None if
             `config.condition` is 0.
-        beta: Weight of the divergence.
-        asked: Targets of a subset: `all` for all modalities, `own` for the members of the subset, as in the paper's
-            code.
+        beta: Weight of the divergence of the posterior from the prior.
+        asked: Modalities that are predicted for each subset. `all` predicts all modalities. `own` predicts only the
+            members of the subset, as in the paper's code.
         absent: Names of modalities that no sample has as an input.
 
     Returns:
@@ -151,7 +160,9 @@ def infer(
     *,
     present: dict[str, Bool[Array, "batch"]] | None = None,
 ) -> Gaussian:
-    """Compute the posterior `q(z | X)` of the latent from any subset X of the inputs, in evaluation mode.
+    """Compute the posterior `q(z | X)` of the latent z, given the inputs X of any subset of the modalities.
+
+    Batch normalisation uses the running statistics.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -161,7 +172,8 @@ def infer(
             a mask is present in all samples.
 
     Returns:
-        Mean and log variance of the posterior, `(batch, latent)`. For a sample without any input, it is the prior.
+        Mean and log variance of the posterior, `(batch, latent)`. For a sample without any input, the posterior is the
+        standard normal prior.
 
     Raises:
         ValueError: `inputs` is empty, or a name is not the name of a modality.
@@ -170,8 +182,9 @@ def infer(
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
         raise ValueError(
-            f"inputs has the names {list(inputs)} and present has the names {list(present or {})}, but the model has "
-            f"the modalities {list(model.config.names)}: give at least one input, and use only these names"
+            f"inputs has the names {list(inputs)} and present has the names {list(present or {})}, but both may only "
+            f"have names of the model's modalities {list(model.config.names)}: use these names, and give at least one "
+            "input"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
@@ -185,7 +198,7 @@ def decode(
     *,
     condition: Float[Array, "*batch condition"] | None = None,
 ) -> dict[str, Array]:
-    """Decode every modality from a latent, in evaluation mode.
+    """Predict every modality from a latent. Batch normalisation uses the running statistics.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -194,8 +207,8 @@ def decode(
         condition: Numbers that are appended to each latent, `(*batch, condition)`. None if `config.condition` is 0.
 
     Returns:
-        The predictions by modality, `(*batch, *shape)`. An image is given by logits, of which `jax.nn.sigmoid` returns
-        values in [0, 1].
+        The predictions by modality, `(*batch, *shape)`. Images are logits, which `jax.nn.sigmoid` converts to values
+        in [0, 1].
 
     Raises:
         ValueError: `condition` has another width than the model needs.
@@ -214,7 +227,9 @@ def predict(
     present: dict[str, Bool[Array, "batch"]] | None = None,
     condition: Float[Array, "batch condition"] | None = None,
 ) -> tuple[dict[str, Array], Gaussian]:
-    """Predict every modality from any subset of the inputs: decode the mean of the posterior.
+    """Predict every modality from the inputs of any subset of the modalities.
+
+    The predictions are decoded from the mean of the posterior. Batch normalisation uses the running statistics.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -241,17 +256,17 @@ def _check(
     if asked not in ("all", "own"):
         raise ValueError(f"asked is {asked!r}, but it must be 'all' or 'own'")
     if set(absent) - set(config.names):
-        raise ValueError(f"absent is {absent}, but the model has the modalities {config.names}: use only these names")
+        raise ValueError(f"absent is {absent}, but the model has only the modalities {config.names}: use these names")
     unknown = sorted(set(given) - set(config.names))
     if unknown:
         raise ValueError(
-            f"inputs, present or target_present has the names {unknown}, but the model has the modalities "
-            f"{config.names}: use only these names"
+            f"inputs, present or target_present has the names {unknown}, but the model has only the modalities "
+            f"{config.names}: use these names"
         )
     if set(targets) != set(config.names):
         raise ValueError(
-            f"targets has the names {sorted(targets)}, but the loss needs a target of every modality: "
-            f"{sorted(config.names)}"
+            f"targets has the names {sorted(targets)}, but the loss needs exactly one target for each modality "
+            f"{sorted(config.names)}: add or remove targets. If samples lack a target, mask it in target_present"
         )
 
 
@@ -299,7 +314,7 @@ def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
     if width != config.condition:
         raise ValueError(
             f"condition has width {width}, but the model needs width {config.condition}: give an array of this "
-            "width, or None for width 0"
+            "width, or None if the model needs width 0"
         )
     if condition is None:
         return z

@@ -7,18 +7,21 @@ from jaxtyping import Array, Bool, Float
 
 
 class Gaussian(NamedTuple):
-    """A Gaussian with independent components."""
+    """A Gaussian with independent components, given by their means and the logarithms of their variances."""
 
-    mean: Float[Array, "*batch latent"]
-    log_var: Float[Array, "*batch latent"]
+    mean: Float[Array, "*batch latent"]  # mean of each component
+    log_var: Float[Array, "*batch latent"]  # natural logarithm of the variance of each component
 
 
 def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"]) -> Gaussian:
-    """The normalised product of the standard normal prior and of every expert that is present.
+    """Combine the estimates of the latent from several modalities into one posterior.
 
-    For the set X of the present experts, `q(z | X) = N(z; 0, I) prod_{m in X} N(z; mean_m, var_m) / Z`, where Z
-    normalises the product. With the precisions `T_m = 1 / var_m`, its variance is `var = 1 / (1 + sum_m T_m)`, and its
-    mean is `var sum_m T_m mean_m`. Without any expert, the product is the prior.
+    An expert is the Gaussian `N(z; mean_m, var_m)` that the input of modality m gives for the latent z. The posterior
+    is the normalised product of the standard normal prior and of all experts that are present. For the set X of present
+    experts, `q(z | X) = N(z; 0, I) prod_{m in X} N(z; mean_m, var_m) / Z`, where Z normalises the product.
+
+    With the precisions `T_m = 1 / var_m`, the variance of the posterior is `var = 1 / (1 + sum_m T_m)`, and the mean is
+    `var sum_m T_m mean_m`. Without any expert, the posterior is the prior.
 
     Args:
         experts: Mean and log variance of each expert, `(modality, *batch, latent)`. Absent experts may have any finite
@@ -26,9 +29,9 @@ def product_of_experts(experts: Gaussian, present: Bool[Array, "modality *batch"
         present: True for each expert that is present, `(modality, *batch)`.
 
     Returns:
-        Mean and log variance of the product, `(*batch, latent)`.
+        Mean and log variance of the posterior, `(*batch, latent)`.
 
-    Source: the paper's equation for PoE, and Wu and Goodman 2018, section 2.2.
+    Source: the paper's equation for the product of experts (PoE), and Wu and Goodman 2018, section 2.2.
     """
     precision = jnp.where(present[..., None], jnp.exp(-experts.log_var), 0)
     total = 1 + jnp.sum(precision, axis=0)

@@ -37,42 +37,44 @@ _FIRST_LOG_VAR = -4.0  # log variance of an active latent at initialisation
 
 @dataclass(frozen=True)
 class Modality:
-    """One quantity that is measured and predicted.
+    """One quantity that a model measures and predicts: an image or a vector.
 
     Raises:
-        ValueError: `kind` and `shape` do not fit together, or `start` is not between 0 and 1.
+        ValueError: `shape` is not allowed for `kind`, or `start` is not between 0 and 1.
     """
 
     name: str
     kind: Literal["image", "vector"]
     shape: tuple[int, ...]  # (height, width, channel), with sides >= 32 that are multiples of 8, or (size,)
     weight: float = 1.0  # weight lambda of the reconstruction error (paper: 1 for images, 1000 for the pose)
-    start: float = 0.5  # grey value of the images of an untrained decoder. The background's value saves many steps
+    # For images: grey value, > 0 and < 1, of the predictions before training. The grey value of the background saves
+    # many training steps.
+    start: float = 0.5
 
     def __post_init__(self) -> None:
         if not 0 < self.start < 1:
-            raise ValueError(f"{self.name}: start is {self.start}, but it must be a grey value > 0 and < 1")
+            raise ValueError(f"modality {self.name!r}: start is {self.start}, but this grey value must be > 0 and < 1")
         if self.kind == "vector" and len(self.shape) == 1 and self.shape[0] > 0:
             return
         if self.kind == "image" and len(self.shape) == 3:
             if all(side >= 32 and side % 8 == 0 for side in self.shape[:2]):
                 return
             raise ValueError(
-                f"{self.name}: shape is {self.shape}, but the height and the width of an image must be multiples of 8 "
-                "and >= 32"
+                f"modality {self.name!r}: shape is {self.shape}, but the height and the width of an image must be "
+                "multiples of 8 and >= 32"
             )
         raise ValueError(
-            f"{self.name}: kind is {self.kind!r} and shape is {self.shape}, but it must be an 'image' of shape "
-            "(height, width, channel), or a 'vector' of shape (size,)"
+            f"modality {self.name!r}: kind is {self.kind!r} and shape is {self.shape}, but the modality must be an "
+            "'image' with the shape (height, width, channel), or a 'vector' with the shape (size,) and size >= 1"
         )
 
 
 @dataclass(frozen=True)
 class Config:
-    """Configuration of a model, in plain values that JSON can hold.
+    """Configuration of a multimodal variational autoencoder, in values that JSON can represent.
 
     Raises:
-        ValueError: There is no modality, two modalities have the same name, or `widths` has not four numbers.
+        ValueError: `modalities` is empty, two modalities have the same name, or `widths` does not have four numbers.
     """
 
     modalities: tuple[Modality, ...]
@@ -95,7 +97,7 @@ class Config:
         return tuple(m.name for m in self.modalities)
 
     def to_json(self) -> dict[str, Any]:
-        """The configuration in plain dictionaries and sequences."""
+        """The configuration as nested dictionaries and tuples, which `json.dumps` accepts."""
         return asdict(self)
 
     @classmethod
@@ -140,9 +142,10 @@ class BatchNorm(nnx.Module):
     """Batch normalisation with a weight per sample.
 
     In training, the mean of a channel is `sum_n w_n mean_hw(x_n) / sum_n w_n`, where `w_n` is the weight of sample n
-    and `mean_hw` is the mean over its pixels. The variance is computed in the same way. The running statistics become
-    `momentum old + (1 - momentum) new`. If all weights are 0, the running statistics are used and stay unchanged.
-    Evaluation (`weights=None`) always uses the running statistics.
+    and `mean_hw(x_n)` is the mean over the pixels of this sample. The variance is computed in the same way. Each
+    running statistic is then set to `momentum * old + (1 - momentum) * new`, where `new` is the value of the batch. If
+    all weights are 0, the running statistics are used and stay unchanged. Evaluation (`weights=None`) always uses the
+    running statistics.
 
     Args:
         channels: Number of channels.
@@ -267,15 +270,16 @@ class MVAE(nnx.Module):
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
 
     def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
-        """Compute the expert of one modality, a Gaussian over the latent.
+        """Estimate the latent from one modality. The result is an expert of `product_of_experts`.
 
         Args:
             name: Name of the modality.
             x: Images in [0, 1] or vectors, `(batch, *shape)`.
-            weights: Weight of each sample in the batch statistics, `(batch,)`. None selects evaluation mode.
+            weights: Weight of each sample in batch normalisation, `(batch,)`. With None, batch normalisation uses the
+                running statistics.
 
         Returns:
-            Mean and log variance, `(batch, latent)`.
+            Mean and log variance of the latent, `(batch, latent)`.
         """
         return self.encoders[name](x, weights)
 
@@ -285,10 +289,11 @@ class MVAE(nnx.Module):
         Args:
             name: Name of the modality.
             z: Latents, each followed by the condition if the model has one, `(batch, latent + condition)`.
-            weights: Weight of each sample in the batch statistics, `(batch,)`. None selects evaluation mode.
+            weights: Weight of each sample in batch normalisation, `(batch,)`. With None, batch normalisation uses the
+                running statistics.
 
         Returns:
-            Logits of images, or vectors, `(batch, *shape)`.
+            The predictions, `(batch, *shape)`. Images are logits, which `jax.nn.sigmoid` converts to values in [0, 1].
         """
         return self.decoders[name](z, weights)
 
@@ -296,8 +301,9 @@ class MVAE(nnx.Module):
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
     """Create a model with random parameters.
 
-    Kernels are normally distributed with variance `1 / fan_in`, and smaller for the inactive latents and the last layer
-    of an image decoder. Biases of hidden layers are 0 and scales are 1.
+    Kernels are drawn from normal distributions with variance `1 / fan_in`. Two kinds of kernels are smaller: those of
+    all latents but the first 16, so that these latents start near the prior, and those of the last layer of an image
+    decoder. The biases of hidden layers are 0, and the scales of batch normalisation are 1.
 
     Args:
         key: Random key for the kernels.

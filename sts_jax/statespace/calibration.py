@@ -32,10 +32,11 @@ _PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a no
 
 
 class Calibration(NamedTuple):
-    """Corrections of the predicted density, one for each subset of the inputs. The value 1 changes nothing.
+    """Factors and exponents that widen the predicted density of the final pose, for each subset of the model's inputs.
 
-    The correction of a subset has the index `sum of 2**i`, summed over all i for which the subset contains the input
-    `Config.inputs[i]`.
+    Each array has one value for each subset. The value 1 leaves the density unchanged. A subset has the index
+    `sum(2**i for i in members)`, where `members` are the positions of its inputs in `Config.inputs`. For example, the
+    subset of the first and the second input has the index 3.
     """
 
     outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 1]
@@ -55,14 +56,17 @@ def predict(
 
     Args:
         model: The networks.
-        inputs: Inputs by name, as in `statespace.sample`.
-        present: A mask for each of the inputs. True means that the item has the input.
+        inputs: Inputs of n items by name, as in `statespace.sample`.
+        present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input.
         empty: `visual` and `tactile` image of the empty sensor, in [0, 1].
-        condition: Condition of the scenario, from `training.Preprocessing.encode_condition`, or None.
-        calibration: Correction of the density, or None. Items whose true `state` is an input are not corrected.
+        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
+            `training.Preprocessing.encode_condition`. None if the model has no condition.
+        calibration: Calibration of the density, or None. Items that have the true state code `state` as an input are
+            not corrected.
 
     Returns:
-        The posterior of the state code and the appearance code, `(n, code + look)`, and the density of the final pose.
+        The posterior in the first frame, `(n, code + look)`, and the density of the final pose. The posterior is a
+        Gaussian over the state code (pose, shape and mass) and the appearance code (all other visible properties).
     """
     belief = fuse(experts(model, inputs, present, empty), present)
     final = model.transition(of_state(belief), condition)
@@ -77,13 +81,13 @@ def predict(
 def corrected(
     final: FinalPose, outcome: Float[Array, "*n"], weight: Float[Array, "*n"], variance: Float[Array, "*n"]
 ) -> FinalPose:
-    """Correct the densities of the final poses.
+    """Apply the three numbers of a calibration to the predicted densities of the final pose.
 
     Args:
         final: Densities of n items.
-        outcome: Exponent of the probabilities of the outcomes, one for all items or `(n,)`.
-        weight: Exponent of the weights of the mixture components, one for all items or `(n,)`.
-        variance: Factor of the variances, one for all items or `(n,)`.
+        outcome: Exponent of the probabilities of the outcomes: a scalar for all items, or `(n,)`.
+        weight: Exponent of the weights of the mixture components: a scalar for all items, or `(n,)`.
+        variance: Factor of the variances of the components: a scalar for all items, or `(n,)`.
 
     Returns:
         The corrected densities.
@@ -111,8 +115,8 @@ def fit(
 ) -> Calibration:
     """Fit the calibration of a model to the final poses of trajectories that its training did not see.
 
-    The result maximises the posterior density of the correction: the likelihood of the true outcomes and final poses,
-    times a prior that keeps the corrections near 1.
+    For each subset of the inputs, the calibration maximises the likelihood of the true outcomes and final poses, times
+    a prior that favours values near 1.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -124,10 +128,11 @@ def fit(
         empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
             in all items.
-        condition: Condition of the scenario, `(n, c)`, from `training.Preprocessing.encode_condition`, or None.
+        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
+            `training.Preprocessing.encode_condition`. None if the model has no condition.
 
     Returns:
-        The calibration. The correction of a subset that no item has is 1.
+        The calibration. If no item has all inputs of a subset, the values of this subset are 1.
     """
     names = nnx.merge(graphdef, params).config.inputs
     number = len(targets["pose"])

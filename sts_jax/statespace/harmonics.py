@@ -14,19 +14,20 @@ from jaxtyping import Array, Float
 
 
 def number(degree: int) -> int:
-    """The number of spherical harmonics up to a degree, which is the number of coefficients of a function."""
+    """The number of spherical harmonics of the degrees 0 to `degree`. A function has one coefficient for each."""
     return (degree + 1) ** 2
 
 
 def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
-    """Evaluate all spherical harmonics up to a degree.
+    """Evaluate all real spherical harmonics of the degrees 0 to `degree`.
 
     Args:
-        direction: Unit vectors. At a shorter vector of length s, a harmonic of degree n is multiplied by s^n.
+        direction: Unit vectors. If a vector has another length s, the values of degree n are multiplied by `s**n`.
         degree: Largest degree.
 
     Returns:
-        Values of the harmonics at each direction, in the order of the coefficients.
+        Values of the k harmonics at each direction. They are sorted by degree, and within degree n by the orders 0, 1,
+        -1, ..., n, -n.
     """
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     square = x**2 + y**2 + z**2
@@ -50,27 +51,28 @@ def basis(direction: Float[Array, "*n 3"], degree: int) -> Float[Array, "*n k"]:
 def values(
     coefficients: Float[Array, "n c k"], rotation: Float[Array, "n 3 3"], directions: Float[np.ndarray, "j 3"]
 ) -> Float[Array, "n c j"]:
-    """Evaluate functions at fixed directions after a rotation.
+    """Rotate functions on the unit sphere, and evaluate the rotated functions at fixed directions.
 
     Args:
-        coefficients: Coefficients of c functions for each of n objects.
-        rotation: Rotation matrix of each object. For a mean of rotation matrices, the results are approximately the
-            means of the values.
+        coefficients: Coefficients of k spherical harmonics, for c functions of each of n objects.
+        rotation: Rotation matrix R of each object. At the direction d, the rotated function of f has the value
+            `f(R^T d)`. If R is a mean of several rotation matrices, the result is approximately the mean of their
+            values.
         directions: Unit vectors.
 
     Returns:
-        Values of the rotated functions at the directions.
+        Values of the rotated functions at the j directions.
     """
     degree = math.isqrt(coefficients.shape[-1]) - 1
     return jnp.einsum("nck,njk->ncj", coefficients, basis(jnp.asarray(directions) @ rotation, degree))
 
 
 def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Rotate functions about the z axis.
+    """Rotate functions on the unit sphere about the z axis.
 
     Args:
         angle: Cosine and sine of the rotation angle of each object.
-        coefficients: Coefficients of c functions for each of n objects.
+        coefficients: Coefficients of k spherical harmonics, for c functions of each of n objects.
 
     Returns:
         Coefficients of the rotated functions.
@@ -80,11 +82,12 @@ def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Flo
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Variances of the coefficients after a rotation about the z axis.
+    """Compute the variances of spherical harmonic coefficients after a rotation of the functions about the z axis.
 
     Args:
         angle: Cosine and sine of the rotation angle of each object.
-        variance: Variances of the coefficients, which are assumed to be independent.
+        variance: Variances of the k coefficients, for c functions of each of n objects. The coefficients are assumed
+            to be independent.
 
     Returns:
         Variances of the coefficients of the rotated functions.

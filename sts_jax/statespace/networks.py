@@ -42,10 +42,10 @@ _SMALL = nnx.initializers.variance_scaling(0.1, "fan_in", "normal")  # for last 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The size, view and loss weights of a model. All values are plain, so that `dataclasses.asdict` returns JSON.
+    """The configuration of a state-space model, in values that JSON can represent.
 
     Raises:
-        ValueError: A field is out of range, or two fields contradict each other.
+        ValueError: A field is out of range, or the values of two fields do not fit together.
     """
 
     inputs: tuple[str, ...] = ("visual", "pose")  # some of `visual`, `tactile` and `pose`, in this order
@@ -94,26 +94,31 @@ class Config:
                 )
         if len(self.encoder) != 3 or len(self.decoder) != 3:
             raise ValueError(
-                f"encoder has {len(self.encoder)} widths and decoder has {len(self.decoder)}, but each must have 3"
+                f"encoder has {len(self.encoder)} widths and decoder has {len(self.decoder)}, but each must have 3 "
+                "widths, one for each resolution of the network"
             )
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
-                f"condition is {self.condition} and vectors is {self.vectors}, but condition must be 0, or at least "
-                "2 * vectors, because a vector has two numbers. vectors must be >= 0"
+                f"condition is {self.condition} and vectors is {self.vectors}, but condition must be 0 or at least "
+                "2 * vectors, because each vector has two numbers, and vectors must be >= 0"
             )
         if self.traits < TINT:
-            raise ValueError(f"traits is {self.traits}, but it must be >= {TINT}: the first {TINT} traits are the tint")
+            raise ValueError(f"traits is {self.traits}, but it must be >= {TINT}: the first {TINT} are the mean colour")
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but it is a share and must be > 0 and <= 1")
+                raise ValueError(f"{name} is {getattr(self, name)}, but this share of a batch must be > 0 and <= 1")
 
     @property
     def look(self) -> int:
-        """Number of components of the appearance code."""
+        """Number of values in the appearance code, which describes the visible properties other than pose and shape."""
         return self.traits + (self.own + self.shown) * harmonics.number(self.degree)
 
     def to_json(self) -> dict[str, Any]:
-        """The fields in plain dictionaries and tuples. `vectors` is left out if it is 1, as in older models."""
+        """The fields by name, in values that `json.dumps` accepts.
+
+        The field `vectors` is left out if it has its default value 1. Models of older versions were saved without this
+        field, and a resumed training compares the fields with those of the saved model.
+        """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
 
@@ -125,10 +130,11 @@ class Config:
 
 
 class FinalPose(NamedTuple):
-    """The density of the final pose: for each outcome, a mixture of Gaussians over 21 numbers.
+    """The predicted density of the final pose of n objects: for each outcome, a mixture of k Gaussians over 21 numbers.
 
-    The numbers are the final pose code and the matrix of the rotation from the first to the final pose. Both are given
-    in a coordinate frame whose x axis is `heading`.
+    The first 12 numbers are the final pose code (position and rotation matrix, see `statespace.poses`). The other 9 are
+    the matrix of the rotation from the first to the final pose, row by row. All are given in the sensor frame after a
+    rotation about the z axis, which turns the x axis into the direction `heading`.
     """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
@@ -139,7 +145,7 @@ class FinalPose(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """The rendered object without background. `compose` adds the images of the empty sensor."""
+    """The rendered image of each of n objects without a background. `compose` adds the images of the empty sensor."""
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
     colour: Float[Array, "n size size 3"]  # colour of the object, [0, 1]
@@ -170,15 +176,17 @@ class _ResidualDense(nnx.Module):
 
 
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
-    """Split appearance codes into their parts.
+    """Split appearance codes into traits and functions on the unit sphere.
+
+    Traits do not depend on the object's rotation. Functions describe an appearance that depends on the direction.
 
     Args:
-        config: Configuration of the model.
+        config: Configuration of the model, with the numbers `traits`, `own` and `shown`.
         look: Appearance codes.
 
     Returns:
-        The traits `(n, traits)`, and the coefficients of the functions on the sphere for directions in the mesh frame
-        `(n, own, k)` and in the sensor frame `(n, shown, k)`.
+        The traits `(n, traits)`, and k spherical harmonic coefficients for each function. The functions `(n, own, k)`
+        depend on a direction in the mesh frame, and `(n, shown, k)` on a direction in the sensor frame.
     """
     count = harmonics.number(config.degree)
     traits, own, shown = jnp.split(look, [config.traits, config.traits + config.own * count], axis=-1)
@@ -223,9 +231,10 @@ def _unfold(x: Float[Array, "n h w c"]) -> Float[Array, "n 2*h 2*w c//4"]:
 
 
 class Encoder(nnx.Module):
-    """Estimates the state code and the appearance code from a visual or from a tactile image.
+    """Estimates the state code (pose, shape and mass) and the appearance code from a visual or from a tactile image.
 
-    The tint is measured in a visual image. A tactile image does not determine it.
+    The first three numbers of the appearance code are the tint, which describes the mean colour of the object. In a
+    visual image, the tint is measured from the pixels. A tactile image does not determine the tint.
     """
 
     def __init__(self, config: Config, name: str, rngs: nnx.Rngs) -> None:
@@ -294,10 +303,10 @@ class Encoder(nnx.Module):
 
 
 class Transition(nnx.Module):
-    """Predicts the density of the final pose from a belief about the first state.
+    """Predicts the density of the final pose from the state in the first frame.
 
-    The appearance code is not an input, because the transition would recognise training objects by their appearance
-    (see docs/trials.md).
+    The input is a belief: a Gaussian over the state code (pose, shape and mass). The appearance code is not an input,
+    because the transition would recognise training objects by their appearance (see docs/trials.md).
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -315,8 +324,8 @@ class Transition(nnx.Module):
 
         Args:
             belief: Posterior of the state code, `(n, code)`.
-            condition: Condition of the scenario, each number divided by its typical size. None if the scenario has no
-                condition.
+            condition: Known quantities of the scenario such as an acceleration, from
+                `training.Preprocessing.encode_condition`. None if the scenario has no condition.
 
         Returns:
             The density, in a coordinate frame whose x axis is the heading of the mean state.
@@ -360,9 +369,10 @@ class Transition(nnx.Module):
 class Decoder(nnx.Module):
     """Renders an object in a given pose, from its state code and its appearance code.
 
-    The network renders a square image of the object, the canvas, which follows the object's heading. The canvas is then
-    placed in the view below the mesh origin, at the height of the object's lowest point, because the camera sees the
-    object from below. `compose` adds the images of the empty sensor.
+    The network renders the object on a canvas: a square that is parallel to the pad and aligned with the object's
+    heading, a direction in the plane of the pad that turns with the object. The canvas is then projected into the view
+    of the camera. Its centre is below the mesh origin, at the height of the object's lowest point, because the camera
+    sees the object from below. `compose` adds the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -425,11 +435,11 @@ def compose(
     """Combine the rendered objects with the images of the empty sensor.
 
     Args:
-        layers: Rendered objects, from the decoder.
-        empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size.
-        level: Threshold for each object, from 0 to 1. The object covers the pixels whose probability of being covered
-            is above the threshold, so that its outline is sharp. If the thresholds are drawn uniformly, each pixel is
-            covered as often as its probability predicts. With None, the colour of a pixel is the expected colour.
+        layers: Rendered images of n objects, from the decoder.
+        empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the size of the rendered images.
+        level: Threshold of each object for sharp outlines, from 0 to 1. A pixel shows the object if the probability
+            `layers.covered` is above the threshold, and the empty sensor otherwise. With uniformly random thresholds,
+            the frequency of the object in a pixel is this probability. With None, each pixel has the expected colour.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].

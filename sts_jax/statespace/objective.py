@@ -46,18 +46,22 @@ def experts(
     counts: dict[str, Bool[Array, "n"]],
     empty: dict[str, Float[Array, "size size 3"]],
 ) -> dict[str, Gaussian]:
-    """Compute the expert of each input: a Gaussian over the state code and the appearance code.
+    """Estimate the state code and the appearance code from each input alone.
+
+    Each estimate is a Gaussian, which is called the expert of the input. The state code describes pose, shape and mass,
+    and the appearance code describes all other visible properties.
 
     Args:
         model: The networks.
         inputs: Inputs by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1], pose codes `pose`
             `(n, 12)` and, if they are known, true state codes `state` `(n, code)`.
-        counts: A mask for each of the inputs. True means that the item has the input. Values of other items have no
-            influence and may be NaN.
+        counts: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
+            have no influence and may be NaN.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size as the inputs.
 
     Returns:
-        The experts by input, `(n, code + look)`. A pose or a state does not determine the other numbers.
+        The experts by input, `(n, code + look)`. The expert of `pose` or `state` has a very large variance for all
+        numbers that the input does not contain.
     """
     # Masked items are set to zero before the networks, because 0 * NaN would make the product and its gradient NaN.
     change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
@@ -72,21 +76,21 @@ def experts(
 
 
 def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gaussian:
-    """Multiply the standard normal prior by the experts that each item has.
+    """Combine the estimates from all inputs of each item: multiply the standard normal prior by the Gaussians.
 
     Args:
-        found: Experts by input, from `experts`.
-        counts: A mask for each of these inputs. True means that the item has the input.
+        found: Gaussian estimate from each input by name, from `experts`.
+        counts: A mask for each name in `found`, `(n,)`. True means that the item has the input.
 
     Returns:
-        The belief, which is a Gaussian over the state code and the appearance code.
+        The belief, a Gaussian over the state code and the appearance code, `(n, code + look)`.
     """
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *found.values())
     return product_of_experts(stacked, jnp.stack([counts[name] for name in found]))
 
 
 def of_state(belief: Gaussian) -> Gaussian:
-    """The belief about the state code, from a belief about the state code and the appearance code."""
+    """The belief about the state code alone, `(n, code)`, from a belief about both codes, `(n, code + look)`."""
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
 
@@ -98,11 +102,11 @@ def _counted(counts: Bool[Array, "n"], values: Float[Array, "n ..."]) -> Float[A
 def log_density(
     final: FinalPose, code: Float[Array, "n 12"], turn: Float[Array, "n 3 3"], outcome: Int[Array, "n"]
 ) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Evaluate a predicted density at a final pose.
+    """Evaluate the predicted densities of n items at their true outcomes and final poses.
 
     Args:
-        final: Density of the final pose.
-        code: Final pose codes.
+        final: Densities of the final poses.
+        code: Final pose codes (position and rotation matrix, see `statespace.poses`).
         turn: Rotation matrices from the first to the final poses.
         outcome: Indices into the outcomes of the scenario.
 
@@ -187,7 +191,7 @@ def loss(
     falls: dict[str, Array] | None = None,
     beta: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Compute the loss of one batch, see the docstring of the module.
+    """Compute the loss of one batch: a weighted sum of the terms that the docstring of the module defines.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -200,9 +204,10 @@ def loss(
             `(n, 12)`, and indices `outcome` into the outcomes of the scenario `(n,)`.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
-            in all items. Each item must have at least one input. Masked values have no influence and may be NaN.
-        condition: Condition of the scenario, each number divided by its typical size. None if the model has no
-            condition.
+            in all items. Each item must have at least one input. Values of items whose mask is False have no influence
+            and may be NaN.
+        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
+            `training.Preprocessing.encode_condition`. None if the model has no condition.
         views: First frames without a trajectory: images `visual` `(m, size, size, 3)` in [0, 1] with the side
             `input_size`, and state codes `state` `(m, code)`. The model must have the input `visual`.
         falls: Trajectories without images: `state`, `pose` and `outcome` as in `targets` and, if the model has a
@@ -210,9 +215,10 @@ def loss(
         beta: Weight of the divergence of the appearance code.
 
     Returns:
-        The loss, and its terms by name, which are means over the items that have the input or the target, before they
-        are weighted. `state` is in squared units of the code, and all other terms are in nats. `state`, `doubt` and
-        `first` are sums over the input images, and `covered` is a sum over the first and the last frame.
+        The loss, and its unweighted terms by name. Each term is a mean over the items that have the input or the
+        target. The term `state` is a squared error of state codes, and all other terms are in nats. `state`, `doubt`
+        and `first` are summed over the images `visual` and `tactile` that are inputs. `covered` is summed over the
+        first and the last frame.
     """
     model = nnx.merge(graphdef, params)
     config = model.config
@@ -275,14 +281,14 @@ def _weighted(config: Config, terms: dict[str, Float[Array, ""]], beta: float | 
 
 
 def rotation_between(code: Float[Array, "n code"], pose: Float[Array, "n 12"]) -> Float[Array, "n 3 3"]:
-    """The rotation matrices from the first to the final pose.
+    """Compute the rotation matrices from the first to the final poses.
 
     Args:
-        code: State codes of the first frame.
+        code: State codes of the first frame, which begin with the pose codes.
         pose: Pose codes of the last frame.
 
     Returns:
-        Matrices that rotate vectors in the sensor frame.
+        Matrices `R_final @ R_first.T`, which rotate vectors in the sensor frame.
     """
     return poses.matrix(pose) @ jnp.swapaxes(poses.matrix(code[:, : poses.CODE]), -1, -2)
 

@@ -22,15 +22,17 @@ LEVEL = 0.85  # an axis is level if the length of its projection onto the pad is
 def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     """The heading of each object: the direction of one of its mesh axes, projected onto the plane of the pad.
 
-    The axis is x if x is level, else z if z is level, else the axis with the longest projection. An object that rests
-    on one of its faces has a level axis, so that the choice does not change with small rotations. No gradient flows
-    through the heading.
+    A mesh axis counts as level if the projection of its unit vector is longer than 0.85. The axis is x if x is level,
+    else z if z is level, else the axis with the longest projection. An object that rests on one of its faces has a
+    level axis, so that small rotations do not change the choice. If the projection of the chosen axis is almost 0, the
+    heading is the x axis of the sensor frame. No gradient flows through the heading.
 
     Args:
-        code: Pose codes. The nine numbers need not be an exact rotation matrix.
+        code: Pose codes (position and rotation matrix). The matrix may be inexact, for example the mean of several
+            rotation matrices.
 
     Returns:
-        Cosine and sine of the angle from the x axis to the heading.
+        Cosine and sine of the angle from the x axis of the sensor frame to the heading.
     """
     columns = jax.lax.stop_gradient(code[..., 3:].reshape(*code.shape[:-1], 3, 3)[..., :2, :])
     lengths = jnp.linalg.norm(columns, axis=-2)
@@ -43,57 +45,60 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
 
 
 def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
-    """How well a belief determines the rotation: 0 if it is unknown, and at least 0.8 for an exact rotation matrix.
+    """The certainty of each object's rotation: 0 if the rotation is unknown, 0.8 to 1 if the rotation is known exactly.
+
+    The mean of uncertain rotation matrices has shorter columns than a rotation matrix. The certainty is the length of
+    the longest projection of a column, which is a mesh axis, onto the plane of the pad.
 
     Args:
-        code: Means of pose codes under the belief.
+        code: Means of pose codes (position and rotation matrix) under the density of an uncertain pose.
 
     Returns:
-        Length of the longest projection of a mesh axis onto the plane of the pad.
+        The certainty of each rotation.
     """
     return jnp.max(jnp.linalg.norm(matrix(code)[..., :2, :], axis=-2), axis=-1)
 
 
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
-    """The matrices of pose codes. For means of pose codes, they need not be exact rotation matrices."""
+    """The rotation matrices in pose codes. In a mean of several pose codes, the matrix may be inexact."""
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
 
 
 def about_vertical(angle: Float[Array, "*n 2"]) -> Float[Array, "*n 3 3"]:
-    """Matrices of rotations about the z axis. `angle` has the cosine and the sine of each angle."""
+    """The matrices of rotations about the z axis. `angle` has the cosine and the sine of each rotation angle."""
     cos, sin, zero = angle[..., 0], angle[..., 1], jnp.zeros_like(angle[..., 0])
     rows = [[cos, -sin, zero], [sin, cos, zero], [zero, zero, zero + 1]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def nearest(turn: Float[Array, "*n 9"]) -> Float[Array, "*n 3 3"]:
-    """The nearest rotation matrix to each matrix. A matrix is given by nine numbers, row by row."""
+    """The nearest rotation matrix to each matrix in `turn`, which has the nine numbers of a matrix row by row."""
     return geometry.quat_to_matrix(geometry.quat_from_matrix(turn.reshape(*turn.shape[:-1], 3, 3)))
 
 
 def rigid(code: Float[Array, "*n 12"]) -> Float[Array, "*n 12"]:
-    """Replace the nine numbers of each pose code by the nearest rotation matrix."""
+    """Replace the matrix in each pose code by the nearest rotation matrix."""
     quat = geometry.quat_from_matrix(code[..., 3:].reshape(*code.shape[:-1], 3, 3))
     return jnp.concatenate([code[..., :3], geometry.quat_to_matrix(quat).reshape(*code.shape[:-1], 9)], axis=-1)
 
 
 def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
-    """Rotate vectors (x, y) in the plane of the pad. `angle` has the cosine and the sine of each angle."""
+    """Rotate vectors (x, y) in the plane of the pad. `angle` has the cosine and the sine of each rotation angle."""
     cos, sin, x, y = angle[..., 0], angle[..., 1], vector[..., 0], vector[..., 1]
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def turn_back(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
-    """Rotate vectors (x, y) by the opposite angles. This is the inverse of `turn`."""
+    """Rotate vectors (x, y) by the negative angles. This is the inverse of `turn`."""
     return turn(angle * jnp.array([1.0, -1.0]), vector)
 
 
 def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Rotate the scene about the z axis of the sensor frame.
+    """Compute the pose codes of objects after a rotation of the whole scene about the z axis of the sensor frame.
 
     Args:
         angle: Cosine and sine of the rotation angle.
-        code: Pose codes.
+        code: Pose codes (position and rotation matrix) before the rotation.
 
     Returns:
         Pose codes after the rotation.
@@ -106,12 +111,12 @@ def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Flo
 
 
 def turn_code_back(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Rotate pose codes by the opposite angles. This is the inverse of `turn_code`."""
+    """Compute pose codes after a rotation by the negative angles. This is the inverse of `turn_code`."""
     return turn_code(angle * jnp.array([1.0, -1.0]), code)
 
 
 def turn_variance(angle: Float[Array, "*#n 2"], variance: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Variances of pose codes after a rotation about the z axis of the sensor frame.
+    """Compute the variances of pose codes after a rotation of the scene about the z axis of the sensor frame.
 
     Args:
         angle: Cosine and sine of the rotation angle.

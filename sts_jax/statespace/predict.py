@@ -14,7 +14,7 @@ from sts_jax.statespace.objective import reduced
 
 
 class Samples(NamedTuple):
-    """k samples of the last frame for each of n items. The first `drawn` samples have images."""
+    """Samples of the last frame: k final poses for each of n items, and images of the first `drawn` of these poses."""
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -42,21 +42,22 @@ def sample(
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
         key: Random key.
-        inputs: Inputs by name, some of `model.config.inputs`: images `visual` and `tactile` `(n, size, size, 3)` in
-            [0, 1] with the side `input_size`, and pose codes `pose` `(n, 12)`. If the true state codes `state`
-            `(n, code)` are known, they may be an input too.
-        present: A mask for each of the inputs. True means that the item has the input. Values of other items have no
-            influence and may be NaN.
+        inputs: Inputs of n items by name, at least one: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1]
+            with the side `Config.input_size`, pose codes `pose` `(n, 12)` and true state codes `state` `(n, code)`.
+            Inputs other than `state` must be in the model's `Config.inputs`.
+        present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
+            have no influence and may be NaN.
         empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].
-        condition: Condition of the scenario, from `training.Preprocessing.encode_condition`. None if the model has no
-            condition.
-        correction: Calibration of the density of the final pose, from `fit_calibration`. None changes nothing.
+        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
+            `training.Preprocessing.encode_condition`. None if the model has no condition.
+        correction: Calibration of the density of the final pose, from `fit_calibration`. None leaves the density
+            unchanged.
         num: Number of final poses for each item.
-        drawn: Number of these poses for which both images are rendered, from 1 to `num`. Each image has its own sample
-            of the appearance.
+        drawn: Number of final poses, from 1 to `num`, for which the visual and the tactile image are rendered. A random
+            appearance code is drawn for each of these poses.
 
     Returns:
-        The samples, the expected images and the probabilities of the outcomes.
+        The sampled final poses and images, the mean images, and the probabilities of the outcomes.
 
     Raises:
         ValueError: `drawn` is out of range.

@@ -36,14 +36,17 @@ CODE = sum(SIZES)  # numbers in a state code
 
 
 class State(NamedTuple):
-    """The parts of state codes, as in the docstring of the module, or the variances of these parts."""
+    """The parts of state codes, which describe the pose, the shape and the mass of n objects.
 
-    pose: Float[Array, "n 12"]
-    own: Float[Array, "n k"]
-    com: Float[Array, "n 3"]
-    mass: Float[Array, "n 1"]
-    shown: Float[Array, "n k"]
-    low: Float[Array, "n 3"]
+    The same class holds the variances of these parts. The docstring of the module defines the support function.
+    """
+
+    pose: Float[Array, "n 12"]  # pose code
+    own: Float[Array, "n k"]  # coefficients of the support function, for directions in the mesh frame
+    com: Float[Array, "n 3"]  # centre of mass in the mesh frame, in units of 0.01 m
+    mass: Float[Array, "n 1"]  # natural logarithm of the mass in units of 0.05 kg
+    shown: Float[Array, "n k"]  # coefficients of the support function, for directions in the sensor frame
+    low: Float[Array, "n 3"]  # vector from mesh origin to centre of mass in the sensor frame, in units of 0.01 m
 
 
 @functools.cache
@@ -54,12 +57,12 @@ def _fit() -> np.ndarray:
 
 
 def split(code: Float[Array, "n code"]) -> State:
-    """Split state codes into their parts."""
+    """Split state codes into their parts: pose, shape and mass, see `State`."""
     return State(*jnp.split(code, np.cumsum(SIZES)[:-1], axis=-1))
 
 
 def join(state: State) -> Float[Array, "n code"]:
-    """Join parts to state codes. This is the inverse of `split`."""
+    """Concatenate the parts of state codes. This is the inverse of `split`."""
     return jnp.concatenate(state, axis=-1)
 
 
@@ -69,16 +72,16 @@ def encode(
     mass: Float[Array, "n"],
     com: Float[Array, "n 3"],
 ) -> Float[Array, "n code"]:
-    """Encode the true states of objects.
+    """Encode the true poses, shapes and masses of n objects as state codes.
 
     Args:
-        pose: Pose codes, from `training.Preprocessing.encode_pose`.
-        support: Support functions at `objects.DIRECTIONS`, from `objects.support` (m).
+        pose: Pose codes (position and rotation matrix), from `training.Preprocessing.encode_pose`.
+        support: Support functions of the convex hulls at `objects.DIRECTIONS`, from `objects.support` (m).
         mass: Masses (kg).
         com: Centres of mass in the mesh frame (m).
 
     Returns:
-        State codes with the parts that the docstring of the module lists.
+        State codes, which are the concatenated parts of `State`.
     """
     own = (support / LENGTH - MEAN) @ _fit()
     rotation = poses.matrix(pose)
@@ -89,11 +92,11 @@ def encode(
 
 
 def turn(angle: Float[Array, "n 2"], state: State) -> State:
-    """Rotate the scene about the z axis of the sensor frame.
+    """Compute the state codes of objects after a rotation of the whole scene about the z axis of the sensor frame.
 
     Args:
-        angle: Cosine and sine of the rotation angle.
-        state: Parts of state codes.
+        angle: Cosine and sine of the rotation angle of each item.
+        state: Parts of the state codes before the rotation.
 
     Returns:
         Parts of the state codes after the rotation.
@@ -106,10 +109,10 @@ def turn(angle: Float[Array, "n 2"], state: State) -> State:
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
-    """Variances of state codes after a rotation about the z axis of the sensor frame.
+    """Compute the variances of state codes after a rotation of the scene about the z axis of the sensor frame.
 
     Args:
-        angle: Cosine and sine of the rotation angle.
+        angle: Cosine and sine of the rotation angle of each item.
         variance: Variances of the numbers of the state codes, which are assumed to be independent.
 
     Returns:
@@ -124,11 +127,11 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
 
 
 def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
-    """Height of the mesh origin above the lowest point of an object, after a further rotation.
+    """Compute the height of the mesh origin above the lowest point of each object, after a rotation of the object.
 
     Args:
-        state: Parts of state codes.
-        rotation: Rotation matrices from the orientation in `state` to the new one.
+        state: Parts of the state codes before the rotation.
+        rotation: Matrices of the rotation in the sensor frame.
 
     Returns:
         Heights along the z axis of the sensor frame (m).
@@ -140,14 +143,16 @@ def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
 def heading(state: State) -> Float[Array, "n 2"]:
     """The heading of each object: a direction in the plane of the pad that turns with the object.
 
-    It is the direction of one of the mesh axes, see `poses.heading`. If the rotation is too uncertain, it is the long
-    axis of `shown` in the plane of the pad, with an arbitrary sign. No gradient flows through the heading.
+    If `poses.certainty` is above 0.5, the rotation is known well enough, and the heading is the direction of one of the
+    mesh axes, see `poses.heading`. Otherwise, the heading is the long axis of the object's shape in the plane of the
+    pad, with an arbitrary sign. This shape is `State.shown`, the support function in the sensor frame, which an image
+    determines even if the rotation of the mesh is uncertain. No gradient flows through the heading.
 
     Args:
-        state: Parts of state codes, or their means under a belief.
+        state: Parts of state codes. For uncertain states, their means.
 
     Returns:
-        Cosine and sine of the angle from the x axis to the heading.
+        Cosine and sine of the angle from the x axis of the sensor frame to the heading.
     """
     state = jax.lax.stop_gradient(state)
     certain = poses.certainty(state.pose)[:, None] > 0.5  # 0 for an unknown rotation, at least 0.8 for a known one

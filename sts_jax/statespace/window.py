@@ -17,7 +17,10 @@ SMALLEST = 0.08  # side of the smallest window, divided by the side of the image
 
 
 class Window(NamedTuple):
-    """A square in each of n images, along the principal axes of the silhouette. Lengths are in sides of the image."""
+    """A square in each of n images, aligned with the principal axes of the object's silhouette.
+
+    The unit of all lengths and positions is the side of the image, so that the whole image has the side 1.
+    """
 
     centre: Float[Array, "n 2"]  # column and row of the centre, from the left and the upper border of the image
     angle: Float[Array, "n 2"]  # cosine and sine of the angle from the direction of increasing columns to the long axis
@@ -31,13 +34,15 @@ def shows(change: Float[Array, "n h w 3"]) -> Float[Array, "n h w"]:
         change: Images minus the image of the empty sensor, both in [0, 1].
 
     Returns:
-        1 for pixels that differ from the empty sensor by more than THRESHOLD in any channel, else 0.
+        1 for pixels that differ from the empty sensor by more than 12/255 in any channel, else 0.
     """
     return (jnp.max(jnp.abs(change), axis=-1) > THRESHOLD).astype(jnp.float32)
 
 
 def locate(change: Float[Array, "n size size 3"]) -> Window:
-    """Find the window around the silhouette in each image.
+    """Find a square window around the object in each image, aligned with the principal axes of the silhouette.
+
+    The silhouette is the set of all pixels that differ from the image of the empty sensor, see `shows`.
 
     Args:
         change: Square images minus the image of the empty sensor, both in [0, 1].
@@ -74,17 +79,17 @@ def locate(change: Float[Array, "n size size 3"]) -> Window:
 
 
 def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Float[Array, "n side side c"]:
-    """Cut the windows out of images and resample them.
+    """Cut the windows out of images, and resample each window to `side` x `side` pixels.
 
-    A pixel is the mean of four values, which are interpolated bilinearly. Values outside the image are 0.
+    A pixel of the result is the mean of four values that are interpolated bilinearly. Values outside the image are 0.
 
     Args:
         images: Square images.
-        window: Window in each image.
-        side: Side of the resampled windows (pixels).
+        window: Window in each image, from `locate`.
+        side: Side of the results (pixels).
 
     Returns:
-        Contents of the windows. Their columns run along the long axis of the silhouette.
+        Images of the windows. The column index increases along the long axis of the silhouette.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5
@@ -95,14 +100,14 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
 
 
 def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"]) -> Float[Array, "n m c"]:
-    """Interpolate images bilinearly at m places each.
+    """Interpolate each image bilinearly at m places.
 
     Args:
-        images: Images.
+        images: Square images.
         places: Column and row of each place (pixels). Whole numbers are pixel centres.
 
     Returns:
-        Values at the places. Outside the image they are 0.
+        Values at the places, which are 0 outside the image.
     """
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)

@@ -13,12 +13,13 @@ Batch = dict[str, Any]  # the fields of `Arrays` by name, with the samples of on
 
 @dataclass(frozen=True)
 class Arrays:
-    """A training set in memory. Each dictionary has arrays `(samples, *shape)` by modality.
+    """A training set in memory.
 
-    Images are uint8, or float32 in [0, 1].
+    `inputs`, `targets`, `present` and `target_present` are dictionaries of arrays by modality. The first axis of these
+    arrays and of `condition` is the sample. Images are uint8, or float32 in [0, 1].
 
     Raises:
-        ValueError: The arrays have different numbers of samples, or no samples.
+        ValueError: These arrays have different numbers of samples, or no samples.
     """
 
     inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
@@ -40,9 +41,11 @@ class Arrays:
     def __post_init__(self) -> None:
         sizes = {len(x) for x in jax.tree.leaves(self._tree())}
         if len(sizes) != 1 or 0 in sizes:
+            leaves = jax.tree_util.tree_leaves_with_path(self._tree())
+            found = {jax.tree_util.keystr(path, simple=True, separator="/"): len(x) for path, x in leaves}
             raise ValueError(
-                f"inputs, targets, present, target_present and condition have {sorted(sizes)} samples, but all arrays "
-                "must have the same number of samples, at least 1"
+                f"the arrays have the numbers of samples {found}, but all arrays must have the same number of samples, "
+                "and at least one sample: give arrays of equal length"
             )
 
     def __len__(self) -> int:
@@ -53,11 +56,11 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: Indices into the rows of `views` and `falls`, by these names. A name that is not given is not part
-                of the batch.
+            further: Indices into the first axis of the field `views` (as `views=`) and of the field `falls` (as
+                `falls=`). Without such indices, the batch does not contain the field.
 
         Returns:
-            The selected arrays by field, and all of `empty`.
+            The selected arrays by name of the field, and the field `empty` without a selection.
         """
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}
@@ -76,17 +79,18 @@ class Arrays:
 
 
 def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> Iterator[np.ndarray]:
-    """Iterate over the batches of a training as arrays of sample indices.
+    """Iterate over the batches of a training, each as an array of sample indices.
 
-    Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the begin of the
-    next, so that no sample is dropped. A batch depends only on `seed` and its number, and not on `start`.
+    Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the start of the
+    next, so that no sample is dropped. The batch of a given number does not depend on `start` and `stop`, so that a
+    resumed training uses the same batches.
 
     Args:
         seed: Seed of the permutations.
         samples: Number of samples.
         batch_size: Number of samples in a batch.
-        start: Number of the first batch, from 0.
-        stop: Number after the last batch.
+        start: Number of the first batch. The numbers of the batches of a training start at 0.
+        stop: Number of the last batch plus 1, as in `range(start, stop)`.
 
     Yields:
         Indices of the samples of one batch, `(batch_size,)`.

@@ -15,8 +15,8 @@ from sts_jax.training.model import Model, load
 def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     """Fit the calibration of a trained state-space model, and write it to `calibration.json` in its folder.
 
-    The calibration corrects the width of the predicted density of the final pose, see `statespace.fit_calibration`. If
-    the model was calibrated on the same arrays before, nothing is fitted and nothing is written.
+    The calibration widens the predicted density of the final pose, which is too narrow for new objects, see
+    `statespace.fit_calibration`. If the model was calibrated on the same arrays before, nothing is fitted or written.
 
     Args:
         workdir: Folder of the model.
@@ -27,7 +27,8 @@ def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
 
     Raises:
         FileNotFoundError: The folder has no trained model.
-        ValueError: The model is not a state-space model, or the arrays do not fit the model.
+        ValueError: The model is not a state-space model, or the names, shapes or values of the arrays do not fit the
+            model.
         OSError: A file is damaged or cannot be written.
         LockedError: Another process works in the folder.
     """

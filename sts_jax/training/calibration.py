@@ -44,14 +44,17 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
         folder: Folder of the model.
 
     Returns:
-        The calibration, and the checksum of the arrays that it was fitted to (None if unknown). None instead of both if
-        the folder has no calibration, or if the model's files changed after the fit.
+        The calibration, and the checksum of the arrays that it was fitted to (None if unknown). If the folder has no
+        calibration, or if the model's files changed after the fit, the result is None instead of a pair.
 
     Raises:
         DamagedFileError: The file is damaged, or was written by another version of sts_jax.
     """
     path = folder / NAME
-    remedy = "restore it from a copy, or delete it and calibrate again (--only train, or training.calibrate)"
+    remedy = (
+        "restore the file from a copy, or delete the file and calibrate again (training.calibrate, or an experiment "
+        "with --only train)"
+    )
     if not path.exists():
         return None
     content: Any = _files.read_json(path, remedy)

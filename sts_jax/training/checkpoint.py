@@ -60,13 +60,13 @@ def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) ->
 
     Args:
         folder: Folder of the model.
-        state: State of the training, or its weights alone.
-        compact: True writes rounded weights in one small file, see `training.rounded`.
+        state: State of the training, or only its weights.
+        compact: True writes all arrays to one small file, in which the weights are rounded, see `training.rounded`.
 
     Raises:
         OSError: The checkpoint cannot be written, for example because the disk is full. The previous checkpoint stays
             valid.
-        ValueError: The folder has a checkpoint but no manifest.
+        ValueError: The folder has a checkpoint but no `manifest.json`, which contains the checksums.
     """
     before = _manifest(folder)
     if before is None:
@@ -100,14 +100,14 @@ def restore(folder: Path, like: State) -> State | None:
 
     Args:
         folder: Folder of the model.
-        like: A state, or the result of `jax.eval_shape` for a state. It sets the structure, the shapes and the dtypes.
+        like: State with the structure, shapes and dtypes of the result. The result of `jax.eval_shape` is sufficient.
 
     Returns:
-        A state of the same structure, or None if the folder has no checkpoint.
+        The state in the checkpoint, or None if the folder has no checkpoint.
 
     Raises:
-        DamagedFileError: A file is damaged, missing or not listed in the manifest.
-        ValueError: The checkpoint was written for another model or optimiser, or has no manifest.
+        DamagedFileError: A file is damaged, missing or not listed in `manifest.json`.
+        ValueError: The checkpoint was written for another model or optimiser, or the folder has no `manifest.json`.
     """
     path = verified(folder)
     return None if path is None else read(path, like)
@@ -123,8 +123,8 @@ def verified(folder: Path) -> Path | None:
         The folder of the current checkpoint, or None if there is no checkpoint.
 
     Raises:
-        DamagedFileError: A file is damaged, missing or not listed in the manifest.
-        ValueError: The folder has a checkpoint but no manifest.
+        DamagedFileError: A file is damaged, missing or not listed in `manifest.json`.
+        ValueError: The folder has a checkpoint but no `manifest.json`, which contains the checksums.
     """
     listed = _manifest(folder)
     if listed is None:
@@ -138,10 +138,10 @@ def read(path: Path, like: State) -> State:
 
     Args:
         path: Folder of the checkpoint.
-        like: A state, or the result of `jax.eval_shape` for a state. It sets the structure, the shapes and the dtypes.
+        like: State with the structure, shapes and dtypes of the result. The result of `jax.eval_shape` is sufficient.
 
     Returns:
-        A state of the same structure.
+        The state in the checkpoint.
 
     Raises:
         ValueError: The checkpoint cannot be read, or an array is missing or has another shape or dtype.
@@ -162,9 +162,9 @@ def read(path: Path, like: State) -> State:
                     "training began with, or train in another folder. Predictor.load reads this model either way."
                 ) from None
             raise ValueError(
-                f"{path} cannot be read {reason}: it was damaged before its checksums were taken, or it belongs to "
-                "another model, or to a version of sts_jax with other networks. Give another folder, load the model "
-                "with the version that trained it, or delete the folder and train again."
+                f"{path} cannot be read {reason}: the checkpoint was damaged before its checksums were taken, or it "
+                "belongs to another model, or to a version of sts_jax with other networks. Give another folder, load "
+                "the model with the version that trained it, or delete the folder and train again."
             ) from None
     return jax.tree.unflatten(jax.tree.structure(like), [loaded[name] for name in _plain(like)])
 
@@ -182,7 +182,7 @@ def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Arra
         there = ocp.metadata(str(path.absolute()), stored).metadata
         _compare(there, wanted)
         if stored == OPTIMISER and there.keys() != wanted.keys():
-            raise ValueError(f"{min(there.keys() - wanted.keys())} is not part of the state of the given optimiser")
+            raise ValueError(f"array {min(there.keys() - wanted.keys())} is not in the state of the given optimiser")
         with context:
             return ocp.load(str(path.absolute()), abstract, checkpointable_name=stored)
 
@@ -196,11 +196,14 @@ def _read_rounded(path: Path, wanted: dict[str, Any]) -> dict[str, Array]:
 def _compare(there: dict[str, Any], wanted: dict[str, Any]) -> None:
     for name, x in wanted.items():
         if name not in there or (there[name].shape, there[name].dtype) != (x.shape, x.dtype):
-            raise ValueError(f"{name} is missing, or has another shape or dtype")
+            raise ValueError(f"array {name} is missing, or does not have shape {x.shape} and dtype {x.dtype}")
 
 
 def seal(folder: str | os.PathLike[str]) -> None:
-    """Write the missing manifest of a model that was trained by sts_jax 0.1, with the checksums of its present files.
+    """Write `manifest.json` for a model of sts_jax 0.1, which did not write this file.
+
+    The manifest contains the checksums of the model's files. A model without a manifest cannot be loaded. Files that
+    were damaged before this call are not detected.
 
     Args:
         folder: Folder of the model.

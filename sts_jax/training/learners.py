@@ -16,7 +16,7 @@ Terms = dict[str, Array]  # scalars by name: the loss and its parts
 
 @runtime_checkable
 class Loss(Protocol):
-    """Type of a loss: a pure function of one batch, which `jax.grad` and `jax.jit` can trace."""
+    """Type of a loss function: a pure function of one batch, which `jax.grad` and `jax.jit` can trace."""
 
     def __call__(
         self,
@@ -61,8 +61,8 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
 
     Args:
         model: Configuration of the model.
-        targets: For `mvae` models: `all` if every subset of the modalities predicts all modalities, `own` if it
-            predicts its members.
+        targets: For `mvae` models: modalities that are predicted from the inputs of each subset of the modalities.
+            `all` predicts all modalities, and `own` only the members of the subset.
         absent: For `mvae` models: names of modalities that no sample has as an input.
 
     Returns:
@@ -100,8 +100,8 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
             f"present has masks for {sorted(arrays.present)}, target_present has masks for "
-            f"{sorted(arrays.target_present)}, but a state-space model has masks only in `present`, for its inputs "
-            f"{list(model.inputs)}: remove all other masks"
+            f"{sorted(arrays.target_present)}, but a state-space model can have masks only for its inputs "
+            f"{list(model.inputs)}, in `present`: remove all other masks"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES
@@ -113,8 +113,8 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         found = {name: x.shape[1:] for name, x in values.items()}
         if found != expected[kind]:
             raise ValueError(
-                f"{kind} has samples of the shapes {found}, but the model needs {expected[kind]}: make the arrays with "
-                "training.state_arrays"
+                f"{kind} has samples of the shapes {found}, but the model needs samples of the shapes "
+                f"{expected[kind]}: make the arrays with training.state_arrays"
             )
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
         raise ValueError(
@@ -130,8 +130,8 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         if values and (found != further[kind] or len({len(x) for x in values.values()}) > 1):
             shapes = {name: x.shape for name, x in values.items()}
             raise ValueError(
-                f"{kind} has arrays of the shapes {shapes}, but it must have samples of the shapes {further[kind]}, "
-                "equally many in all arrays: make them with training.state_arrays"
+                f"{kind} has arrays of the shapes {shapes}, but the samples along the first axis must be equally many "
+                f"in all arrays and have the shapes {further[kind]}: make the arrays with training.state_arrays"
             )
     for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
@@ -148,7 +148,7 @@ def _check_condition(expected: int, arrays: Arrays) -> None:
     if width != expected:
         raise ValueError(
             f"condition has width {width}, but the model needs width {expected}: give a condition of this width (None "
-            f"for 0), or a model with condition={width}"
+            f"for width 0), or a model with condition={width}"
         )
 
 
@@ -164,20 +164,20 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())
         if not needed <= set(values) <= set(model.names):
             raise ValueError(
-                f"{kind} has the modalities {sorted(values)}, but the model with the modalities {sorted(model.names)} "
-                f"needs {sorted(needed)}: give these, or name the missing inputs in `absent`"
+                f"{kind} has the modalities {sorted(values)}, but the model needs {sorted(needed)} and allows only "
+                f"{sorted(model.names)}: add or remove arrays, or name missing inputs in `absent`"
             )
     for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
         if not set(masks) <= set(model.names):
             raise ValueError(
-                f"{kind} has masks for {sorted(masks)}, but the model has the modalities {sorted(model.names)}: remove "
-                "all other masks"
+                f"{kind} has masks for {sorted(masks)}, but the model has only the modalities {sorted(model.names)}: "
+                "remove all other masks"
             )
     for modality in model.modalities:
         for values in (arrays.inputs, arrays.targets):
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
                 raise ValueError(
-                    f"{modality.name}: the samples have the shape {values[modality.name].shape[1:]}, but the modality "
-                    f"of the model has the shape {modality.shape}: give samples of this shape, or another model"
+                    f"modality {modality.name!r}: the samples have the shape {values[modality.name].shape[1:]}, but "
+                    f"the model needs the shape {modality.shape}: give samples of this shape, or another model"
                 )
     _check_condition(model.condition, arrays)

@@ -37,7 +37,7 @@ def initial(
     Args:
         config: Options of the training.
         learner: Initialisation and loss of the model, from `learner`.
-        total: Number of steps of the whole training.
+        total: Number of steps of the whole training, which the default optimiser needs for its learning rate schedule.
         optimiser: Optimiser (default: that of `training.optimiser`).
 
     Returns:
@@ -63,7 +63,8 @@ def step(
         learner: Loss of the model, from `learner`.
         graphdef: Definition of the model.
         config: Options of the training.
-        total: Number of steps of the whole training, which determines `beta` and the learning rate.
+        total: Number of steps of the whole training. It sets the warm-up of `beta`, the weight of the divergence in the
+            loss, and the schedule of the learning rate.
         state: State before the step.
         batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
         optimiser: Optimiser that made `state` (default: that of `training.optimiser`).
@@ -111,8 +112,8 @@ def train(
     """Train a model in the folder `workdir`, or resume its training where an earlier call stopped.
 
     On one machine, a training that was killed and resumed ends with the same bits as an uninterrupted training. If the
-    training in `workdir` has finished, the model is loaded and nothing is written. Files of other names in `workdir`
-    are not changed. Only one process at a time can train in a folder.
+    training in `workdir` has finished, the model is loaded and nothing is written. Other files in `workdir` are not
+    changed. Only one process at a time can train in a folder.
 
     Args:
         config: Options of the training.
@@ -121,8 +122,8 @@ def train(
         workdir: Folder of the model, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
         absent: For `mvae` models: names of modalities that no sample has as an input. `arrays.inputs` need not have
             them.
-        targets: For `mvae` models: `all` if every subset of the modalities predicts all modalities, `own` if it
-            predicts its members.
+        targets: For `mvae` models: modalities that are predicted from the inputs of each subset of the modalities.
+            `all` predicts all modalities, and `own` only the members of the subset.
         preprocessing: Plain values that describe how images and vectors were made. They are stored in `config.json`.
         loss: Loss that replaces the loss of the model (default: that of `training.learner`). `targets` and `absent` are
             not passed to it.
@@ -140,7 +141,7 @@ def train(
 
     Raises:
         ValueError: `workdir` has a training with other settings, other data or another optimiser, or a checkpoint
-            without a manifest, or `arrays` does not fit the model.
+            without `manifest.json`, or the names, shapes or values of `arrays` do not fit the model.
         OSError: A file in `workdir` is damaged or cannot be written.
         LockedError: Another process trains in `workdir`.
         FloatingPointError: The loss is not finite.
@@ -217,7 +218,7 @@ def _run(
                 raise FloatingPointError(
                     f"{workdir}: the loss is {record['loss']} at step {done}: lower TrainConfig.learning_rate (now "
                     f"{config.learning_rate}), or set a lower TrainConfig.clip (now {config.clip}). If you gave an "
-                    "optimiser, change the optimiser instead, because it uses neither"
+                    "optimiser, change that optimiser instead, because it does not use these two options"
                 )
         if done % config.checkpoint_every == 0 or done == total:
             save(workdir, state)

@@ -23,12 +23,12 @@ class Manifest(NamedTuple):
 
 
 def checkpoint(folder: Path, step: int) -> Path:
-    """The folder of the checkpoint of a step, inside the folder of a model."""
+    """Path of the checkpoint of a model at a step: `folder/checkpoints/STEP`, with STEP in eight digits."""
     return folder / "checkpoints" / f"{step:08d}"
 
 
 def read(folder: Path) -> Manifest | None:
-    """Read the manifest in the folder of a model, or return None if there is no manifest.
+    """Read `manifest.json`, the checksums of a model's files. Return None if the folder has no such file.
 
     Raises:
         DamagedFileError: The manifest is damaged, or was written by another version of sts_jax.
@@ -43,14 +43,14 @@ def read(folder: Path) -> Manifest | None:
 
 
 def write(folder: Path, step: int | None) -> Manifest:
-    """Write a manifest that names another checkpoint as the current one.
+    """Write `manifest.json`, which names the current checkpoint and contains the checksums of the model's files.
 
-    The checksums of `config.json` and `blank.npz` are copied from the previous manifest, so that damage to them since
-    then is still found.
+    The checksums of `config.json` and `blank.npz` are copied from the previous manifest, so that later damage to these
+    files is still found.
 
     Args:
         folder: Folder of the model.
-        step: Step of the checkpoint, or None if there is no checkpoint.
+        step: Step of the current checkpoint, or None if there is no checkpoint.
 
     Returns:
         The new manifest.
@@ -68,7 +68,7 @@ def write(folder: Path, step: int | None) -> Manifest:
 
 
 def add(folder: Path, name: str) -> None:
-    """Add the checksum of a file outside the checkpoint to the manifest, if the folder has a manifest.
+    """Add the checksum of a file outside the checkpoint to `manifest.json`, if the folder has this file.
 
     Args:
         folder: Folder of the model.
@@ -84,11 +84,11 @@ def add(folder: Path, name: str) -> None:
 
 
 def verify(folder: Path, manifest: Manifest) -> None:
-    """Compare the files of a model with their checksums.
+    """Compare the files of a model with their checksums in the manifest.
 
     Args:
         folder: Folder of the model.
-        manifest: Manifest of the folder.
+        manifest: Manifest of this folder, from `read`.
 
     Raises:
         DamagedFileError: A file has changed, is missing or is not listed. The message names the file and the remedy.

@@ -20,8 +20,8 @@ KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.
 class Model(NamedTuple):
     """A trained model.
 
-    `graphdef` and `state` are the arguments of `mvae.predict` for an `mvae` model, and of `statespace.sample` for a
-    state-space model.
+    `graphdef` and `state` are the first two arguments of `mvae.predict` for an `mvae` model, and of `statespace.sample`
+    for a state-space model.
     """
 
     config: Config  # configuration of the model
@@ -55,7 +55,7 @@ def load(workdir: str | os.PathLike[str]) -> Model:
     Raises:
         FileNotFoundError: The folder has no `config.json` or no checkpoint.
         OSError: A file is damaged, missing or not listed in `manifest.json`.
-        ValueError: The model was written by another version of sts_jax, or the folder has no manifest.
+        ValueError: The model was written by another version of sts_jax, or the folder has no `manifest.json`.
     """
     workdir = Path(workdir)
     while True:

@@ -9,11 +9,11 @@ from sts_jax.training.config import TrainConfig
 
 
 def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
-    """Make the optimiser of a training: Adam, with `encoder_epsilon` for the encoders of an `mvae` model.
+    """Make the default optimiser of a training: Adam, whose epsilon is `encoder_epsilon` for encoders of `mvae` models.
 
     Args:
         config: Options of the training.
-        total: Number of steps of the whole training. A cosine schedule reaches 0 after it.
+        total: Number of steps of the whole training, after which a cosine schedule reaches 0.
 
     Returns:
         The optimiser, with the learning rate schedule and the clipping of `config`.

@@ -24,7 +24,9 @@ _NORMAL = 1.4826  # standard deviation of a normal distribution divided by its m
 
 @dataclasses.dataclass(frozen=True)
 class Preprocessing:
-    """How images, poses and conditions are encoded for a model, and which tactile images show a contact.
+    """How images, poses and scenario conditions are encoded for a model, and which tactile images show a contact.
+
+    A scenario condition has the known quantities of a trajectory, such as the acceleration of the pad.
 
     Raises:
         ValueError: `rotation` is unknown, `touch_block` does not divide `resolution`, or `touch_blocks` is below 1.
@@ -50,7 +52,8 @@ class Preprocessing:
             raise ValueError(f"rotation must be 'matrix' or 'quaternion', got {self.rotation!r}")
         if self.touch_block < 1 or any(side % self.touch_block for side in self.resolution):
             raise ValueError(
-                f"touch_block must divide height and width of the resolution {self.resolution}, got {self.touch_block}"
+                f"touch_block must divide the height and the width of resolution {self.resolution}, got "
+                f"{self.touch_block}"
             )
         if self.touch_blocks < 1:
             raise ValueError(f"touch_blocks must be >= 1, got {self.touch_blocks}")
@@ -64,11 +67,11 @@ class Preprocessing:
         """Encode poses for the networks.
 
         Args:
-            pose: Position (m) and quaternion of each pose. Quaternions are normalised.
+            pose: Position (m) and quaternion (w, x, y, z) of each pose. Quaternions are normalised.
 
         Returns:
-            Position divided by `position_scale`, followed by the rotation matrix row by row, or by the unit quaternion
-            with `w >= 0`.
+            Position divided by `position_scale`, followed by the nine entries of the rotation matrix row by row. If
+            `rotation` is `quaternion`, the position is followed by the unit quaternion (w, x, y, z) with `w >= 0`.
         """
         position, quat = pose[..., :3] / self.position_scale, geometry.quat_canonical(pose[..., 3:])
         if self.rotation == "matrix":
@@ -79,11 +82,11 @@ class Preprocessing:
         """Decode poses from the output of a network.
 
         Args:
-            code: Encoded poses. The numbers of a rotation need not be an exact rotation matrix or a unit quaternion:
-                the nearest rotation is used, and the identity if all numbers are 0.
+            code: Encoded poses, as from `encode_pose`. An inexact rotation matrix or a quaternion of another length is
+                replaced by the nearest rotation. If all of its numbers are 0, the identity is used.
 
         Returns:
-            Position (m) and unit quaternion with `w >= 0` of each pose.
+            Position (m) and unit quaternion (w, x, y, z) with `w >= 0` of each pose.
         """
         quat = code[..., 3:]
         if self.rotation == "matrix":
@@ -98,10 +101,10 @@ class Preprocessing:
         """Encode conditions for the networks.
 
         Args:
-            condition: Conditions of a scenario (SI units).
+            condition: Known quantities of the scenario such as an acceleration, c numbers for each item (SI units).
 
         Returns:
-            The numbers divided by `condition_scale`.
+            The numbers divided by `condition_scale`, their typical sizes.
         """
         return condition / jnp.array(self.condition_scale, jnp.float32)
 
@@ -113,8 +116,10 @@ class Preprocessing:
             blank: Tactile image of the empty sensor in [0, 1].
 
         Returns:
-            True for images that differ from the blank image in at least `touch_blocks` blocks. True for all images if
-            `mask_blank_touch` is False.
+            True for images in which at least `touch_blocks` square blocks of `touch_block` pixels on a side differ from
+            the blank image. A block differs if its mean changes by more than `touch_threshold` in any channel. If
+            `touch_level` is True, the median change of each image and channel is subtracted first. If
+            `mask_blank_touch` is False, the result is True for all images.
         """
         if not self.mask_blank_touch:
             return jnp.ones(tactile.shape[:-3], bool)
@@ -128,15 +133,18 @@ class Preprocessing:
 def touch_of_noisy_images(
     preprocessing: Preprocessing, tactile: UInt8[np.ndarray, "n h w 3"], blank: UInt8[np.ndarray, "h w 3"]
 ) -> Preprocessing:
-    """Adapt the contact test of a preprocessing to the noise of a camera's images.
+    """Adapt the contact test `Preprocessing.touched` to the noise of a camera's images.
 
-    An image then shows a contact if at least three blocks of 2 x 2 pixels differ from the blank image by more than a
-    threshold. The threshold is six standard deviations of the noise of a block's mean, limited to 3/255 to 24/255. The
-    standard deviation is estimated as 1.4826 times the median absolute difference from the blank image. Contacts on
-    less than half of the pad hardly change this median. Slow changes of the light since the blank image increase it.
+    With the new fields, an image shows a contact if at least three blocks of 2 x 2 pixels differ from the blank image
+    by more than a threshold. The threshold is six times the standard deviation of the noise in the mean of a block, but
+    at least 3/255 and at most 24/255.
+
+    The standard deviation is estimated as 1.4826 times the median absolute difference from the blank image. Contacts on
+    less than half of the pad hardly change this median. Slow changes of the light after the blank image was taken
+    increase the median.
 
     Args:
-        preprocessing: Preprocessing whose other fields are kept.
+        preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.
         tactile: Images of the empty pad, or of contacts on less than half of the pad.
         blank: Tactile image of the empty sensor, a mean over many frames.
 
@@ -149,8 +157,9 @@ def touch_of_noisy_images(
     shape = (*preprocessing.resolution, 3)
     if tactile.shape[1:] != shape or blank.shape != shape or not len(tactile):
         raise ValueError(
-            f"tactile has shape {tactile.shape} and blank has shape {blank.shape}, but they must be (n, "
-            f"{', '.join(map(str, shape))}) with n >= 1 and {shape}: resize the images to preprocessing.resolution"
+            f"tactile has shape {tactile.shape} and blank has shape {blank.shape}, but tactile must have shape (n, "
+            f"{', '.join(map(str, shape))}) with n >= 1, and blank must have shape {shape}: resize the images to "
+            "preprocessing.resolution"
         )
     change = _block_means(tactile.astype(np.float32) - blank, _NOISY_BLOCK)
     change = change - np.median(change, axis=(-3, -2), keepdims=True)
@@ -218,17 +227,18 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             images = arrays["visual"], arrays["tactile"]
         if any(image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 for image in images):
-            raise ValueError(f"images of {images[0].dtype} {images[0].shape} and {images[1].dtype} {images[1].shape}")
+            found = ", ".join(f"{image.dtype} {image.shape}" for image in images)
+            raise ValueError(f"the images are {found}, but they must be uint8 (height, width, 3)")
     except Exception as error:  # zipfile, zlib and NumPy raise many types for damaged archives
         raise _files.DamagedFileError(
             f"{path} is damaged ({type(error).__name__}: {error}): delete it and start the training again, which "
-            "writes it anew."
+            "writes the file anew."
         ) from error
     return images
 
 
 def preprocessing_from_json(content: dict) -> Preprocessing:
-    """Make a preprocessing from the result of `dataclasses.asdict`, or from the same values read from a JSON file.
+    """Make a `Preprocessing` from the result of `dataclasses.asdict`, or from the same values read from a JSON file.
 
     Args:
         content: Values of the fields of a `Preprocessing` by name.
@@ -247,6 +257,6 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
         return Preprocessing(**content)
     except (KeyError, TypeError) as error:
         raise ValueError(
-            f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): give dataclasses.asdict "
-            "of a training.Preprocessing as preprocessing= to training.train."
+            f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): train the model with "
+            "the argument preprocessing=dataclasses.asdict(p) of training.train, where p is a training.Preprocessing."
         ) from error

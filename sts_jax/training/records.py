@@ -14,7 +14,7 @@ Record = dict[str, float]  # `step`, and the parts of the loss by name
 
 
 def mean(step: int, recent: list[Terms]) -> Record:
-    """Make the record of a step.
+    """Make the record of the training log at a step.
 
     Args:
         step: Number of steps done.
@@ -44,7 +44,8 @@ def read(path: Path, last: int) -> list[Record]:
         lines = path.read_bytes().splitlines() if path.exists() else []
     except OSError as error:
         raise OSError(
-            f"cannot read {path}: {error}. Check its permissions, or delete it to continue without it."
+            f"cannot read {path}: {error}. Check the permissions of this training log, or delete the file to continue "
+            "without the earlier records."
         ) from error
     records = []
     for number, line in enumerate(lines, 1):
@@ -64,7 +65,7 @@ def read(path: Path, last: int) -> list[Record]:
 
 
 def write(path: Path, records: list[Record]) -> None:
-    """Replace the training log by these records.
+    """Replace the training log `path` by the given records.
 
     Raises:
         OSError: The file cannot be written.
@@ -73,7 +74,7 @@ def write(path: Path, records: list[Record]) -> None:
 
 
 def append(path: Path, record: Record) -> None:
-    """Append one record to the training log.
+    """Append one record to the training log `path`.
 
     Raises:
         OSError: The file cannot be written.

@@ -18,11 +18,14 @@ _STEP = ":step"  # suffix of the name of the array that has the steps of a kerne
 
 
 def write(path: Path, arrays: dict[str, ArrayLike]) -> None:
-    """Write arrays to a file. float32 arrays with two or more axes are rounded, and all others are unchanged.
+    """Write arrays to a compressed file. float32 arrays with two or more axes are rounded, all others are unchanged.
+
+    The rounding steps are separate for each index of the last axis, which is the output channel of a kernel. A step is
+    1/128 of the root mean square of the values, or more if the largest value does not fit into 16 bits.
 
     Args:
         path: File to write, with the suffix `.npz`.
-        arrays: Arrays by name. The last axis of a kernel is that of its output channels.
+        arrays: Arrays by name.
 
     Raises:
         OSError: The file cannot be written.
@@ -52,7 +55,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
         Arrays by name. Rounded arrays are float32.
 
     Raises:
-        Exception: The file is damaged. zipfile, zlib and NumPy raise many types.
+        Exception: The file is damaged. The type depends on the damage (errors of zipfile, zlib or NumPy).
     """
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         stored = dict(file)

@@ -9,16 +9,19 @@ def shifted(
 ) -> UInt8[np.ndarray, "n 2 h w 3"]:
     """Shift the images of trajectories to other places on a level pad.
 
-    The difference from the image of the empty pad is shifted and added to this image, so that the light of the empty
-    pad stays at its place. The result is exact for points on the pad under distant lights. A point at the height h
-    above the pad should move by the share d / (d + h) of the shift only, where d is the distance from the camera to the
-    pad. If the border of the image cuts off a part of an object, this part is missing after the shift, too.
+    The function subtracts the image of the empty pad, shifts the difference, and adds the image of the empty pad again.
+    The light on the empty pad therefore stays in place.
+
+    The result is exact for points on the pad under distant lights. For a point at the height h above the pad, the shift
+    is too large by the factor 1 + h / d, where d is the distance from the camera to the pad. If the border of the image
+    cuts off a part of an object, this part is missing after the shift, too.
 
     Args:
-        images: First and last image of each trajectory, all visual or all tactile.
-        empty: Image of the empty pad, visual or tactile as the others.
-        shifts: Rows and columns by which each trajectory is shifted (pixels). The visual and the tactile images of a
-            trajectory need the same shift.
+        images: First and last image of each of n trajectories, all visual or all tactile.
+        empty: Image of the empty pad, visual or tactile like `images`.
+        shifts: Numbers of rows and columns by which each trajectory is shifted (pixels). Positive shifts move the
+            object to larger row and column indices. The visual and the tactile images of a trajectory need the same
+            shift.
 
     Returns:
         Shifted images, of the same shape.
@@ -30,12 +33,13 @@ def shifted(
     if empty.shape != images.shape[2:] or shifts.shape != (len(images), 2):
         raise ValueError(
             f"images has shape {images.shape}, empty has shape {empty.shape} and shifts has shape {shifts.shape}, but "
-            "they must have shapes (n, 2, h, w, 3), (h, w, 3) and (n, 2)"
+            "images must have shape (n, 2, h, w, 3), empty must have shape (h, w, 3), and shifts must have shape "
+            "(n, 2), with the same n, h and w"
         )
     if (np.abs(shifts) >= size).any():
         raise ValueError(
-            f"shifts has values up to {np.abs(shifts).max()} pixels, but they must be below the size {size} of the "
-            "images"
+            f"shifts has up to {tuple(np.abs(shifts).max(0).tolist())} rows and columns, but these numbers must be "
+            f"below the size {size} of the images: give smaller shifts"
         )
     moved = np.empty_like(images)
     for out, pair, shift in zip(moved, images, shifts, strict=True):

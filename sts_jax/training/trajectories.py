@@ -23,13 +23,14 @@ def frame_arrays(
 
     Args:
         pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
-        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
-        preprocessing: Preprocessing of poses and conditions, with the criterion for a contact.
+        modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
+        preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:
-        The arrays, and the preprocessing with a new field `absent`. `absent` is `("tactile",)` if `tactile` is a
-        modality and no first frame shows a contact. The arrays then have no input `tactile`.
+        The arrays, and the preprocessing with a new field `absent`, the modalities that no sample has as an input. If
+        `tactile` is a modality and no first frame shows a contact, `absent` is `("tactile",)`, and the arrays have no
+        input `tactile`. Otherwise `absent` is empty.
     """
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -50,16 +51,16 @@ def image_arrays(
         visual: First and last visual image of each trajectory, for example from `hardware.recorded_images`.
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
-        preprocessing: Preprocessing with the criterion for a contact, see `touch_of_noisy_images`. First tactile images
-            without contact are not inputs.
+        preprocessing: Preprocessing with the test that finds contacts in tactile images, see `touch_of_noisy_images`.
+            If the first tactile image of a trajectory shows no contact, this sample does not have the input `tactile`.
         blank: Tactile image of the empty sensor.
 
     Returns:
         The arrays, and the preprocessing with a new field `absent`, as from `frame_arrays`.
 
     Raises:
-        ValueError: `modalities` has another name or none, or the images have another type or shape than
-            `preprocessing.resolution` requires.
+        ValueError: `modalities` is empty or has a name other than `visual` and `tactile`, or the images are not uint8
+            with the resolution `preprocessing.resolution`.
     """
     found, shape = {"visual": visual, "tactile": tactile}, (2, *preprocessing.resolution, 3)
     if not modalities or not set(modalities) <= set(found):
@@ -68,7 +69,7 @@ def image_arrays(
         if images.dtype != np.uint8 or images.shape != (len(visual), *shape) or not len(images):
             raise ValueError(
                 f"{name} is {images.dtype} of shape {images.shape}, but visual and tactile must be uint8 of shape (n, "
-                f"{', '.join(map(str, shape))}) with the same n >= 1"
+                f"{', '.join(map(str, shape))}) with the same n >= 1: convert and resize the images to this shape"
             )
     return _arrays(found, modalities, preprocessing, blank, None)
 
@@ -93,10 +94,12 @@ def _arrays(
 
 
 def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mvae.Config:
-    """Make the configuration of the paper's networks. The weight lambda is 1 for images and 1000 for the pose.
+    """Make the configuration of the paper's networks.
+
+    In the loss, the weight of the reconstruction error is 1 for images and 1000 for the pose.
 
     Args:
-        modalities: Modalities of the model, some of `visual`, `tactile` and `pose`.
+        modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
         preprocessing: Preprocessing of the training arrays.
 
     Returns:
@@ -122,15 +125,15 @@ def state_arrays(
     """Make the training arrays of a state-space model.
 
     Args:
-        pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`. The side of their images must be
-            `model.input_size`.
+        pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`. The images must have
+            `model.input_size` pixels on each side.
         model: Configuration of the model, from `state_model`.
         scenario: Scenario of the trajectories.
-        preprocessing: Preprocessing of poses and conditions, with the criterion for a contact.
+        preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
         empty: `visual` and `tactile` image of the empty sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
-        views: Images of objects at further starts without a trajectory, from `dataset.Dataset.views`. They are used
-            only if `visual` is an input of the model.
-        falls: Further trajectories without images, from `dataset.Dataset.ends`.
+        views: Visual images of objects in initial poses that were not simulated, from `dataset.Dataset.views`. They are
+            used only if `visual` is an input of the model.
+        falls: First and last poses of further trajectories without images, from `dataset.Dataset.ends`.
 
     Returns:
         The arrays.
@@ -194,13 +197,13 @@ def state_codes(
 
     Args:
         preprocessing: Preprocessing of the model.
-        pose: Positions (m) and unit quaternions, `(n, 7)`.
+        pose: Positions (m) and unit quaternions (w, x, y, z), `(n, 7)`.
         support: Support functions of the convex hulls at `objects.DIRECTIONS`, `(n, 128)` (m).
         mass: Masses, `(n,)` (kg).
         com: Centres of mass in the mesh frame, `(n, 3)` (m).
 
     Returns:
-        State codes, `(n, code)`, see `statespace.encode`.
+        State codes, `(n, code)`, as from `statespace.encode`.
     """
     encode = jax.jit(statespace.encode)
     parts = []
@@ -220,19 +223,20 @@ def state_model(
     *,
     image_size: int = 64,
 ) -> tuple[statespace.Config, Preprocessing]:
-    """Make the configuration of a state-space model of the size that the experiments use.
+    """Make the configuration of a state-space model with the network sizes of the experiments.
 
     Args:
         pairs: First and last frames of the training trajectories, from `dataset.Dataset.pairs`.
         sensor: Sensor of the images.
         scenario: Scenario of the trajectories.
-        preprocessing: Preprocessing of poses and conditions, with square images of the whole view.
+        preprocessing: Preprocessing of the trajectories. Its images must be square and show the whole view.
         empty: `visual` and `tactile` image of the empty sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
         image_size: Side of the predicted images (pixels). It must divide the side of the input images.
 
     Returns:
-        The configuration, and the preprocessing with a new field `absent`. If no first frame shows a contact, `tactile`
-        is not an input of the model, and `absent` is `("tactile",)`.
+        The configuration, and the preprocessing with a new field `absent`, the modalities that no sample has as an
+        input. If no first frame shows a contact, `tactile` is not an input of the model, and `absent` is
+        `("tactile",)`. Otherwise `absent` is empty.
 
     Raises:
         ValueError: The images are not square or are cropped, or their side is not a multiple of `image_size`.
