@@ -152,8 +152,8 @@ class ProvenFrames:
         if slowest_s > watch_s - period_s:
             raise LightError(
                 f"the image still changes {slowest_s:.2f} s after a switch of the lights, but frames were collected "
-                f"for only {watch_s:.2f} s: keep the scene at rest and lock the camera's exposure. If the lights are slow, "
-                "pass longer times as STS(settling=Settling(visual_s, tactile_s))."
+                f"for only {watch_s:.2f} s: keep the scene at rest and lock the camera's exposure. If the lights "
+                "are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
             )
         return found
 

@@ -132,7 +132,7 @@ class Recordings:
                 must have the same shape. The default returns the raw image.
 
         Returns:
-            Four arrays: the initial visual, initial tactile, final visual and final tactile images.
+            The initial visual, initial tactile, final visual and final tactile images, in this order.
 
         Raises:
             DamagedFileError: A file is missing or damaged.
