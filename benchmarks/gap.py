@@ -182,7 +182,9 @@ def sessions(args: Args) -> hardware.Recordings:
             with make(args.seed, imperfections, own) as device:
                 poses.append(record(device, args.workdir / name, args.trajectories, name, bar))
     if poses[0] != poses[1]:
-        raise AssertionError("the logs of the two twins show different poses, although their seeds are equal")
+        raise AssertionError(
+            f"the two twins have the seed {args.seed} but recorded different poses: delete {args.workdir} and run again"
+        )
     hardware.Device(
         camera="http://127.0.0.1/camera",
         fps=30.0,

@@ -228,9 +228,9 @@ def test_images_copied_over_others_and_a_flipped_bit_are_refused(copied):
     [
         (
             lambda split: split["test"].append(split["train"][0]),
-            "object . must be in one part, but it occurs 2 times",
+            "object . must be in exactly one of train, validation, test, but it occurs 2 times",
         ),
-        (lambda split: split["train"].pop(), "object . must be in one part, but it occurs 0 times"),
+        (lambda split: split["train"].pop(), "in exactly one of train, validation, test, but it occurs 0 times"),
         (lambda split: split["test"].append(4), "test contains object 4, but the objects are 0 to 3"),
         (lambda split: split["test"].append(-1), "test contains object -1"),
         (lambda split: split["test"].append(1.5), "test must be a list of whole numbers"),

@@ -156,5 +156,5 @@ def test_missing_columns_are_named(tmp_path):
 
 def test_a_table_without_a_usable_object_is_refused(tmp_path):
     shapenet.build(tmp_path, [shapenet.row("a", "Watch", unit="")], {"a": box()})
-    with pytest.raises(ValueError, match=r"contains no usable mesh.*\n  a: the model has no unit"):
+    with pytest.raises(ValueError, match=r"contains no usable mesh.*\n  a: the row of the model .* has no unit"):
         objects.library(tmp_path)

@@ -198,7 +198,7 @@ class Dataset:
         return self.split[part]
 
     def ends(self, trajectories: np.ndarray) -> Ends:
-        """First and last poses of some trajectories, which may lack images.
+        """Return the first and last poses of trajectories. Trajectories without images are allowed.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
@@ -406,6 +406,7 @@ def _read_split(path: Path, num_objects: int) -> dict[str, np.ndarray]:
     if (times != 1).any():
         number = int(np.flatnonzero(times != 1)[0])
         raise DamagedFileError(
-            f"{path}: object {number} must be in one part, but it occurs {times[number]} times: {remedy}."
+            f"{path}: object {number} must be in exactly one of {', '.join(content)}, but it occurs {times[number]} "
+            f"times: {remedy}."
         )
     return {name: np.array(part, np.int64) for name, part in content.items()}

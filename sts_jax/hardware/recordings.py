@@ -49,7 +49,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordedTrajectory:
-    """A confirmed trajectory: the raw images at its beginning and at its end."""
+    """A recorded trajectory that its user has confirmed: the raw images at its beginning and at its end."""
 
     number: int  # number of the trajectory in its session
     initial: Pair  # images of the held object

@@ -248,7 +248,8 @@ def facts(body: Body, apart: tuple[float, float]) -> list[str]:
 
     Args:
         body: One body.
-        apart: Both distances (m) between the surface and the collision parts, as `gaps` returns them.
+        apart: Largest distances by which the surface lies outside the collision parts and the parts lie outside the
+            surface (m), as `gaps` returns them.
 
     Returns:
         Size along x, y and z (mm), number of faces, number of vertices of the collision parts, and both distances (mm).

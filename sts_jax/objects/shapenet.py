@@ -85,8 +85,8 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
                 raise ValueError("the model has the category _BAD in metadata.csv, so it is not used")
             if len(labels) > 1:
                 raise ValueError(
-                    f"the model has categories of several classes ({', '.join(sorted(labels))}) in metadata.csv: keep "
-                    "only one class"
+                    f"the row of the model in metadata.csv has categories of several classes "
+                    f"({', '.join(sorted(labels))}): delete all but one of them in the file"
                 )
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
             if path is None:
@@ -122,7 +122,10 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
     """Make the item of a row, or raise a ValueError with the reason why the row cannot be used."""
     unit = row["unit"].strip()
     if not unit:
-        raise ValueError("the model has no unit in metadata.csv, so its size is unknown: add the unit in metres")
+        raise ValueError(
+            "the row of the model in metadata.csv has no unit, so its size is unknown: write the length of one unit of "
+            "its mesh in metres, such as 0.01"
+        )
     try:
         scale = float(unit)
     except ValueError:

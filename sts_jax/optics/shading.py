@@ -212,14 +212,14 @@ def housing(
 def empty_view(
     room: Room, square_radius: Float[Array, "*n"], walls: Float[Array, "*n"], hidden: Float[Array, "*n"]
 ) -> Float[Array, "*n 3"]:
-    """Background of the view: the pad and the walls, with the object's shadow on the skin but without the object.
+    """Render the background of the visual image: the empty pad, the walls below it, and the object's shadow on the pad.
 
     Args:
         room: Constants of the external light.
         square_radius: Squared distance from the pad's centre on the gel's face, `(2 x / width)^2 + (2 y / height)^2`
             for a pad of this width and height. It is 1 at the middle of each edge.
-        walls: Brightness of the housing, from `housing`: an sRGB value divided by that of the pad. The square of this
-            ratio approximates the ratio in linear light.
+        walls: Brightness of the housing's walls relative to the pad, as a ratio of sRGB values, from `housing`. This
+            function squares the ratio to approximate the ratio of linear light.
         hidden: Share of the sky that the object hides, from `hidden_sky`. Zeros give the view of the empty sensor.
 
     Returns:

@@ -97,9 +97,10 @@ class Released(Scenario):
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one held pose and the share of the weight on the pad. `Scenario.start` describes the arguments.
 
-        Two faces meet at an edge. The object leans from the narrower one, where it balances at 15 to 45 degrees.
-        Returning then usually turns the object by less than 45 degrees, and toppling by more. `outcome` uses this
-        difference. An object without such an edge, for example a cylinder on its side, leans over another edge.
+        The object stands on one of the two faces at an edge and is tilted over this edge. The face is the narrower one,
+        so the object balances on the edge at a tilt of 15 to 45 degrees. An object that returns to the face then
+        usually turns by less than 45 degrees, and one that topples turns by more. `outcome` uses this difference. If an
+        object has no such edge, for example a cylinder on its side, it is tilted over another edge.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)

@@ -196,7 +196,7 @@ class Scenario(abc.ABC):
 
     @property
     def condition_scale(self) -> tuple[float, ...]:
-        """Typical size of each number of the condition (`quantities`), in SI units."""
+        """Typical magnitude of each number of the condition, such as the acceleration of the pad, in SI units."""
         return tuple(q.scale for q in self.quantities for _ in range(2 if q.vector else 1))
 
     @property

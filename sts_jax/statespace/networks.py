@@ -181,12 +181,13 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
     Traits do not depend on the object's rotation. Functions describe an appearance that depends on the direction.
 
     Args:
-        config: Configuration of the model, with the numbers `traits`, `own` and `shown`.
-        look: Appearance codes.
+        config: Configuration of the model. It has `config.traits` traits, `config.own` functions of a direction in the
+            mesh frame, and `config.shown` functions of a direction in the sensor frame.
+        look: Appearance codes of n items.
 
     Returns:
-        The traits `(n, traits)`, and k spherical harmonic coefficients for each function. The functions `(n, own, k)`
-        depend on a direction in the mesh frame, and `(n, shown, k)` on a direction in the sensor frame.
+        Three arrays. The first has the traits, `(n, traits)`. The others have k spherical harmonic coefficients of each
+        function: `(n, own, k)` in the mesh frame and `(n, shown, k)` in the sensor frame.
     """
     count = harmonics.number(config.degree)
     traits, own, shown = jnp.split(look, [config.traits, config.traits + config.own * count], axis=-1)
@@ -479,7 +480,7 @@ def _on_canvas(
 
 
 class Model(nnx.Module):
-    """The networks of a state-space model: an encoder for each image that is an input, a transition and a decoder."""
+    """The networks of a state-space model: a transition, a decoder, and an encoder for each image among the inputs."""
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config

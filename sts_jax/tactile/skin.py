@@ -25,9 +25,10 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Lights:
-    """Far internal lights. Each light has one direction at all points, and there may be any number m of lights.
+    """Lights inside the sensor, modelled as directional lights. There may be any number m of lights.
 
-    The defaults are those of the paper's code: four lights in the gel's plane, one from each edge of the image.
+    The defaults are those of the code of the See-Through-your-Skin paper: four lights in the gel's plane, one from each
+    edge of the image.
     """
 
     # Directions from the skin towards the lights, sensor frame. Any length > 0. Defaults: left, right, top and bottom

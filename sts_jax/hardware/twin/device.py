@@ -277,7 +277,8 @@ class Twin:
     def make(self, index: int) -> Made | None:
         """Produce a frame, and write it to the files `log` and `record` of the twin.
 
-        Call this method when the exposure of the frame has ended (`end_s`), and always from the same thread.
+        Call this method at the time `end_s(index)` or later, when the exposure of the frame has ended, and always from
+        the same thread.
 
         Args:
             index: Number of the frame, from 0. It must increase from call to call.

@@ -72,7 +72,9 @@ class Scene(abc.ABC):
 
         Args:
             seen: State of the scene, as `at` returns it.
-            blender: Blender of the twin. `Blender.ends` converts the rendered images.
+            blender: The twin's `Blender`, which mixes both images in each frame. Its method `ends` converts the
+            rendered
+                images to linear light, and applies lens distortion and vignetting.
 
         Returns:
             The converted images.
