@@ -132,7 +132,7 @@ def test_a_file_of_another_sensor_is_refused(peer, tmp_path):
     file = sensor_file(peer, tmp_path / "sensor.json")
     peer.leds.controller._serial_number = "EMULATED"
     options = real.Collect(tmp_path, leds=peer.path, sensor=file, lock=False, headless=True, automatic=True)
-    with pytest.raises(SystemExit, match="LED controller OTHER, but the connected device has LED controller EMULATED"):
+    with pytest.raises(SystemExit, match="LED controller OTHER, but the connected sensor has LED controller EMULATED"):
         real.main(options)
 
 

@@ -151,7 +151,9 @@ def test_a_folder_is_locked_until_the_process_that_holds_it_ends(tmp_path):
     with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": root}, **pipes) as other:
         assert other.stdout.readline() == "held\n"
         with (
-            pytest.raises(_files.LockedError, match=rf"one is in use by process {other.pid} on .*: wait until it"),
+            pytest.raises(
+                _files.LockedError, match=rf"one is in use by process {other.pid} on .*: wait until that process"
+            ),
             _files.lock(folder),
         ):
             pytest.fail("held twice")

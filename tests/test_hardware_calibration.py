@@ -277,7 +277,7 @@ def test_missing_boards_are_named(images):
     message = (
         rf"only 3 of 7 images .* 6 are needed.* not found in images 3, 5, 6.*corners were found in image 4 \({count} "
     )
-    with pytest.raises(CalibrationError, match=message + ".*Check that the board"):
+    with pytest.raises(CalibrationError, match=message + ".*Check that `board`"):
         calibrate([*images[:3], empty, few, empty, empty], BOARD)
     with pytest.raises(
         CalibrationError, match=r"image 0, in which the board lies on the pad, shows 0 corners of the board"

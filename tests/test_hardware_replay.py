@@ -144,7 +144,9 @@ def test_a_recorder_refuses_bad_input(folder, tmp_path):
         hardware.Recorder(tmp_path / "new", ORIGIN, encoding="gif")
     with (
         hardware.Recorder(tmp_path / "new", ORIGIN) as recorder,
-        pytest.raises(ValueError, match=r"has shape \(4, 4, 3\), but the images of this recording have \(48, 64, 3\)"),
+        pytest.raises(
+            ValueError, match=r"has shape \(4, 4, 3\), but all images of this recording must have shape \(48, 64, 3\)"
+        ),
     ):
         recorder.add(dataclasses.replace(shot(0), image=np.zeros((4, 4, 3), np.uint8)))
 

@@ -42,7 +42,7 @@ def test_files_of_any_folder_take_the_axes_of_their_format_and_the_given_size(fo
 def test_a_missing_and_an_empty_folder_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="nowhere: no such folder"):
         objects.library(tmp_path / "nowhere")
-    with pytest.raises(ValueError, match=f"{tmp_path.name}: contains no mesh"):
+    with pytest.raises(ValueError, match=f"{tmp_path.name}: the folder contains no usable mesh"):
         objects.library(tmp_path)
 
 

@@ -241,7 +241,9 @@ def test_a_model_without_preprocessing_is_named(folder, tmp_path, monkeypatch):
     for wrong in ({}, {"view": "pad"}, {**model.settings["preprocessing"], "resolution": 3}):
         settings = {**model.settings, "preprocessing": wrong}
         monkeypatch.setattr(training, "load", lambda _, settings=settings: model._replace(settings=settings))
-        with pytest.raises(ValueError, match=r"config\.json, preprocessing: .*preprocessing= to training\.train"):
+        with pytest.raises(
+            ValueError, match=r"config\.json, preprocessing: .*argument preprocessing=.* of training\.train"
+        ):
             sts.Predictor.load(folder)
 
 
@@ -367,7 +369,7 @@ POSE = measurement()["pose"]
         ({"pose": POSE, "present": [True]}, "present is a list"),
         ({"pose": POSE, "present": {"pose": 1.0}}, r"present\['pose'\] is float64, but it must be bool"),
         ({"pose": POSE, "present": {"pose": "yes"}}, r"present\['pose'\] is 'yes'"),
-        ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*one of \['pose'\]"),
+        ({"pose": POSE, "present": {"sound": True}}, r"present\['sound'\].*must be among \['pose'\]"),
         ({"pose": POSE, "condition": "fast"}, "condition is 'fast'"),
         ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, 2, SIDE, SIDE, 3))}, "the leading axes differ"),
         ({"pose": np.tile(POSE, (2, 3, 1)), "visual": np.zeros((3, SIDE, SIDE, 3))}, "the leading axes differ"),
