@@ -81,7 +81,7 @@ def test_every_reroll_begins_at_the_start_of_its_item_and_its_end_is_a_sample(en
 def test_another_start_than_that_of_the_item_is_refused(engine, monkeypatch):
     real = rerolls.physics.simulate
     monkeypatch.setattr(rerolls.physics, "simulate", lambda key, *rest, **k: real(jax.random.key(9), *rest, **k))
-    with pytest.raises(RuntimeError, match="simulate changed its keys"):
+    with pytest.raises(RuntimeError, match="first pose of a re-roll differs"):
         evaluation.ceiling(COLLECTION, sts.Sensor(), starts(), TIMES, jax.random.key(0))
 
 
