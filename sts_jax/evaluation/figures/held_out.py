@@ -1,5 +1,6 @@
 """Figures of predictions of held-out trajectories. Each function writes one file."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -78,7 +79,8 @@ def predictions(
             tip = middle + drift[item] * width / 4
             axes[row, 0].annotate("", tip, middle, arrowprops={"arrowstyle": "->", "color": "red"})
     arrows = "\nred arrow: velocity over the pad that a freely sliding object receives" if drift.any() else ""
-    figure.suptitle(title + arrows, fontsize=11)
+    wrapped = textwrap.fill(title, int(11 * figure.get_figwidth()))  # about eleven letters fit into an inch
+    figure.suptitle(wrapped + arrows, fontsize=11)
     drawing.save(figure, path)
 
 
