@@ -73,8 +73,7 @@ class Scene(abc.ABC):
         Args:
             seen: State of the scene, as `at` returns it.
             blender: The twin's `Blender`, which mixes both images in each frame. Its method `ends` converts the
-                rendered
-                images to linear light, and applies lens distortion and vignetting.
+                rendered images to linear light, and applies lens distortion and vignetting.
 
         Returns:
             The converted images.
