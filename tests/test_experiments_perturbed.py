@@ -98,7 +98,7 @@ def test_a_model_takes_a_jerk_in_si_units(workdir):
     out = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition)
     other = predictor(tactile=pairs.tactile[:, 0] / 255, condition=pairs.condition * [-1, -1, 1])
     assert np.abs(out.pose - other.pose).max() > 1e-4
-    with pytest.raises(ValueError, match=r"condition has shape None: .* needs \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"condition is missing, but .* needs shape \(1, 3\)"):
         predictor(tactile=pairs.tactile[:, 0] / 255)
 
 
@@ -131,7 +131,7 @@ def test_pictures_for_recognition_come_with_their_answers(workdir, tmp_path, mon
     assert {text.splitlines()[1] for text in found} == {"answers: A1 B2", "answers: A2 B1"}
     with Image.open(tmp_path / "0.png") as picture:
         assert picture.size[0] > 100
-    with pytest.raises(ValueError, match="first is 100: fewer than 2"):
+    with pytest.raises(ValueError, match="--first is 100, but only .* and 2 are needed"):
         recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))
 
 
