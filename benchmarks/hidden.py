@@ -9,9 +9,10 @@ Hidden properties are those that a camera cannot see, such as the fill level of 
 
 - `outcomes`: the share of each outcome. Also the share of the starts whose outcome changes if only the hidden contents
   are drawn again, which are the fill level and, on the slope, also the side on which the contents lie.
-- `truth`: the log loss of two classifiers of the outcome. The first one knows the exact shape, the start and the jerk
-  (on the slope, the pose with the noise `slope_features.SEEN`). The second one also has a noisy measurement of touch:
-  the weight on the jerked pad, the centre of pressure on the slope. The gain is the relative decrease of the loss.
+- `truth`: the log loss of two classifiers of the outcome. The inputs of the first one are the exact shape, the first
+  pose and the jerk (on the slope, the pose has the noise `slope_features.SEEN`). The second one has a noisy measurement
+  of touch as a further input: the weight on the jerked pad, or the centre of pressure on the slope. The gain is the
+  relative decrease of the loss.
 - `pictures`: as `truth`, but a small network estimates the measurement of touch from the first uint8 tactile image. The
   network is trained on other objects.
 - `fill`: the AUC of a small network that separates objects that are more than half full from emptier ones. Its inputs

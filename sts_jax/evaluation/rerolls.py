@@ -42,8 +42,8 @@ def ceiling(
     the pad). Each re-roll draws new values of the properties that a camera cannot see, such as fill level and friction.
 
     The true last frame is one more draw from the same distribution, so the prediction is calibrated. With infinitely
-    many re-rolls, no predictor that knows only shape, pose and condition has a better expected log loss of the outcome
-    or a better expected cross-entropy of the images.
+    many re-rolls, it has the best expected log loss of the outcome and the best expected cross-entropy of the images
+    among all predictions from the shape, the pose and the condition.
 
     The tactile image of the first frame reveals a part of the properties that a camera cannot see. A model that uses
     this image can therefore exceed the ceiling.

@@ -256,7 +256,7 @@ class Grabber:
                         return
         except CameraError as error:
             self._set_problem(_Problem(type(error), str(error), final=True))
-        except Exception as error:
+        except Exception as error:  # an error that ends the thread must reach the caller, who would wait otherwise
             self._set_problem(
                 _Problem(
                     CameraError,

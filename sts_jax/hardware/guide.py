@@ -1,4 +1,4 @@
-"""The guide: it decides from images what a person has to do next while collecting a trajectory.
+"""The guide leads a person through the stages of a trajectory, and derives the current stage from images.
 
 The guide is a pure function of a state and a pair of images, and needs no devices. The person places an object on the
 pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests (`STILL`).

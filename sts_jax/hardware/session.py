@@ -321,7 +321,7 @@ class Session:
             error: Exception | None = None
             try:
                 job.run()
-            except Exception as failed:
+            except Exception as failed:  # kept in `self._error` for the caller, and the job is tried again
                 error = failed
             with self._changed:
                 self._error = error

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 
 from sts_jax.objects.assembly import CONTENTS, WALL, assemble
 from sts_jax.objects.body import FACE_CLASSES, PAD, SMALLEST, Body, check_category
@@ -303,7 +303,7 @@ def _body(
         faces, colors, uv = faces[:, ::-1], colors[:, ::-1], uv[:, ::-1]
     try:
         hull = ConvexHull(vertices)
-    except Exception as error:
+    except (QhullError, ValueError) as error:  # ValueError: there are too few vertices
         raise ValueError(
             f"{path}: the mesh is flat, so even its convex hull has no volume: give it a thickness"
         ) from error
