@@ -156,8 +156,15 @@ def test_slow_drift_of_the_light_is_followed_between_trajectories_and_is_no_cont
 def test_a_speck_is_no_contact():
     scene = Scene(noise=0.5)
     scene.until(Stage.PLACE)
-    scene.spot = (62, 62, 1.5)  # within one block
+    scene.spot = (61, 61, 1)  # one pixel within a small block of 2.5 x 2.5 pixels
     assert all(scene.see() is Stage.PLACE for _ in range(20))
+
+
+def test_an_imprint_within_one_block_is_a_contact():
+    scene = Scene(noise=0.5)
+    scene.until(Stage.PLACE)
+    scene.spot = (62.5, 62.5, 2.5)  # block 12 of 24 from above, which has the pixels 60 to 64
+    scene.until(Stage.RELEASE)
 
 
 def test_an_unknown_pad_waits_for_the_person():
@@ -182,9 +189,13 @@ def test_a_background_shows_an_object_that_was_left():
 
 def test_noise_is_measured():
     random = np.random.default_rng(0)
-    looks = random.normal(100, 2, (200, 2, 24, 32, 3)).astype(np.float32)
-    measured = guide.empty_pad([guide.Observation(float(i), *look) for i, look in enumerate(looks)])
+    sizes = {"visual": (24, 32), "tactile": (24, 32), "imprint": (48, 64)}
+    looks = {name: random.normal(100, 2, (200, *size, 3)).astype(np.float32) for name, size in sizes.items()}
+    measured = guide.empty_pad(
+        [guide.Observation(float(i), **{name: look[i] for name, look in looks.items()}) for i in range(200)]
+    )
     np.testing.assert_allclose(measured.visual_noise.mean(), 2, rtol=0.05)
+    np.testing.assert_allclose(measured.imprint_noise.mean(), 2, rtol=0.05)
     np.testing.assert_allclose(measured.tactile, 100, atol=1)
     with pytest.raises(ValueError, match="at least 2 items"):
         guide.empty_pad([])

@@ -11,7 +11,7 @@ from jaxtyping import TypeCheckError
 import sts_jax as sts
 from sts_jax import geometry, hardware, training
 from sts_jax.evaluation.metrics import geodesic_angle
-from sts_jax.hardware import twin
+from sts_jax.hardware import guide, twin
 
 
 def poses(count):
@@ -119,7 +119,7 @@ def test_images_of_another_resolution_and_invalid_fields_are_refused():
 
 
 @pytest.mark.slow
-def test_the_criterion_finds_light_contacts_of_a_noisy_twin_and_nothing_on_its_empty_pad():
+def test_both_criteria_find_light_contacts_of_a_noisy_twin_and_nothing_on_its_empty_pad():
     size = (240, 320)
     sensor, body = sts.Sensor(), sts.objects.make(jax.random.key(0), "camera")
     gentle = sts.physics.Released(carried=(0.05, 0.1))  # the pad carries 5 to 10 % of the weight
@@ -129,20 +129,24 @@ def test_the_criterion_finds_light_contacts_of_a_noisy_twin_and_nothing_on_its_e
     warp = twin.lens_warp(lens, sensor.camera, size)
     with twin.Twin(scene, imperfections=noisy, warp=warp) as device:
 
-        def view():
+        def raw():
             device.set((255,) * 4)
             device.step(0.2)
-            return hardware.rectified(lens, sensor.camera, device.capture()[1], (64, 64))
+            return device.capture()[1]
 
-        blank = np.round(np.mean([view() for _ in range(20)], axis=0)).astype(np.uint8)
-        empty = np.stack([view() for _ in range(100)])
-        held = []
+        background = [raw() for _ in range(20)]
+        free = [raw() for _ in range(100)]
+        pressed = []
         for _ in range(24):
             device.command("hold")
             device.step(0.2)
-            held.append(view())
+            pressed.append(raw())
             assert device.state.phase == "held"
-    held = np.stack(held)
+    known, empty, held = (
+        np.stack([hardware.rectified(lens, sensor.camera, image, (64, 64)) for image in images])
+        for images in (background, free, pressed)
+    )
+    blank = np.round(known.mean(0)).astype(np.uint8)
     own = training.touch_of_noisy_images(training.Preprocessing(), held, blank)
     before = touched(training.Preprocessing(), empty, blank).mean()
     false, true = touched(own, empty, blank).mean(), touched(own, held, blank).mean()
@@ -151,5 +155,14 @@ def test_the_criterion_finds_light_contacts_of_a_noisy_twin_and_nothing_on_its_e
         f"({before:.2f} by the criterion of simulated images); light contacts: {true:.2f} of {len(held)}"
     )
     assert before > 0.5
+    assert false <= 0.01
+    assert true >= 0.95
+    # The guide tests raw images. The visual image has no influence on its test.
+    observed = [[guide.observe(0.0, image, image) for image in images] for images in (background[:4], free, pressed)]
+    pad = guide.empty_pad(observed[0])
+    false, true = (
+        np.mean([guide.has_contact(guide.GuideConfig(), pad, seen) for seen in group]) for group in observed[1:]
+    )
+    print(f"guide: {false:.2f} of the images of the empty pad, {true:.2f} of the light contacts")
     assert false <= 0.01
     assert true >= 0.95

@@ -3,9 +3,10 @@
 The guide is a pure function of a state and a pair of images, and needs no devices. The person places an object on the
 pad and holds it (stages `PLACE` and `HOLD`), releases it (`RELEASE`), and waits until it rests (`STILL`).
 
-Each image is divided into 24 rows of 32 blocks, and all decisions use the means of these blocks, in which the noise of
-single pixels averages out. A block has changed if its mean differs by more than a threshold, which is a multiple of the
-noise of this mean on the empty pad.
+Each image is divided into 24 rows of 32 blocks, and movements are detected in the means of these blocks, in which the
+noise of single pixels averages out. A contact can be as small as one of these blocks. Contacts are therefore detected
+in blocks of half the width and height. A block has changed if its mean differs by more than a threshold, which is a
+multiple of the noise of this mean on the empty pad.
 """
 
 import dataclasses
@@ -14,15 +15,18 @@ import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from sts_jax.hardware.settling import thumbnail
 
 Blocks = Float[np.ndarray, "24 32 3"]  # means of an image's blocks, 0 to 255
+SmallBlocks = Float[np.ndarray, "48 64 3"]  # means of blocks of half the width and height, 0 to 255
 End = Literal["initial", "final"]  # "initial": the pair of the held object, "final": the pair of the object at rest
 
 _NORMAL = 1.4826  # ratio of the standard deviation to the median absolute deviation of a normal distribution
+_SMALL_BLOCKS = 64, 48  # numbers of columns and rows of the small blocks
 _KEPT = 16  # number of earlier observations that are kept in `State.window` besides its first one
 
 
@@ -48,7 +52,7 @@ class GuideConfig:
     deviations: float = 6.0  # threshold of a block's change, in standard deviations of the noise of the block's mean
     smallest_change: float = 3.0  # lower limit of the threshold of a block's change, of 255
     largest_threshold: float = 24.0  # upper limit of the threshold of a block's change, of 255
-    contact_blocks: int = 3  # least number of blocks of the tactile image that differ from the empty pad in a contact
+    contact_blocks: int = 3  # least number of small blocks (48 x 64) that differ from the empty pad in a contact
     watched: Literal["both", "tactile"] = "both"  # streams in which movements are detected
     empty_s: float = 0.5  # time without movement after which the pad counts as empty (s)
     hold_s: float = 0.5  # time without movement before the initial pair is taken (s)
@@ -75,25 +79,30 @@ class GuideConfig:
 class Observation(NamedTuple):
     """The block means of a pair of images.
 
-    An image is divided into 24 rows of 32 blocks. A block mean is the mean colour of one block.
+    An image is divided into 24 rows of 32 blocks, and into 48 rows of 64 small blocks. A block mean is the mean colour
+    of one block.
     """
 
     time_s: float  # arrival time of the later image, on any clock that increases (s)
     visual: Blocks  # block means of the visual image
     tactile: Blocks  # block means of the tactile image
+    imprint: SmallBlocks  # means of the small blocks of the tactile image, in which contacts are detected
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmptyPad:
     """The block means of both streams while the pad is empty, and the noise of these means.
 
-    An image is divided into 24 rows of 32 blocks. A block mean is the mean colour of one block.
+    An image is divided into 24 rows of 32 blocks, and into 48 rows of 64 small blocks. A block mean is the mean colour
+    of one block.
     """
 
     visual: Blocks  # block means of the visual image
     tactile: Blocks  # block means of the tactile image
+    imprint: SmallBlocks  # means of the small blocks of the tactile image
     visual_noise: Blocks  # standard deviations of the noise of `visual`
     tactile_noise: Blocks  # standard deviations of the noise of `tactile`
+    imprint_noise: SmallBlocks  # standard deviations of the noise of `imprint`
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -118,7 +127,9 @@ class State:
 def observe(
     time_s: float, visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]
 ) -> Observation:
-    """Divide each image of a pair into 24 rows of 32 blocks, and compute the mean colour of each block.
+    """Compute the mean colour of each block of a pair of images.
+
+    Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks.
 
     Args:
         time_s: Arrival time of the later image, on any clock that increases (s).
@@ -128,15 +139,20 @@ def observe(
     Returns:
         The time and the block means of both images.
     """
-    return Observation(time_s, thumbnail(visual), thumbnail(tactile))
+    return Observation(time_s, thumbnail(visual), thumbnail(tactile), _imprint(tactile))
+
+
+def _imprint(tactile: UInt8[np.ndarray, "height width 3"]) -> SmallBlocks:
+    """The means of the small blocks of a tactile image."""
+    return cv2.resize(tactile, _SMALL_BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
     """Measure the appearance of the empty pad, and its noise, from several observations.
 
-    An observation contains the mean colour of each of the 24 x 32 blocks of both images. The noise of a block is
-    the standard deviation of its mean colour over the observations. A few observations can underestimate the noise.
-    Each value is therefore raised to at least the median noise of all blocks of the stream.
+    An observation contains the mean colours of blocks of the images, see `observe`. The noise of a block is the
+    standard deviation of its mean colour over the observations. A few observations can underestimate the noise.
+    Each value is therefore raised to at least the median noise of all blocks of the same kind.
 
     Args:
         observations: At least two observations of the empty pad without movement.
@@ -151,13 +167,11 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
         raise ValueError(
             f"observations must contain at least 2 items, so that the noise can be measured, got {len(observations)}"
         )
-    visual, tactile = (
-        np.stack(looks) for looks in ([o.visual for o in observations], [o.tactile for o in observations])
-    )
-    return EmptyPad(visual.mean(0), tactile.mean(0), _noise(visual), _noise(tactile))
+    looks = [np.stack(blocks) for blocks in zip(*(seen[1:] for seen in observations), strict=True)]
+    return EmptyPad(*(blocks.mean(0) for blocks in looks), *map(_noise, looks))
 
 
-def _noise(looks: Float[np.ndarray, "n 24 32 3"]) -> Blocks:
+def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "rows columns 3"]:
     """The noise of each block mean, from the block means of n images."""
     deviation = looks.std(0, ddof=1)
     return np.maximum(deviation, np.median(deviation)).astype(np.float32)
@@ -166,15 +180,15 @@ def _noise(looks: Float[np.ndarray, "n 24 32 3"]) -> Blocks:
 def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
     """Make an `EmptyPad` from the images of the empty pad in a sensor file, which `Device.background` reads.
 
-    The noise in the result is 0, because it cannot be measured from one image. `step` measures the noise before each
-    trajectory.
+    The noise in the result is 0, because it cannot be measured from one image. `has_contact` then estimates it from the
+    image to test, and `step` measures it before each trajectory.
 
     Args:
         visual: Raw image of the empty pad without light, RGB.
         tactile: Raw image of the empty pad with light, RGB.
     """
-    none = np.zeros_like(thumbnail(visual))
-    return EmptyPad(thumbnail(visual), thumbnail(tactile), none, none)
+    looks = observe(0.0, visual, tactile)[1:]
+    return EmptyPad(*looks, *map(np.zeros_like, looks))
 
 
 def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
@@ -290,18 +304,22 @@ def _enter(state: State, stage: Stage) -> State:
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
     """Return True if the tactile image shows a contact.
 
-    A tactile image shows a contact if at least `config.contact_blocks` of its 24 x 32 blocks differ from the empty pad.
-    The median difference over all blocks is subtracted first, so that a change in the brightness of the whole image is
-    not a contact.
+    A tactile image shows a contact if at least `config.contact_blocks` of its 48 x 64 small blocks differ from the
+    empty pad. The median difference over all blocks is subtracted first, so that a change in the brightness of the
+    whole image is not a contact. The noise is the larger one of the noise in `empty` and 1.4826 times the median
+    absolute difference.
 
     Args:
         config: Thresholds.
         empty: Appearance of the empty pad, from `empty_pad` or `known_pad`.
         observation: Result of `observe` for the pair of images to test.
     """
-    change = observation.tactile - empty.tactile
+    change = observation.imprint - empty.imprint
     change = change - np.median(change, axis=(0, 1))
-    noise = empty.tactile_noise * math.sqrt(1 + 1 / config.pairs)  # of the image and of the mean of `pairs` empty ones
+    # A contact covers less than half of the image, and hardly changes this median. `known_pad` does not know the noise.
+    shared = _NORMAL * np.median(np.abs(change))
+    measured = empty.imprint_noise * math.sqrt(1 + 1 / config.pairs)  # of the image and of the mean of `pairs` images
+    noise = np.maximum(measured, shared)
     return int((np.abs(change) > _threshold(config, noise)).any(-1).sum()) >= config.contact_blocks
 
 
@@ -321,7 +339,9 @@ def _same(config: GuideConfig, state: State, first: Observation, second: Observa
     return True
 
 
-def _threshold(config: GuideConfig, noise: Blocks | float | np.floating) -> Blocks | np.floating:
+def _threshold(
+    config: GuideConfig, noise: Blocks | SmallBlocks | float | np.floating
+) -> Blocks | SmallBlocks | np.floating:
     """The threshold of a change for a standard deviation of the noise."""
     return np.clip(config.deviations * np.asarray(noise), config.smallest_change, config.largest_threshold)
 
