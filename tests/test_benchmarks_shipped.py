@@ -1,0 +1,30 @@
+"""Metrics of the shipped models on new objects: the calibration error of exact probabilities, and a small run."""
+
+import numpy as np
+import pytest
+
+from benchmarks import shipped
+from sts_jax import dataset
+
+
+def test_the_calibration_error_of_exact_probabilities_has_its_closed_form():
+    found = shipped.if_calibrated(np.full(400, 0.75), draws=2000)
+    assert found == pytest.approx(np.sqrt(2 / np.pi) * np.sqrt(0.75 * 0.25 / 400), rel=0.05)  # E|X| of a Gaussian
+
+
+def test_no_object_is_shared_with_the_training_of_the_model():
+    args = shipped.Args("perturbed", objects=4)
+    trained = shipped.EXPERIMENTS["perturbed"].LONG.collection
+    assert shipped.collection(args).scenario == trained.scenario
+    new, old = (dataset.make_bodies(made, np.arange(4)) for made in (shipped.collection(args), trained))
+    assert not any(np.array_equal(one.vertices, two.vertices) for one in new for two in old)
+
+
+@pytest.mark.slow
+def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
+    args = shipped.Args("released", objects=10, workdir=tmp_path / "work")
+    text = shipped.main(args)
+    assert "32 held-out trajectories of 8 objects" in text
+    assert "| from visual and tactile |" in text
+    assert "Touch removes" in text
+    assert shipped.main(args) == text  # the trajectories are reused
