@@ -150,7 +150,7 @@ def test_missing_and_torn_images_are_named(tmp_path):
     with pytest.warns(UserWarning, match=r"flag\.png"):
         objects.load(path)
     (tmp_path / "flag.png").write_bytes(b"\x89PNG\r\n\x1a\n torn")
-    with pytest.raises(ValueError, match=r"flag\.png: cannot be read as an image"):
+    with pytest.raises(ValueError, match=r"flag\.png: the file cannot be read as an image"):
         objects.load(path)
     with pytest.raises(FileNotFoundError, match=r"none\.png"):
         objects.load(path, texture=tmp_path / "none.png")
@@ -289,7 +289,7 @@ def test_arguments_out_of_range_are_refused(box, arguments, message):
         ({"density": 0.0}, "density must be a positive"),
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
         ({"faces": 2}, "faces must be a whole number, at least 4"),
-        ({"up": (0.0, 0.0, 0.0)}, r"up not \(0, 0, 0\)"),
+        ({"up": (0.0, 0.0, 0.0)}, r"up must not be \(0, 0, 0\)"),
         ({"up": (0.0, 1.0, 0.0)}, "must not be parallel"),
         ({"up": "z", "front": (0.0, -1.0, 0.0)}, "direction of three numbers"),
     ],
@@ -342,7 +342,7 @@ def test_a_truncated_stl_is_refused_as_truncated(tmp_path, kind, part):
 def test_an_off_of_random_bytes_is_refused_as_damaged(tmp_path):
     path = tmp_path / "damaged.off"
     path.write_bytes(np.random.default_rng(0).integers(128, 256, 2000, np.uint8).tobytes())
-    with pytest.raises(ValueError, match=r"damaged\.off: cannot be read as a mesh") as error:
+    with pytest.raises(ValueError, match=r"damaged\.off: the file cannot be read as a mesh") as error:
         objects.load(path)
     assert "charset" not in str(error.value) or "truncated or damaged" in str(error.value)
 

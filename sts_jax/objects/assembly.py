@@ -33,8 +33,8 @@ def assemble(
     """Assemble a `Body` from a surface, its colours and its masses.
 
     The body collides as the convex hull of the vertices, reduced to at most 64 vertices. The origin moves to the
-    centroid of this hull. The arrays are padded to sizes in FACE_CLASSES and HULL_CLASSES, so that bodies of similar
-    size have arrays of equal shapes.
+    centroid of this hull. The arrays are padded to a few allowed lengths, so that many bodies have arrays of equal
+    shapes. FACE_CLASSES lists these lengths for vertices and faces, and HULL_CLASSES for vertices of the hull.
 
     Args:
         vertices: Vertices of the surface (m), with +z up, at most 131,072.

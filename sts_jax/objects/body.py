@@ -69,7 +69,9 @@ class Body:
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 number = int((~np.isfinite(values)).sum())
                 which = f"is {values}" if values.ndim == 0 else f"has {number:,} values that are not finite"
-                raise ValueError(f"{field.name} {which}, but all must be finite: repair the mesh, or omit the body")
+                raise ValueError(
+                    f"{field.name} {which}, but all values must be finite: repair the mesh, or omit the body"
+                )
         faces = np.asarray(self.faces)
         if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
             raise ValueError(
@@ -116,7 +118,7 @@ def size_class(count: int, classes: tuple[int, ...]) -> int:
 
 
 def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
-    """Append rows to an array until it has `size` rows. Each appended row is `value`, or is filled with this number."""
+    """Append rows to an array until it has `size` rows. `value` is the appended row, or a number that fills it."""
     padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
     return np.concatenate([array, padding])
 
@@ -144,9 +146,9 @@ def stack(bodies: Sequence[Body]) -> Body:
     """Stack bodies into one `Body` with a leading axis, for `jax.vmap`.
 
     Args:
-        bodies: At least one body. The arrays of all bodies must have the same shapes. Bodies of similar size do,
-            because their arrays are padded to the sizes in FACE_CLASSES, PART_CLASSES, HULL_CLASSES and
-            TEXTURE_CLASSES.
+        bodies: At least one body. The arrays of all bodies must have the same shapes. Many bodies fulfil this, because
+            arrays are padded to the lengths in FACE_CLASSES, PART_CLASSES and HULL_CLASSES, and textures are resized to
+            the sides in TEXTURE_CLASSES.
 
     Returns:
         A body whose arrays are stacked along a new first axis.
@@ -161,7 +163,8 @@ def stack(bodies: Sequence[Body]) -> Body:
         if shape != shapes[0]:
             raise ValueError(
                 f"the arrays of body {index} and body 0 have different shapes: body {index} has "
-                f"{_sizes(bodies[index])}, and body 0 has {_sizes(bodies[0])}. Stack only bodies with equal shapes"
+                f"{_sizes(bodies[index])}, and body 0 has {_sizes(bodies[0])}. Stack only bodies whose arrays "
+                "have equal shapes"
             )
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bodies)
 
@@ -228,9 +231,9 @@ def fill_moments(
     """Compute volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
 
     The triangles are clipped to the half-space below the liquid's surface. Each clipped triangle and a reference point
-    form a tetrahedron with a signed volume. The moments of the liquid are the sums over these tetrahedra. The reference
-    point lies on the liquid's surface, so that tetrahedra over the surface itself would have no volume. Bisection finds
-    the height of the surface.
+    form a tetrahedron with a signed volume. The moments of the liquid are the sums over these tetrahedra. The liquid's
+    surface has no triangles, so its tetrahedra are missing from the sums. The reference point lies on this surface, so
+    that the missing tetrahedra have no volume. Bisection finds the height of the surface.
 
     Args:
         interior: Triangles of a closed surface (m), counter-clockwise seen from outside. Triangles without area have no

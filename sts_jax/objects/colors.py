@@ -31,7 +31,7 @@ def vivid(rng: np.random.Generator) -> Color:
 
 
 def pale(rng: np.random.Generator) -> Color:
-    """Return a random light, nearly white colour (3,) of any hue, in linear light."""
+    """Return a random bright, nearly white colour (3,) of any hue, in linear light."""
     return hsv(rng.uniform(), rng.uniform(0.0, 0.25), rng.uniform(0.8, 0.97))
 
 

@@ -10,7 +10,7 @@ from sts_jax.objects.surface import Surface, proper, surface_samples
 
 
 def decimate(path: Path, surface: Surface, target: int) -> Surface:
-    """Reduce a surface to at most `target` faces and vertices, and issue a warning with the numbers of faces.
+    """Reduce a surface to at most `target` faces and vertices, and warn with the old and the new number of faces.
 
     Args:
         path: Path of the mesh file. The warning and errors contain it.

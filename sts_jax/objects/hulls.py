@@ -30,8 +30,8 @@ def convex_hull(
 ) -> Float[np.ndarray, "h 3"]:
     """Compute an approximate convex hull of points that has a limited number of vertices.
 
-    The hull starts as a tetrahedron of four points. The point farthest outside is added until all points are inside,
-    apart from distances up to `tolerance`, or until the hull has `limit` vertices.
+    The hull starts as a tetrahedron of four points. Then the point farthest outside the hull is added
+    repeatedly, until no point is more than `tolerance` outside the hull, or until the hull has `limit` vertices.
 
     Args:
         points: Points that the hull encloses (m).

@@ -48,10 +48,10 @@ def library(
 ) -> Library:
     """List the objects of a folder without opening a mesh.
 
-    If the folder contains ShapeNetSem's table metadata.csv, the table lists the objects. Its column `unit` defines the
-    size of an object, the columns `up` and `front` define its orientation, and the column `category` defines its class,
-    one of CATEGORIES. The mesh of the object with the id ID is expected at models-OBJ/models/ID.obj, and its images in
-    models-textures/textures.
+    If the folder or one of its direct sub-folders contains ShapeNetSem's table metadata.csv, the table lists the
+    objects. Its column `unit` defines the size of an object, and the columns `up` and `front` define its orientation.
+    The column `category` defines its class, which is one of CATEGORIES, such as "bottle". The mesh of the object
+    with the id ID is expected at models-OBJ/models/ID.obj, and its images in models-textures/textures.
 
     In any other folder, every mesh file is an object. Its class is the name of the first sub-folder of its path. The
     class of a file directly in the folder is the name of the folder.
@@ -60,8 +60,8 @@ def library(
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
         scale: Length of one unit of the files (m), above 0. None uses ShapeNetSem's table, or 1 m without a table.
-        longest_side: Longest side to which every object is scaled (m), at most 0.15 m. None keeps the sizes. Only
-            `scale` or `longest_side` can be given.
+        longest_side: Longest side to which every object is scaled (m), at most 0.15 m. None keeps the sizes. Must
+            be None if `scale` is given.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
@@ -154,7 +154,7 @@ def read(collection: Library, index: int) -> Entry:
         index: Index of the item in `collection.items`.
 
     Returns:
-        The body, the distances between its surface and its collision parts, and notes.
+        The body, the two distances (m) that `gaps` computes, and notes on repairs.
 
     Raises:
         ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.

@@ -83,7 +83,7 @@ def read_image(path: Path) -> Image.Image:
         with Image.open(path) as picture:
             return picture.convert("RGB")
     except (OSError, SyntaxError) as error:
-        raise ValueError(f"{path}: cannot be read as an image ({error}): replace the file") from error
+        raise ValueError(f"{path}: the file cannot be read as an image ({error}): replace the file") from error
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):

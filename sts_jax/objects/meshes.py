@@ -41,15 +41,20 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
         Rotation matrix R. A point p of the file becomes R p.
 
     Raises:
-        ValueError: A direction is not finite or zero, or the two are parallel.
+        ValueError: A direction is zero or not finite, or the two directions are parallel.
     """
     z, y = np.array(up, float), -np.array(front, float)
     if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
-        raise ValueError(f"up and front must be three finite numbers each, and up not (0, 0, 0), got {up} and {front}")
+        raise ValueError(
+            f"up is {up} and front is {front}, but each must be three finite numbers, and up must not be (0, 0, 0)"
+        )
     z /= np.linalg.norm(z)
     across = y - (y @ z) * z
     if not np.linalg.norm(across) > 1e-3 * np.linalg.norm(y):
-        raise ValueError(f"front is {tuple(front)} and up is {tuple(up)}, but they must not be parallel or zero")
+        raise ValueError(
+            f"front is {tuple(front)} and up is {tuple(up)}, but they must not be parallel, and front must not be "
+            "(0, 0, 0)"
+        )
     y = across / np.linalg.norm(across)
     return np.stack([np.cross(y, z), y, z])
 
@@ -87,7 +92,7 @@ def load(
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.
         longest_side: Longest side of the bounding box after scaling (m), from 5 mm to 0.15 m. None keeps the file's
-            size. Only `longest_side` or `scale` can be given.
+            size. Must be None if `scale` is given.
         scale: Length of one unit of the file (m). None is 1 m.
         largest: Largest allowed longest side (m), from 5 mm to 0.15 m. A larger mesh is scaled down to it with a
             warning. None raises an error for a mesh that is longer than 0.15 m, the width of the pad.
@@ -96,9 +101,9 @@ def load(
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
         hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3. The share of the interior that they
             fill is an argument of `rigid`. If False, the body has no contents.
-        strict: If False, two defects are repaired with a warning. If a mesh is not closed or encloses no volume, its
-            contents fill its convex hull. Missing materials and images of an OBJ file are left out. If True, these
-            defects are errors.
+        strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
+            image of an OBJ file. If False, these defects are repaired with a warning. The contents of such a mesh then
+            fill its convex hull, and missing materials and images are left out.
         up: Axis of the file, or direction in the file, that becomes +z. The convention of glTF files is "y".
         front: Direction in the file that becomes -y, only for an `up` that is a direction. None is (0, -1, 0). If `up`
             is an axis, `front` must be None.
@@ -213,10 +218,10 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
         # For text that is not UTF-8, trimesh imports a package that is not one of its requirements.
         install = f"install the package {error.name}"
         remedy = "the file is truncated or damaged: replace it" if error.name == "charset_normalizer" else install
-        raise ValueError(f"{path}: cannot be read as a mesh ({error}): {remedy}") from error
+        raise ValueError(f"{path}: the file cannot be read as a mesh ({error}): {remedy}") from error
     except Exception as error:  # trimesh's many readers raise errors of many types
         raise ValueError(
-            f"{path}: cannot be read as a mesh ({error}): check that the file is complete and has the right suffix"
+            f"{path}: the file cannot be read as a mesh ({error}): check that it is complete and has the right suffix"
         ) from error
     if not pieces:
         raise ValueError(f"{path}: the mesh has no faces: give a mesh with triangles")
@@ -233,7 +238,7 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
 def _check_file(path: Path) -> None:
     """Raise an error unless a file exists, can be read and is not empty. An STL file must also be complete."""
     if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: give a mesh file in it, or pass it to objects.library")
+        raise IsADirectoryError(f"{path} is a folder: give a mesh file in it, or pass the folder to objects.library")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such mesh file: check the path")
     try:
@@ -274,7 +279,7 @@ def _factor(
     if extent < SMALLEST:
         raise ValueError(
             f"{path}: the longest side is {extent * 1e3:.2g} mm, but the smallest object is {SMALLEST * 1e3:g} mm "
-            "long: check the unit of the file, and give longest_side, or scale, the length of one unit in metres"
+            "long: check the unit of the file, and give longest_side in metres, or scale in metres per unit"
         )
     if largest is not None and extent > largest:
         warnings.warn(f"{path}: the longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
@@ -282,7 +287,7 @@ def _factor(
     if extent > PAD:
         raise ValueError(
             f"{path}: the longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side in metres, or "
-            "scale, the length of one unit in metres (0.001 if the file is in millimetres)"
+            "scale in metres per unit (0.001 if the file is in millimetres)"
         )
     return factor
 
@@ -295,7 +300,7 @@ def _body(
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
             f"{path}: the mesh has {len(faces):,} faces and {len(vertices):,} vertices, but at most "
-            f"{FACE_CLASSES[-1]:,} of each are allowed: decimate it with the argument faces, the largest number of both"
+            f"{FACE_CLASSES[-1]:,} of each are allowed: decimate it with the argument faces, which limits both"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     closed = is_closed(faces)

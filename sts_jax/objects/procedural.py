@@ -65,8 +65,8 @@ def find_family(category: str) -> Family:
     """Return the family that generates the objects of a category.
 
     Args:
-        category: One of CATEGORIES, or "module:NAME" for a `Family` of your own. The module is imported, and its
-            variable NAME must hold the family. The module of a notebook or script is `__main__`.
+        category: One of CATEGORIES, such as "bottle", or "module:NAME" for a `Family` of your own. The module is
+            imported, and its variable NAME must hold the family. The module of a notebook or script is `__main__`.
 
     Returns:
         The family.
@@ -103,7 +103,8 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Args:
         key: Key from `jax.random.key`, consumed by the call.
-        category: One of CATEGORIES, "module:NAME" for a `Family` of your own (`find_family`), or a `Family`.
+        category: One of CATEGORIES, such as "bottle", or "module:NAME" for a `Family` of your own (`find_family`), or
+            a `Family`.
 
     Returns:
         A body with +z up as the object usually stands or lies. A body of one of CATEGORIES has a longest side of 50 to

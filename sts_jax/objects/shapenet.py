@@ -123,8 +123,8 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
     unit = row["unit"].strip()
     if not unit:
         raise ValueError(
-            "the row of the model in metadata.csv has no unit, so its size is unknown: write the length of one unit of "
-            "its mesh in metres, such as 0.01"
+            "the row of the model in metadata.csv has no unit, so the size of the mesh is unknown: write the "
+            "metres per unit of the mesh, such as 0.01, into the column unit"
         )
     try:
         scale = float(unit)

@@ -74,7 +74,7 @@ def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.nd
 
     Args:
         outline: Outline of n points, (n, 2) (mm).
-        levels: A factor on the outline and the height z (mm) of each ring.
+        levels: Factor that scales the outline, and height z (mm), for each ring.
     """
     return np.stack([np.column_stack([outline * scale, np.full(len(outline), z)]) for scale, z in levels])
 

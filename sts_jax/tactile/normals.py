@@ -13,12 +13,13 @@ def surface_normals(
 ) -> Float[Array, "h w *n 3"]:
     """Unit normals of a surface given by a grid of points.
 
-    A normal is the axis along which the 3x3 neighbourhood of a point has the least variance (paper, supplement
-    "Simulator Details").
+    A normal is the axis along which the 3x3 neighbourhood of a point has the least variance (See-Through-your-Skin
+    paper, supplement "Simulator Details").
 
     Args:
         points: x, y and z of the points in the sensor frame (m). The grid of points extends beyond the result by one
-            row or column on each side (a = h + 2, b = w + 2). Axes *n are separate grids.
+            row or column on each side (a = h + 2, b = w + 2). The axes *n are batch axes
+            of separate grids.
 
     Returns:
         Unit normals towards the camera (z <= 0).

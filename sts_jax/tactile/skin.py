@@ -145,7 +145,7 @@ def shadows(
     Pressed parts of the skin stand out into the gel, through which the light travels. They cast shadows on the skin
     behind them. The share of a light at a point x of the skin is
 
-        share = 1 - (atan max_t (d(x + t u) - d(x)) / t - e) / penumbra,   clipped to [0, 1]
+        share = clip(1 - (atan(max_t (d(x + t u) - d(x)) / t) - e) / penumbra, 0, 1)
 
     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
     along u. Elevations are angles above the gel's plane (rad), seen from x. The arctangent is the largest elevation of
@@ -156,9 +156,9 @@ def shadows(
     other pressed parts. A shadow is partial where the elevation of these parts is below `penumbra`.
 
     Args:
-        skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the skin at the distance
-            `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a part narrower than a step may cast no shadow
-            there.
+        skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the depth at x with the
+            depth at the distance `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a part narrower than a
+            step may cast no shadow there.
         lights: Far or near lights. Skin behind a near light does not hide it.
         depth: Depth of the skin below the gel's undeformed face (m). Skin outside the image casts no shadow.
         window: Part of the gel's face in the image: left, top, width, height (m).
@@ -212,7 +212,7 @@ def phong(
     points: Float[Array, "*n 3"],
     shares: Float[Array, "m *n"] | None = None,
 ) -> Float[Array, "*n 3"]:
-    """Light that the skin reflects to the camera, by Phong's model (paper, equation "phong").
+    """Light that the skin reflects to the camera, by Phong's model, as in the See-Through-your-Skin paper.
 
         I = k_a i_a + sum_m (k_d (L_m . N) + k_s (R_m . V)^alpha) i_m,   R_m = 2 (L_m . N) N - L_m
 
@@ -222,7 +222,7 @@ def phong(
     flat skin under far lights is uniform.
 
     For a near light at the position p_m, the colour is multiplied by `(reference / |p_m - x|)^falloff` at the point x.
-    Distances below 0.1 mm count as 0.1 mm.
+    `reference` and `falloff` are fields of `Leds`. Distances below 0.1 mm count as 0.1 mm.
 
     Args:
         phong: Constants of the skin's reflectance.
