@@ -322,7 +322,7 @@ def test_a_config_of_another_version_is_named(folder, change):
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     (folder / "manifest.json").unlink()
     training.seal(folder)
-    with pytest.raises(ValueError, match=r"config\.json describes no model of this version"):
+    with pytest.raises(ValueError, match=r"config\.json does not describe a model that this version"):
         training.load(folder)
 
 

@@ -265,7 +265,7 @@ def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
     ("name", "key", "change", "message"),
     [
         ("views", "visual", lambda x: x[:, :8], "views has"),
-        ("views", "state", lambda x: x[:2], "equally many"),
+        ("views", "state", lambda x: x[:2], "same number of samples"),
         ("falls", "pose", lambda x: x[:, :7], "falls has"),
         ("falls", "outcome", lambda x: x + 2, "outcome is int32 from 2 to 3"),
     ],

@@ -29,7 +29,7 @@ def test_a_shifted_trajectory_is_the_one_at_the_other_place(shift):
 
 def test_invalid_shapes_and_shifts_are_refused():
     images = np.stack([[EMPTY, EMPTY]])
-    with pytest.raises(ValueError, match="must be below the size"):
+    with pytest.raises(ValueError, match="must be below the image size"):
         training.shifted(images, EMPTY, np.array([[64, 0]]))
     with pytest.raises((ValueError, TypeCheckError), match="shifts"):
         training.shifted(images, EMPTY, np.array([[1, 0], [2, 0]]))

@@ -28,9 +28,9 @@ from sts_jax.sensor import Sensor
 
 
 class Collected(NamedTuple):
-    """Summary of a collected dataset, which `collect` returns."""
+    """The result of `collect`: a summary of the whole dataset."""
 
-    resampled: int  # number of trajectories that were discarded and drawn again
+    resampled: int  # number of trajectories that were discarded and sampled again
     left_out: tuple[str, ...]  # one line for each object that the dataset lacks, with the reason
 
 
@@ -66,15 +66,15 @@ def collect(
         progress: Function that is called with a `Progress` when some trajectories or images are finished.
 
     Returns:
-        Summary of the whole dataset, including the shards that earlier calls made. A trajectory is discarded and drawn
-        again if it becomes non-finite or the object sinks too deep into the pad. An object is left out if it cannot be
-        made or cannot be simulated.
+        Summary of the whole dataset, including the shards that earlier calls made. A trajectory is discarded and
+        sampled again if it becomes non-finite or the object sinks too deep into the pad. An object is left out if it
+        cannot be made or cannot be simulated.
 
     Raises:
-        ValueError: A constant of the sensor or a field of the collection is out of range, the pad is not square as
-            `symmetries=True` requires, or no object of a shard can be simulated. The error is also raised if the folder
-            contains a dataset of another collection, sensor or format. The message names the constant, the field or the
-            file.
+        ValueError: A constant of the sensor or a field of the collection is out of range, the pad is not square but the
+            symmetries of the collection need a square pad, or no object of a shard can be simulated. The error is also
+            raised if the folder contains a dataset of another collection, sensor or format. The message names the
+            constant, the field or the file.
         ImportError: `collection.parts` or a mesh file needs a package that is not installed.
         LockedError: Another process collects into the folder.
         DamagedFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.

@@ -18,8 +18,8 @@ PARTS = ("train", "validation", "test")  # the parts into which the objects are 
 class Collection:
     """Description of a dataset. A collection and a `Sensor` determine every byte of the dataset.
 
-    This holds for the scenarios and object classes of the library. The description contains only the names of your own
-    scenarios and classes, so their code also determines the dataset.
+    The description contains the names of the scenario and of the object classes, but not their code. If you change the
+    code of your own scenario or object class, the same collection therefore gives another dataset.
     """
 
     scenario: physics.Scenario = dataclasses.field(default_factory=physics.Freefall)
@@ -61,12 +61,11 @@ class Collection:
         """Raise an error if a field is invalid, or if the sensor does not suit the collection.
 
         Args:
-            sensor: The sensor. Its pad must be square if frames are also rendered after a quarter turn (with
-                `symmetries=True`, for a scenario that allows quarter turns).
+            sensor: The sensor. Its pad must be square if `symmetries=True` and the scenario allows quarter turns.
 
         Raises:
-            ValueError: A field is out of range, a name in `categories` is unknown, or the pad is not square but must
-                be. The message names the field.
+            ValueError: A field is out of range, a name in `categories` is unknown, or the pad must be square and
+                is not. The message names the field.
         """
         sides = [float(side) for side in sensor.gel.size]
         quarter_turns = any(symmetry % 2 for symmetry in symmetries_of(self))
@@ -103,7 +102,7 @@ class Collection:
 
 
 def class_names(collection: Collection) -> tuple[str, ...]:
-    """The class of each object of a collection, in the order of the objects."""
+    """Names of the classes of all objects of a collection, such as `bottle`, in the order of the objects."""
     if collection.meshes is not None:
         return collection.meshes.labels
     return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))

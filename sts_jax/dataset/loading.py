@@ -35,7 +35,7 @@ class Pairs(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """First and last poses of some trajectories, with the true shapes and masses but without images."""
+    """First and last poses of some trajectories, with the true shapes and masses of the objects but without images."""
 
     pose: np.ndarray  # float32 (n, 2, 7): first and last pose, mesh frame in the sensor frame
     condition: np.ndarray  # float32 (n, c): input of the scenario such as a jerk (SI units)
@@ -59,23 +59,23 @@ class Views(NamedTuple):
 
 
 def reduced(pairs: Pairs, size: int) -> Pairs:
-    """Reduce the images of pairs to a lower resolution, by means over square blocks of pixels.
+    """Reduce the images of pairs to a lower resolution. Each new pixel is the mean of a square block of pixels.
 
     Args:
         pairs: Pairs with square images.
-        size: New side of the images (pixels). It must divide the present side.
+        size: New side length of the images (pixels). It must divide the present side length.
 
     Returns:
         The pairs with smaller images. A pixel of the segmentation is true if at least half of its block is true.
 
     Raises:
-        ValueError: The images are not square, or their side is not a multiple of `size`.
+        ValueError: The images are not square, or their side length is not a multiple of `size`.
     """
     height, width = pairs.visual.shape[2:4]
     if height != width or size < 1 or height % size:
         raise ValueError(
-            f"size is {size}, but the images are {height} x {width} pixels: they must be square, with a side that is a "
-            "multiple of size"
+            f"size is {size}, but the images are {height} x {width} pixels: they must be square, with a side length "
+            "that is a multiple of size"
         )
     return pairs._replace(
         visual=_means(pairs.visual, size),
@@ -85,11 +85,11 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
 
 
 def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.ndarray]:
-    """Reduce square images to a lower resolution, by means over square blocks of pixels.
+    """Reduce square images to a lower resolution. Each new pixel is the mean of a square block of pixels.
 
     Args:
         images: Arrays of images by name, uint8 `(*n, side, side, channels)`, with any number of leading axes n.
-        size: New side of the images (pixels). It must divide the present side.
+        size: New side length of the images (pixels). It must divide the present side length.
 
     Returns:
         The arrays of smaller images by name, uint8 `(*n, size, size, channels)`.
@@ -262,7 +262,7 @@ class Dataset:
         return trajectories.astype(np.int64)
 
     def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
-        """Read the first and last frames of some trajectories, with the true shapes and masses.
+        """Read the first and last frames of some trajectories, with the true shapes and masses of the objects.
 
         Args:
             trajectories: Indices of the trajectories, int `(n,)`.
@@ -371,7 +371,8 @@ def _read(path: Path, remedy: str | None = None) -> Any:
         return read_json(path, remedy or f"delete {path.parent} and collect again")
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of one, or call `collect`."
+            f"{path} is missing: {path.parent} is not a collected dataset. Give the folder of "
+            "a collected dataset, or call `collect`."
         ) from None
 
 

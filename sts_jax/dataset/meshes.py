@@ -45,7 +45,8 @@ def survey_meshes(
     both the training and the test part of a dataset.
 
     Args:
-        folder: Folder of mesh files with one sub-folder per class, or of ShapeNetSem (see `objects.library`).
+        folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
+            `objects.library`).
         scenario: The scenario in which the objects are simulated.
         classes: The classes to use, a subset of `mesh_classes(folder)`. Empty means all.
         scale: Length of one unit of the files (m). Default: the value in ShapeNetSem's table, or 1 m for other files.
@@ -120,7 +121,8 @@ def mesh_classes(folder: str | os.PathLike[str]) -> tuple[str, ...]:
     """List the classes of the mesh files in a folder, without opening a file.
 
     Args:
-        folder: Folder of mesh files with one sub-folder per class, or of ShapeNetSem (see `objects.library`).
+        folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
+            `objects.library`).
 
     Raises:
         FileNotFoundError: The folder does not exist.
@@ -135,10 +137,10 @@ def open_library(meshes: Meshes, parts: bool) -> tuple[objects.Library, dict[str
 
     Args:
         meshes: The mesh files.
-        parts: True to split badly fitting objects into convex parts, as in `survey_meshes`.
+        parts: True to split an object into convex parts if its convex hull reaches more than 2 mm beyond its surface.
 
     Returns:
-        The library, and the index in `library.items` of each object by its name.
+        The library, and a dictionary from the name of each object to its index in `library.items`.
     """
     library = objects.library(meshes.folder, cache=meshes.cache, scale=meshes.scale, up=meshes.up, parts=parts)
     return library, {item.name: index for index, item in enumerate(library.items)}

@@ -42,7 +42,7 @@ class Images(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """Identity of a shard: its dataset, sensor and index."""
+    """Identity of a shard (the pair of files of some objects): its dataset, sensor and index."""
 
     collection: str  # SHA-256 of the content of collection.json
     sensor: str  # SHA-256 of the content of sensor.json
@@ -50,7 +50,7 @@ class Identity(NamedTuple):
 
 
 def shard_path(folder: Path, count: int, index: int) -> Path:
-    """Path of the record file of shard `index` in a dataset of `count` shards."""
+    """Path of the `.array_record` file, which has the images of shard `index` in a dataset of `count` shards."""
     return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
 
 
@@ -80,14 +80,14 @@ def check_format(content: Any, folder: Path) -> None:
 def write_shard(
     path: Path, frames: Iterable[tuple[np.ndarray, ...]], arrays: dict[str, np.ndarray], identity: Identity
 ) -> None:
-    """Write both files of a shard.
+    """Write the two files of a shard: the images (`.array_record`) and all other data (`.npz`).
 
     Args:
-        path: The `.array_record` file.
+        path: The `.array_record` file. The `.npz` file has the same name with this suffix.
         frames: Batches of images in the order in which they are stored. First come the batches of frames, each an
             `Images`. Then come the batches of views, each a tuple with one array of n visual images, uint8
             `(n, height, width, 3)`. A view is a visual image of an object in an initial pose, without a trajectory.
-        arrays: All other data, one array for each name in the constant ARRAYS.
+        arrays: All other data, one array for each name in `records.ARRAYS`.
         identity: The identity of the shard, which `read_shard` checks.
 
     Raises:
@@ -99,10 +99,10 @@ def write_shard(
 
 
 def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
-    """Read the arrays of a shard, after checking that its two files were written together.
+    """Read the arrays of a shard, after checking that its `.array_record` and `.npz` files belong together.
 
     Args:
-        path: The `.array_record` file.
+        path: The `.array_record` file. The `.npz` file with the arrays is next to it.
         identity: The identity that the shard must have.
 
     Returns:

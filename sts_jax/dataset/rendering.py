@@ -54,8 +54,8 @@ def render(
         frames: The m frames to render, int `(m, 3)`. A row contains the index of the trajectory, the index of the frame
             in the trajectory and the number of the symmetry (see `symmetries_of`). The rows are sorted by object. The
             mirrored frames of an object (symmetries 4 to 7) follow its other frames.
-        views: The arrays of the v views, sorted by object: `pose`, `(v, 7)`, and `body`, int `(v,)`, an index into
-            `bodies`.
+        views: The v views, sorted by object. The array `pose`, `(v, 7)`, has the poses of the objects: position (m) and
+            quaternion (w, x, y, z). The array `body`, int `(v,)`, has indices into `bodies`.
         report: Function that is called after each batch with the number of images that are finished so far.
 
     Yields:
@@ -111,10 +111,10 @@ def render_uint8(
     Args:
         sensor: The sensor.
         body: The object.
-        pose: Poses of the mesh frame in the sensor frame, position (m) and quaternion.
+        pose: Poses of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
         wrench: Wrenches of the pad on the object: force (N) and moment about the sensor's origin (N m).
         resolution: Height h and width w of the images (pixels).
-        crop: True to show only a window around the object. False to show the whole pad.
+        crop: True to show only the square around the object. False to show the whole pad.
 
     Returns:
         The visual images, the tactile images, and the segmentation, bool `(n, h, w)`, which is true in pixels that show

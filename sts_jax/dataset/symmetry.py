@@ -17,7 +17,7 @@ def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
     Symmetries 4 to 7 mirror the object. The result is then the pose of the mirrored body, `objects.mirror(body)`.
 
     Args:
-        pose: Pose of the mesh frame in the sensor frame, position (m) and quaternion.
+        pose: Pose of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
         symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
             s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
     """

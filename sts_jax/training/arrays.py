@@ -15,8 +15,10 @@ Batch = dict[str, Any]  # the fields of `Arrays` by name, with the samples of on
 class Arrays:
     """A training set in memory.
 
-    `inputs`, `targets`, `present` and `target_present` are dictionaries of arrays by modality. The first axis of these
-    arrays and of `condition` is the sample. Images are uint8, or float32 in [0, 1].
+    `inputs` and `targets` are dictionaries of arrays by name, such as `visual`, `tactile` or `pose`. `present` and
+    `target_present` contain Boolean arrays, which are True for the samples that have the input or the target of the
+    same name. The first axis of all these arrays and of `condition` is the sample. Images are uint8, or float32 in
+    [0, 1].
 
     Raises:
         ValueError: These arrays have different numbers of samples, or no samples.
@@ -56,11 +58,11 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: Indices into the first axis of the field `views` (as `views=`) and of the field `falls` (as
-                `falls=`). Without such indices, the batch does not contain the field.
+            further: Indices into the first axis of the fields `views` and `falls`, given as `views=` and `falls=`.
+                The batch does not contain a field without indices.
 
         Returns:
-            The selected arrays by name of the field, and the field `empty` without a selection.
+            The selected arrays by name of the field, and the whole field `empty`.
         """
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}

@@ -56,7 +56,9 @@ State = TypeVar("State", TrainState, Weights)
 
 
 def save(folder: Path, state: TrainState | Weights, *, compact: bool = False) -> None:
-    """Write a checkpoint with its checksums to `folder/checkpoints/STEP`, then delete older checkpoints.
+    """Write a checkpoint with its checksums, then delete older checkpoints.
+
+    The checkpoint is the folder `folder/checkpoints/STEP`. STEP is the number of gradient steps done, in eight digits.
 
     Args:
         folder: Folder of the model.
@@ -134,7 +136,7 @@ def verified(folder: Path) -> Path | None:
 
 
 def read(path: Path, like: State) -> State:
-    """Read those arrays of a checkpoint that `like` contains.
+    """Read a checkpoint. Arrays that are not in `like` are not read.
 
     Args:
         path: Folder of the checkpoint.

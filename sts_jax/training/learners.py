@@ -57,12 +57,14 @@ class Learner(NamedTuple):
 
 
 def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
-    """Make the learner of a model, with the loss of `mvae.loss` or `statespace.loss`.
+    """Make the learner of a model, the functions that train it: initialisation, loss and check of the training set.
+
+    The loss is `mvae.loss` or `statespace.loss`, depending on the type of the model.
 
     Args:
         model: Configuration of the model.
-        targets: For `mvae` models: modalities that are predicted from the inputs of each subset of the modalities.
-            `all` predicts all modalities, and `own` only the members of the subset.
+        targets: For `mvae` models: modalities to predict from each subset of the inputs. `all` means every modality.
+            `own` means only the modalities in the subset.
         absent: For `mvae` models: names of modalities that no sample has as an input.
 
     Returns:
@@ -130,8 +132,9 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         if values and (found != further[kind] or len({len(x) for x in values.values()}) > 1):
             shapes = {name: x.shape for name, x in values.items()}
             raise ValueError(
-                f"{kind} has arrays of the shapes {shapes}, but the samples along the first axis must be equally many "
-                f"in all arrays and have the shapes {further[kind]}: make the arrays with training.state_arrays"
+                f"{kind} has arrays of the shapes {shapes}, but all arrays must have the same number of samples (first "
+                f"axis), and the samples must have the shapes {further[kind]}: make the arrays with "
+                "training.state_arrays"
             )
     for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:

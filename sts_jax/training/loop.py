@@ -63,8 +63,8 @@ def step(
         learner: Loss of the model, from `learner`.
         graphdef: Definition of the model.
         config: Options of the training.
-        total: Number of steps of the whole training. It sets the warm-up of `beta`, the weight of the divergence in the
-            loss, and the schedule of the learning rate.
+        total: Number of steps of the whole training. The schedule of the learning rate depends on it. The warm-up of
+            beta, the weight of the divergence in the loss, depends on it, too.
         state: State before the step.
         batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
         optimiser: Optimiser that made `state` (default: that of `training.optimiser`).
@@ -122,14 +122,15 @@ def train(
         workdir: Folder of the model, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
         absent: For `mvae` models: names of modalities that no sample has as an input. `arrays.inputs` need not have
             them.
-        targets: For `mvae` models: modalities that are predicted from the inputs of each subset of the modalities.
-            `all` predicts all modalities, and `own` only the members of the subset.
-        preprocessing: Plain values that describe how images and vectors were made. They are stored in `config.json`.
+        targets: For `mvae` models: modalities to predict from each subset of the inputs. `all` means every modality.
+            `own` means only the modalities in the subset.
+        preprocessing: JSON values that describe how images and vectors were made, such as `dataclasses.asdict(p)` of a
+            `Preprocessing` p. They are stored in `config.json`.
         loss: Loss that replaces the loss of the model (default: that of `training.learner`). `targets` and `absent` are
             not passed to it.
         optimiser: Optimiser that replaces Adam (default: that of `training.optimiser`). The fields of `config` for
             Adam, the learning rate and the clipping are then not used.
-        notes: Plain values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
+        notes: JSON values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
             must have the same notes, because the functions themselves cannot be compared.
         progress: Function that is called after every step with the number of steps done, their total number, and the
             latest record of `metrics.jsonl` (empty before the first record).

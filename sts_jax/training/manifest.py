@@ -68,7 +68,7 @@ def write(folder: Path, step: int | None) -> Manifest:
 
 
 def add(folder: Path, name: str) -> None:
-    """Add the checksum of a file outside the checkpoint to `manifest.json`, if the folder has this file.
+    """Add the checksum of a file outside the checkpoint to `manifest.json`. Without a manifest, nothing is written.
 
     Args:
         folder: Folder of the model.

@@ -82,8 +82,8 @@ def _load(workdir: Path) -> Model:
         like = jax.eval_shape(lambda: Weights(*learner(model).init(jax.random.key(0))[1:], jnp.zeros((), jnp.int32)))
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{path} describes no model of this version of sts_jax ({type(error).__name__}: {error}): load the model "
-            f"with the version that trained it, or delete {workdir} and train again"
+            f"{path} does not describe a model that this version of sts_jax can load ({type(error).__name__}: "
+            f"{error}): use the version that trained the model, or delete {workdir} and train again"
         ) from error
     weights = read(checkpoint, like)
     graphdef = nnx.graphdef(nnx.eval_shape(lambda: _module(model)))

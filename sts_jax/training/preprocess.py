@@ -82,8 +82,8 @@ class Preprocessing:
         """Decode poses from the output of a network.
 
         Args:
-            code: Encoded poses, as from `encode_pose`. An inexact rotation matrix or a quaternion of another length is
-                replaced by the nearest rotation. If all of its numbers are 0, the identity is used.
+            code: Encoded poses, as from `encode_pose`. An inexact rotation matrix is replaced by the nearest rotation.
+                A quaternion is normalised. If all numbers of the rotation are 0, the identity is used.
 
         Returns:
             Position (m) and unit quaternion (w, x, y, z) with `w >= 0` of each pose.
@@ -135,13 +135,14 @@ def touch_of_noisy_images(
 ) -> Preprocessing:
     """Adapt the contact test `Preprocessing.touched` to the noise of a camera's images.
 
-    With the new fields, an image shows a contact if at least three blocks of 2 x 2 pixels differ from the blank image
+    In the adapted test, an image shows a contact if at least three blocks of 2 x 2 pixels differ from the blank image
     by more than a threshold. The threshold is six times the standard deviation of the noise in the mean of a block, but
     at least 3/255 and at most 24/255.
 
-    The standard deviation is estimated as 1.4826 times the median absolute difference from the blank image. Contacts on
-    less than half of the pad hardly change this median. Slow changes of the light after the blank image was taken
-    increase the median.
+    The standard deviation is estimated as 1.4826 times the median absolute difference between the block means of the
+    images and of the blank image. The median difference of each image and channel is subtracted first, so a change of
+    all light does not count. Contacts on less than half of the pad hardly change the estimate. Uneven changes of the
+    light after the blank image was taken increase it.
 
     Args:
         preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.
@@ -149,7 +150,7 @@ def touch_of_noisy_images(
         blank: Tactile image of the empty sensor, a mean over many frames.
 
     Returns:
-        The preprocessing with new fields `touch_threshold`, `touch_block`, `touch_blocks` and `touch_level`.
+        The preprocessing with new values of `touch_threshold`, `touch_block`, `touch_blocks` and `touch_level`.
 
     Raises:
         ValueError: `tactile` has no images, or the images have another resolution than the preprocessing.

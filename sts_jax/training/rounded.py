@@ -20,8 +20,9 @@ _STEP = ":step"  # suffix of the name of the array that has the steps of a kerne
 def write(path: Path, arrays: dict[str, ArrayLike]) -> None:
     """Write arrays to a compressed file. float32 arrays with two or more axes are rounded, all others are unchanged.
 
-    The rounding steps are separate for each index of the last axis, which is the output channel of a kernel. A step is
-    1/128 of the root mean square of the values, or more if the largest value does not fit into 16 bits.
+    The rounded values are multiples of a step. Values with the same index on the last axis (one output channel of a
+    kernel) have the same step: their root mean square divided by 128, or their largest magnitude divided by 32767 if
+    this is larger.
 
     Args:
         path: File to write, with the suffix `.npz`.

@@ -12,8 +12,8 @@ def shifted(
     The function subtracts the image of the empty pad, shifts the difference, and adds the image of the empty pad again.
     The light on the empty pad therefore stays in place.
 
-    The result is exact for points on the pad under distant lights. For a point at the height h above the pad, the shift
-    is too large by the factor 1 + h / d, where d is the distance from the camera to the pad. If the border of the image
+    The result is exact for points on the pad under distant lights. For a point at the height z above the pad, the shift
+    is too large by the factor 1 + z / d, where d is the distance from the camera to the pad. If the border of the image
     cuts off a part of an object, this part is missing after the shift, too.
 
     Args:
@@ -37,9 +37,10 @@ def shifted(
             "(n, 2), with the same n, h and w"
         )
     if (np.abs(shifts) >= size).any():
+        rows, columns = np.abs(shifts).max(0).tolist()
         raise ValueError(
-            f"shifts has up to {tuple(np.abs(shifts).max(0).tolist())} rows and columns, but these numbers must be "
-            f"below the size {size} of the images: give smaller shifts"
+            f"shifts contains shifts of up to {rows} rows and {columns} columns, but they must be below the image size "
+            f"of {size[0]} rows and {size[1]} columns: give smaller shifts"
         )
     moved = np.empty_like(images)
     for out, pair, shift in zip(moved, images, shifts, strict=True):

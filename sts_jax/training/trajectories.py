@@ -28,9 +28,9 @@ def frame_arrays(
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:
-        The arrays, and the preprocessing with a new field `absent`, the modalities that no sample has as an input. If
-        `tactile` is a modality and no first frame shows a contact, `absent` is `("tactile",)`, and the arrays have no
-        input `tactile`. Otherwise `absent` is empty.
+        The arrays, and the preprocessing with a new value of `absent`, the modalities that no sample has as an input.
+        If `tactile` is a modality and no first frame shows a contact, `absent` is `("tactile",)`, and the arrays have
+        no input `tactile`. Otherwise `absent` is empty.
     """
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -56,7 +56,9 @@ def image_arrays(
         blank: Tactile image of the empty sensor.
 
     Returns:
-        The arrays, and the preprocessing with a new field `absent`, as from `frame_arrays`.
+        The arrays, and the preprocessing with a new value of `absent`, the modalities that no sample has as an input.
+        If `tactile` is a modality and no first image shows a contact, `absent` is `("tactile",)`, and the arrays have
+        no input `tactile`. Otherwise `absent` is empty.
 
     Raises:
         ValueError: `modalities` is empty or has a name other than `visual` and `tactile`, or the images are not uint8
@@ -94,7 +96,7 @@ def _arrays(
 
 
 def paper_model(modalities: tuple[str, ...], preprocessing: Preprocessing) -> mvae.Config:
-    """Make the configuration of the paper's networks.
+    """Make the configuration of the networks in the See-Through-your-Skin paper.
 
     In the loss, the weight of the reconstruction error is 1 for images and 1000 for the pose.
 
@@ -130,7 +132,8 @@ def state_arrays(
         model: Configuration of the model, from `state_model`.
         scenario: Scenario of the trajectories.
         preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
-        empty: `visual` and `tactile` image of the empty sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
+        empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
+            The size is `model.input_size`.
         views: Visual images of objects in initial poses that were not simulated, from `dataset.Dataset.views`. They are
             used only if `visual` is an input of the model.
         falls: First and last poses of further trajectories without images, from `dataset.Dataset.ends`.
@@ -198,7 +201,7 @@ def state_codes(
     Args:
         preprocessing: Preprocessing of the model.
         pose: Positions (m) and unit quaternions (w, x, y, z), `(n, 7)`.
-        support: Support functions of the convex hulls at `objects.DIRECTIONS`, `(n, 128)` (m).
+        support: Support functions of the convex hulls for the 128 unit vectors `objects.DIRECTIONS`, `(n, 128)` (m).
         mass: Masses, `(n,)` (kg).
         com: Centres of mass in the mesh frame, `(n, 3)` (m).
 
@@ -230,16 +233,17 @@ def state_model(
         sensor: Sensor of the images.
         scenario: Scenario of the trajectories.
         preprocessing: Preprocessing of the trajectories. Its images must be square and show the whole view.
-        empty: `visual` and `tactile` image of the empty sensor, uint8 `(size, size, 3)`, from `dataset.empty_frame`.
-        image_size: Side of the predicted images (pixels). It must divide the side of the input images.
+        empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
+            The size is the side length of the input images (pixels).
+        image_size: Side length of the predicted images (pixels). It must divide the side length of the input images.
 
     Returns:
-        The configuration, and the preprocessing with a new field `absent`, the modalities that no sample has as an
+        The configuration, and the preprocessing with a new value of `absent`, the modalities that no sample has as an
         input. If no first frame shows a contact, `tactile` is not an input of the model, and `absent` is
         `("tactile",)`. Otherwise `absent` is empty.
 
     Raises:
-        ValueError: The images are not square or are cropped, or their side is not a multiple of `image_size`.
+        ValueError: The images are not square or are cropped, or their side length is not a multiple of `image_size`.
     """
     height, width = preprocessing.resolution
     if height != width or preprocessing.crop:
