@@ -39,14 +39,14 @@ def main(args: Args) -> str:
     """Draw the picture and return the answers as text.
 
     Raises:
-        ValueError: Fewer than ten held-out trajectories begin at `first`.
+        ValueError: The held-out list has fewer than ten trajectories from the place `first` on.
     """
     data = dataset.load(args.workdir / "dataset")
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:
         raise ValueError(
-            f"--first is {args.first}, but only {len(rows)} held-out trajectories begin there and {NUMBER} are needed: "
-            "give a smaller --first"
+            f"--first is {args.first}, but the held-out list has only {len(rows)} trajectories from this place on, and "
+            f"{NUMBER} are needed: give a smaller --first"
         )
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")

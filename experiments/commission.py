@@ -227,8 +227,8 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
         return fit(pictures, pinhole)
     except hardware.CalibrationError as error:
         raise hardware.CalibrationError(
-            f"{error} The pictures are kept: delete the bad ones, then run the same command again, with a larger "
-            f"--pictures than {config.pictures} to add some."
+            f"{error} The pictures are kept: delete the bad ones, and run the command again. To add pictures, give a "
+            f"larger --pictures than {config.pictures}."
         ) from error
 
 

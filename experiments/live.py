@@ -103,7 +103,7 @@ def check(config: Config) -> None:
         for name, there in (
             ("--twin", config.twin),
             ("--replay", bool(config.replay)),
-            ("--camera and --leds", config.camera is not None or config.leds is not None),
+            ("--camera/--leds", config.camera is not None or config.leds is not None),
         )
         if there
     ]

@@ -108,7 +108,9 @@ def read(config: Config, name: str) -> sts.objects.Body:
         path = Path(name)
         if not path.exists() and not path.suffix:
             classes = ", ".join(sts.objects.CATEGORIES)
-            raise FileNotFoundError(f"{name} is neither a file nor an object class ({classes})")
+            raise FileNotFoundError(
+                f"{name} is neither a file nor an object class ({classes}): give the path of a mesh file, or a class"
+            )
         return sts.objects.load(
             path,
             longest_side=config.longest_side,

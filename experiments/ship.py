@@ -62,8 +62,8 @@ def ship(workdir: Path, name: str) -> str:
         size = sum(path.stat().st_size for path in new.rglob("*") if path.is_file())
         if size > LIMIT:
             raise ValueError(
-                f"the rounded model of {workdir} has {size / 1e6:.1f} MB, but the limit is {LIMIT / 1e6:g} MB: train a "
-                "smaller model"
+                f"the model of {workdir} has {size / 1e6:.1f} MB with rounded weights, but the limit is "
+                f"{LIMIT / 1e6:g} MB: train a smaller model"
             )
         line = f"{name}: {size / 1e6:.1f} MB of at most {LIMIT / 1e6:g}; {compare(original, sts.Predictor.load(new))}"
         if (MODELS / name).exists():

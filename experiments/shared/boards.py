@@ -42,8 +42,9 @@ def wait(text: str, every: float | None) -> str:
         return input(f"{text} Then press Enter. ").strip().lower()
     except EOFError:
         raise ValueError(
-            "the Enter key cannot be read, because the standard input has ended: give --every SECONDS to continue by "
-            "time, and --board-images FOLDER or --ideal-lens DEGREES for the lens"
+            "the Enter key cannot be read, because the standard input has ended: give --every SECONDS to wait for a "
+            "fixed time instead, and --board-images FOLDER or --ideal-lens DEGREES to replace live pictures of the "
+            "board"
         ) from None
 
 

@@ -94,7 +94,10 @@ def reroll(
     mean = evaluation.ceiling(collection, sensor, test, times, jax.random.key(SEED), progress=progress)
     samples = mean.samples
     if samples is None or samples.pose is None or samples.outcome is None:
-        raise TypeError("evaluation.ceiling must return samples of the pose and the outcome, got None for one of them")
+        raise TypeError(
+            "evaluation.ceiling must return samples of the pose and of the outcome, but the returned samples, "
+            "samples.pose or samples.outcome is None"
+        )
     one = evaluation.Predicted(*(None if leaf is None else leaf[0] for leaf in samples[:4]))
     scores = {
         evaluation.CEILING: judge(mean, test),

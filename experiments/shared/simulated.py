@@ -145,9 +145,9 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
     there.check_identity(camera=twin.CAMERA, leds=device.serial_number)
     if (there.width, there.height, there.levels) != (*config.size, config.levels):
         raise ValueError(
-            f"{file} is for images of {there.width} x {there.height} pixels and LED levels of {there.levels}, but the "
-            f"options are --size {config.size[0]} {config.size[1]} and levels of {config.levels}: choose another "
-            "--workdir"
+            f"{file} is for images of {there.width} x {there.height} pixels and the LED levels {there.levels}, but the "
+            f"options give {config.size[0]} x {config.size[1]} pixels and the levels {config.levels}: choose another "
+            "--workdir, or the values of the file"
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)

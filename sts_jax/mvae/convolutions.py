@@ -28,9 +28,9 @@ def conv(
     Along each axis, the output is `y[i] = sum_a x[stride i + a - padding] kernel[a]`, summed over the input channels.
 
     Args:
-        x: Images, with zeros outside their borders.
-        kernel: Weights. `size` must be a multiple of `stride`.
-        stride: Distance between the places of two neighbouring output pixels in the input, in pixels.
+        x: Images. Pixels outside their borders count as 0.
+        kernel: Weight for each kernel pixel, input channel and output channel. `size` must be a multiple of `stride`.
+        stride: Step of the kernel from one output pixel to the next, in input pixels.
         padding: Number of zeros before the first and after the last pixel of each axis, at most `size - 1`.
 
     Returns:
@@ -47,7 +47,7 @@ def conv(
 def conv_transpose(
     x: Float[Array, "batch h w in"], kernel: Float[Array, "size size in out"], stride: int, padding: int
 ) -> Float[Array, "batch ho wo out"]:
-    """Convolve images with the transpose of the linear map `conv`, which enlarges images if `stride` is above 1.
+    """Apply a transposed convolution, the transpose of the linear map `conv`. A `stride` above 1 enlarges the images.
 
     The kernel is multiplied by each input pixel, and the products are added to the output. Along each axis, this is
     `y[stride i + a - padding] += x[i] kernel[a]`, summed over the input channels.
@@ -56,7 +56,7 @@ def conv_transpose(
         x: Images.
         kernel: Weights. `size` must be a multiple of `stride`. The third axis belongs to the channels of `x`, and the
             fourth axis to the channels of the output.
-        stride: Distance between the places of two neighbouring input pixels in the output, in pixels.
+        stride: Step of the kernel from one input pixel to the next, in output pixels.
         padding: Number of rows and columns that are cut from each side of the output.
 
     Returns:

@@ -30,10 +30,10 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 
 
 class Terms(NamedTuple):
-    """The loss of a batch and its parts.
+    """The loss of a batch, and its parts before they are multiplied by `beta` and `Modality.weight`.
 
-    The parts are not weighted by `beta` and `Modality.weight`. Each part is a mean over the pairs of a sample and a
-    subset of the modalities. Pairs that do not count in the loss are left out, see the docstring of the module.
+    Each part is a mean over pairs of a sample and a subset of the modalities. The mean excludes the pairs that the loss
+    ignores, for example if the sample has other inputs, but none of the subset. See the docstring of the module.
     """
 
     loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch
@@ -88,17 +88,17 @@ def loss(
     it in every sample, in less time.
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
-    mean and one variance for this call, in which every subset has the same weight as in the loss. If two subsets have
-    the same present modalities in a sample, they use the same noise for the latent `z`.
+    mean and one variance of each channel for this call. Every subset has the same weight in them as in the loss. If two
+    subsets have the same present modalities in a sample, they use the same noise for the latent `z`.
 
     Args:
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
         stats: Running batch statistics of the model.
         key: Random key for the noise of `z`.
-        inputs: Inputs `x_t` by modality, `(batch, *shape)`. Images are in [0, 1]. A modality without an input counts as
+        inputs: Inputs by modality, `(batch, *shape)`. Images are in [0, 1]. A modality without an input counts as
             absent.
-        targets: Targets `x_T` of all modalities, `(batch, *shape)`. Images are in [0, 1].
+        targets: Targets of all modalities at the later time, `(batch, *shape)`. Images are in [0, 1].
         present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
             a mask is present in all samples. Values of samples whose mask is False have no influence and may be NaN.
         target_present: Masks of the targets by modality, `(batch,)`. True means that the sample has the target. A

@@ -270,7 +270,7 @@ class MVAE(nnx.Module):
         self.decoders = nnx.Dict({m.name: decoders[m.kind](m, config) for m in config.modalities})
 
     def encode(self, name: str, x: Array, weights: Array | None) -> Gaussian:
-        """Estimate the latent from one modality. The result is an expert of `product_of_experts`.
+        """Estimate the latent from one modality. `product_of_experts` combines the estimates of several modalities.
 
         Args:
             name: Name of the modality.
@@ -301,9 +301,10 @@ class MVAE(nnx.Module):
 def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[MVAE], nnx.State, nnx.State]:
     """Create a model with random parameters.
 
-    Kernels are drawn from normal distributions with variance `1 / fan_in`. Two kinds of kernels are smaller: those of
-    all latents but the first 16, so that these latents start near the prior, and those of the last layer of an image
-    decoder. The biases of hidden layers are 0, and the scales of batch normalisation are 1.
+    Kernels are drawn from normal distributions with variance `1 / fan_in`. Only the first 16 latents are active at the
+    start. The weights of the other latents are multiplied by 0.03, so that these latents start near the prior. The
+    kernel of the last layer of an image decoder is multiplied by 0.1. The biases of hidden layers are 0, and the scales
+    of batch normalisation are 1.
 
     Args:
         key: Random key for the kernels.

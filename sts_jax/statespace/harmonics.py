@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 
 def number(degree: int) -> int:
-    """The number of spherical harmonics of the degrees 0 to `degree`. A function has one coefficient for each."""
+    """The number of spherical harmonics of the degrees 0 to `degree`. A function has one coefficient per harmonic."""
     return (degree + 1) ** 2
 
 
@@ -55,9 +55,9 @@ def values(
 
     Args:
         coefficients: Coefficients of k spherical harmonics, for c functions of each of n objects.
-        rotation: Rotation matrix R of each object. At the direction d, the rotated function of f has the value
-            `f(R^T d)`. If R is a mean of several rotation matrices, the result is approximately the mean of their
-            values.
+        rotation: Rotation matrix R of each object. The rotation turns a function f into the function with the value
+            `f(R^T d)` at the direction d. If R is a mean of several rotation matrices, the result is approximately the
+            mean of the results for these matrices.
         directions: Unit vectors.
 
     Returns:

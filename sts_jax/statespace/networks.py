@@ -85,7 +85,9 @@ class Config:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
             raise ValueError(f"inputs is {self.inputs}, but it must have at least one of {INPUTS}, in this order")
         if not set(self.inputs) & set(IMAGES):
-            raise ValueError(f"inputs is {self.inputs}, but one input must be an image: add 'visual' or 'tactile'")
+            raise ValueError(
+                f"inputs is {self.inputs}, but at least one input must be an image: add 'visual' or 'tactile'"
+            )
         for name, part in (("window", 8), ("canvas", 8), ("input_size", self.image_size)):
             if getattr(self, name) % part or getattr(self, name) < part:
                 raise ValueError(
@@ -99,8 +101,8 @@ class Config:
             )
         if self.condition < 0 or (self.condition and not 0 <= 2 * self.vectors <= self.condition):
             raise ValueError(
-                f"condition is {self.condition} and vectors is {self.vectors}, but condition must be 0 or at least "
-                "2 * vectors, because each vector has two numbers, and vectors must be >= 0"
+                f"condition is {self.condition} and vectors is {self.vectors}, but vectors must be >= 0, and condition "
+                "must be 0 or at least 2 * vectors, because each vector has two numbers"
             )
         if self.traits < TINT:
             raise ValueError(f"traits is {self.traits}, but it must be >= {TINT}: the first {TINT} are the mean colour")
@@ -130,11 +132,12 @@ class Config:
 
 
 class FinalPose(NamedTuple):
-    """The predicted density of the final pose of n objects: for each outcome, a mixture of k Gaussians over 21 numbers.
+    """The predicted density of the final pose of n objects.
 
-    The first 12 numbers are the final pose code (position and rotation matrix, see `statespace.poses`). The other 9 are
-    the matrix of the rotation from the first to the final pose, row by row. All are given in the sensor frame after a
-    rotation about the z axis, which turns the x axis into the direction `heading`.
+    For each outcome of the scenario, such as resting or falling off, the density is a mixture of k Gaussians over 21
+    numbers. The first 12 numbers are the final pose code (position and rotation matrix, see `statespace.poses`). The
+    other 9 are the matrix of the rotation from the first to the final pose, row by row. All numbers refer to the sensor
+    frame rotated about its z axis, so that its x axis is the direction `heading`.
     """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
@@ -145,7 +148,7 @@ class FinalPose(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """The rendered image of each of n objects without a background. `compose` adds the images of the empty sensor."""
+    """Outlines, colours and tactile changes of n rendered objects. `compose` adds the images of the empty sensor."""
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
     colour: Float[Array, "n size size 3"]  # colour of the object, [0, 1]
@@ -178,7 +181,8 @@ class _ResidualDense(nnx.Module):
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
     """Split appearance codes into traits and functions on the unit sphere.
 
-    Traits do not depend on the object's rotation. Functions describe an appearance that depends on the direction.
+    Traits are numbers that do not depend on the object's rotation. Functions assign a number to each direction and
+    rotate with the object.
 
     Args:
         config: Configuration of the model. It has `config.traits` traits, `config.own` functions of a direction in the
@@ -306,8 +310,8 @@ class Encoder(nnx.Module):
 class Transition(nnx.Module):
     """Predicts the density of the final pose from the state in the first frame.
 
-    The input is a belief: a Gaussian over the state code (pose, shape and mass). The appearance code is not an input,
-    because the transition would recognise training objects by their appearance (see docs/trials.md).
+    The input is a belief: a Gaussian over the state code (pose, shape and mass). The appearance code is not an input.
+    Otherwise, the transition would recognise training objects by their appearance (see docs/trials.md).
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -371,9 +375,9 @@ class Decoder(nnx.Module):
     """Renders an object in a given pose, from its state code and its appearance code.
 
     The network renders the object on a canvas: a square that is parallel to the pad and aligned with the object's
-    heading, a direction in the plane of the pad that turns with the object. The canvas is then projected into the view
-    of the camera. Its centre is below the mesh origin, at the height of the object's lowest point, because the camera
-    sees the object from below. `compose` adds the images of the empty sensor.
+    heading, a direction in the plane of the pad that turns with the object. The centre of the canvas is below the mesh
+    origin, at the height of the object's lowest point, because the camera sees the object from below. The canvas is
+    then projected into the view of the camera. `compose` adds the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:

@@ -196,7 +196,7 @@ def loss(
     Args:
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
-        key: Random key.
+        key: Random key for the choice of inputs and for the noise.
         inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1] with the
             side `input_size`, and pose codes `pose` `(n, 12)`.
         targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
@@ -215,10 +215,10 @@ def loss(
         beta: Weight of the divergence of the appearance code.
 
     Returns:
-        The loss, and its unweighted terms by name. Each term is a mean over the items that have the input or the
-        target. The term `state` is a squared error of state codes, and all other terms are in nats. `state`, `doubt`
-        and `first` are summed over the images `visual` and `tactile` that are inputs. `covered` is summed over the
-        first and the last frame.
+        The loss, and its terms by name without their weights. A term that depends on inputs is a mean over the items
+        that have these inputs. The term `state` is a squared error of state codes, and all other terms are in nats.
+        `state`, `doubt` and `first` are summed over the images `visual` and `tactile` that are inputs. `covered` is
+        summed over the first and the last frame.
     """
     model = nnx.merge(graphdef, params)
     config = model.config

@@ -47,8 +47,8 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
 def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
     """The certainty of each object's rotation: 0 if the rotation is unknown, 0.8 to 1 if the rotation is known exactly.
 
-    The mean of uncertain rotation matrices has shorter columns than a rotation matrix. The certainty is the length of
-    the longest projection of a column, which is a mesh axis, onto the plane of the pad.
+    The columns of a rotation matrix are the mesh axes. The mean of uncertain rotation matrices has shorter columns. The
+    certainty is the length of the longest projection of a column onto the plane of the pad.
 
     Args:
         code: Means of pose codes (position and rotation matrix) under the density of an uncertain pose.
@@ -60,7 +60,7 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
 
 
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
-    """The rotation matrices in pose codes. In a mean of several pose codes, the matrix may be inexact."""
+    """The matrix in each pose code. If the code is a mean of pose codes, the matrix is a mean of rotation matrices."""
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
 
 

@@ -14,7 +14,10 @@ from sts_jax.statespace.objective import reduced
 
 
 class Samples(NamedTuple):
-    """Samples of the last frame: k final poses for each of n items, and images of the first `drawn` of these poses."""
+    """Samples of the last frame: k final poses for each of n items, and images of the first poses.
+
+    `drawn` is the number of poses with images.
+    """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -41,7 +44,7 @@ def sample(
     Args:
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
-        key: Random key.
+        key: Random key for the samples.
         inputs: Inputs of n items by name, at least one: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1]
             with the side `Config.input_size`, pose codes `pose` `(n, 12)` and true state codes `state` `(n, code)`.
             Inputs other than `state` must be in the model's `Config.inputs`.
@@ -57,7 +60,8 @@ def sample(
             appearance code is drawn for each of these poses.
 
     Returns:
-        The sampled final poses and images, the mean images, and the probabilities of the outcomes.
+        The posterior in the first frame, the probabilities of the outcomes, the sampled final poses and images, and the
+        mean images of each item over the `drawn` samples.
 
     Raises:
         ValueError: `drawn` is out of range.

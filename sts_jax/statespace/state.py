@@ -38,7 +38,8 @@ CODE = sum(SIZES)  # numbers in a state code
 class State(NamedTuple):
     """The parts of state codes, which describe the pose, the shape and the mass of n objects.
 
-    The same class holds the variances of these parts. The docstring of the module defines the support function.
+    The shape is given by the support function `h(d)` of the convex hull: the maximum of `x . d` over the points x of
+    the hull, for a unit vector d. The same class holds the variances of these parts.
     """
 
     pose: Float[Array, "n 12"]  # pose code
@@ -76,7 +77,8 @@ def encode(
 
     Args:
         pose: Pose codes (position and rotation matrix), from `training.Preprocessing.encode_pose`.
-        support: Support functions of the convex hulls at `objects.DIRECTIONS`, from `objects.support` (m).
+        support: Support functions of the convex hulls (m), from `objects.support`. For each of the 128 unit vectors d
+            in `objects.DIRECTIONS`, the value is the maximum of `x . d` over the points x of the hull.
         mass: Masses (kg).
         com: Centres of mass in the mesh frame (m).
 
