@@ -258,7 +258,7 @@ def test_a_gap_exceeds_a_timeout(tmp_path):
         recorder.add(dataclasses.replace(shot(1), time_s=1e4))
     with (
         hardware.Replay(tmp_path / "made").connect(0.5) as replay,
-        pytest.raises(hardware.LightError, match=r"available in .* s, but timeout_ms is 500: raise timeout_ms"),
+        pytest.raises(hardware.LightError, match=r"available in .* ms, but timeout_ms is 500: raise timeout_ms"),
     ):
         replay.read(500)
 

@@ -129,7 +129,7 @@ def test_passwords_of_urls_are_not_kept(tmp_path):
 def test_another_version_is_refused(tmp_path):
     saved(tmp_path)
     change(tmp_path / "sensor.json", lambda values: values["device"].update(version=2))
-    with pytest.raises(SensorFileError, match=r"sensor\.json has version 2 of the format.* reads 1\. Use the version"):
+    with pytest.raises(SensorFileError, match=r"sensor\.json has format 2 .* reads format 1\. Use the version"):
         Device.load(tmp_path)
     sts.Sensor.load(tmp_path / "sensor.json")
 

@@ -94,7 +94,7 @@ def test_forgotten_changes_do_not_alter_later_intervals():
 def test_light_history_refuses_wrong_times():
     history = twin.LightHistory()
     history.set(1.0, ON)
-    with pytest.raises(ValueError, match="at least that of the last change"):
+    with pytest.raises(ValueError, match=r"at least 1\.0 s, the time of the last change"):
         history.set(0.5, OFF)
     with pytest.raises(ValueError, match="less than end_s"):
         history.over(2.0, 2.0)

@@ -30,7 +30,7 @@ def header(width: int, height: int, encoding: str) -> bytes:
 
 
 def cluster(time_ms: int, image: bytes) -> bytes:
-    """Return the bytes that append one image to a Matroska video file, called a cluster in this format.
+    """Return the bytes that append one image to a Matroska video file. The format calls these bytes a cluster.
 
     The last bytes are the encoded image.
 

@@ -20,15 +20,15 @@ class LedError(OSError):
 
 
 class PortNotFoundError(LedError):
-    """Raised if a port does not exist, or if no port has the wanted controller. The message lists other ports."""
+    """Raised if a serial port does not exist, or if none has the wanted controller. The message lists other ports."""
 
 
 class PortPermissionError(LedError):
-    """Raised if the user may not open the port. The message names the group that has the permission."""
+    """Raised if the user is not allowed to open the serial port. The message names the group that has permission."""
 
 
 class PortInUseError(LedError):
-    """Raised if the port is open already. The message names the process that has opened it, if it is known."""
+    """Raised if the serial port is open already. The message names the process that has opened it, if it is known."""
 
 
 class NotALedControllerError(LedError):
@@ -77,7 +77,7 @@ def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
     """Open a serial port so that no other process can open it.
 
     Args:
-        name: Name of the device, or a URL of pyserial.
+        name: Name of the port, such as `/dev/ttyACM0`, or a URL of pyserial, such as `socket://localhost:7000`.
         baud: Rate of the serial line (baud).
 
     Returns:
@@ -85,7 +85,7 @@ def open_port(name: str, baud: int = protocol.BAUD) -> serial.Serial:
 
     Raises:
         PortNotFoundError: There is no such port.
-        PortPermissionError: The user may not open the port.
+        PortPermissionError: The user is not allowed to open the port.
         PortInUseError: Another process, or another part of this process, has opened the port.
         NotALedControllerError: The device is not a serial port.
         LedError: The port cannot be opened for another reason.
@@ -140,7 +140,10 @@ def _group(name: str) -> str:
 def users_of(name: str) -> list[str]:
     """Return the processes that have opened a device, as texts such as "process 123 (python)".
 
-    Only processes that this user may see are listed. The list is empty on other systems than Linux.
+    Only processes whose open files this user can read are listed. The list is empty on other systems than Linux.
+
+    Args:
+        name: Path of the device, such as `/dev/ttyACM0`.
     """
     target, users, own = os.path.realpath(name), [], False
     for folder in Path("/proc").glob("[0-9]*/fd"):

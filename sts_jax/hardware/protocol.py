@@ -36,7 +36,7 @@ class Code(enum.IntEnum):
 
 
 class ProtocolError(ValueError):
-    """Raised for a line that is not a valid message of the protocol. The error's message contains the line.
+    """Raised for a line that is not a valid message of the LED controller's protocol. The error's text shows the line.
 
     Attributes:
         code: Error code that a controller sends in its reply to this line.
@@ -77,7 +77,10 @@ class Ping:
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """Request to set the watchdog's period: the time without requests after which the lights are turned off."""
+    """Request to set the watchdog's period. The reply is a `Watching`.
+
+    The period is the time without requests after which the controller turns the lights off.
+    """
 
     sequence: int
     period_ms: int  # time without requests after which the lights go off, 100 to 10000 (ms)
@@ -146,7 +149,7 @@ def encode(text: str) -> bytes:
         text: Printable ASCII without `*`.
 
     Returns:
-        The line, at most `LONGEST_LINE` bytes.
+        The line, at most 64 bytes (`LONGEST_LINE`).
 
     Raises:
         ProtocolError: The text is empty, contains `*` or other characters than printable ASCII, or is too long.
@@ -168,8 +171,8 @@ def decode(line: bytes) -> str:
         line: The whole line, with its newline.
 
     Raises:
-        ProtocolError: The line is longer than `LONGEST_LINE`, contains other bytes than printable ASCII, lacks the
-            checksum or the newline, or has a wrong checksum.
+        ProtocolError: The line is longer than 64 bytes (`LONGEST_LINE`), contains other bytes than printable ASCII,
+            lacks the checksum or the newline, or has a wrong checksum.
     """
     if len(line) > LONGEST_LINE:
         raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}", Code.LENGTH)

@@ -34,9 +34,9 @@ class Replay:
     misses images, as with a sensor, and `skipped` counts them. With `speed=None`, the replay waits for the program
     instead and returns every image.
 
-    The times of a `Shot` are on the clock `time.monotonic` of the replay. The time between two images is that of the
-    recording, divided by the speed. A replay cannot switch lights, so it returns the images of both streams in the
-    order of the recording. Only one thread at a time may use a replay.
+    The times of a `Shot` are those of the replay, not of the recording, on the clock `time.monotonic`. The time between
+    two images is the recorded time divided by the speed. A replay cannot switch lights, so it returns the images of
+    both streams in the order of the recording. Only one thread at a time may use a replay.
 
     Attributes:
         skipped: Number of images since `connect` that were not returned because the program read too slowly.
@@ -117,9 +117,9 @@ class Replay:
             FileNotFoundError: There is no recording, or one of its files is missing.
             DamagedFileError: A file of the recording is damaged or truncated.
             CameraError: A video cannot be read.
-            ValueError: `warmup_s`, or the constructor argument `fps`, is out of range. Or the recording is empty or was
-                written in another version of the format. Or the lengths of the two videos differ by more than one
-                frame.
+            ValueError: `warmup_s` is negative or not finite, or the recording is empty or has another version of the
+                format. Two videos are refused if their lengths differ by more than one frame, if the constructor
+                argument `fps` is not positive and finite, or if a path is that of a device or a stream.
         """
         if not 0 <= warmup_s < math.inf:
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -148,7 +148,7 @@ class Replay:
             film.close()
 
     def read(self, timeout_ms: float | None = None) -> Pair:
-        """Wait for the next pair whose two images become available after the call, and return it.
+        """Wait for a visual and a tactile image that both become available after the call, and return this pair.
 
         With `speed=None`, return the pair that follows the last returned pair, without waiting.
 
@@ -176,7 +176,8 @@ class Replay:
     def async_read(self, timeout_ms: float | None = None) -> Pair:
         """Return the newest available pair that was not returned yet, or wait for the next one.
 
-        With `speed=None`, return the pair that follows the last returned pair, without waiting.
+        A pair consists of a visual and a tactile image. With `speed=None`, return the pair that follows the last
+        returned pair, without waiting.
 
         Args:
             timeout_ms: Longest wait (ms). None: no limit.
@@ -199,7 +200,9 @@ class Replay:
         return self._waited(pair, limit_s)
 
     def read_latest(self, max_age_ms: float = 500.0) -> Pair:
-        """Return the newest available pair without waiting. The same pair may be returned several times.
+        """Return the newest available pair of a visual and a tactile image, without waiting.
+
+        The same pair may be returned several times.
 
         Args:
             max_age_ms: Largest allowed time since the older image of the pair became available (ms). With
@@ -268,8 +271,8 @@ class Replay:
             The image at the end of the first `window_s` seconds without movement.
 
         Raises:
-            NotStillError: Something still moves after `timeout_s`.
-            EndOfVideoError: The recording ends earlier.
+            NotStillError: No period of `window_s` without movement has ended within `timeout_s`.
+            EndOfVideoError: The recording ends before such a period has ended.
             CameraNotConnectedError: The replay is not connected.
             CameraError: The recording has no visual images.
         """
@@ -381,7 +384,7 @@ class Replay:
         wait_s = 0.0 if self._speed is None else self._due_s(pair[1]) - time.monotonic()
         if wait_s > limit_s:
             raise LightError(
-                f"the next pair of {self._name} becomes available in {wait_s:.2f} s, but timeout_ms is "
+                f"the next pair of {self._name} becomes available in {1000 * wait_s:.0f} ms, but timeout_ms is "
                 f"{1000 * limit_s:g}: raise timeout_ms. The recording may have a gap here."
             )
         self._newest, self._fresh, self._position = pair, False, max(self._position, pair[1] + 1)

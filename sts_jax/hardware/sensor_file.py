@@ -39,7 +39,7 @@ class SensorFileError(ValueError):
 
 
 class WrongDeviceError(SensorFileError):
-    """Raised if a sensor file describes another camera or LED controller. The message names both devices."""
+    """Raised if the camera or the LED controller is not that of the sensor file. The message names both devices."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,8 +232,8 @@ class Device:
         version = device.pop("version", None)
         if version != VERSION:
             raise SensorFileError(
-                f"{file} has version {version!r} of the format, but this version of sts_jax reads {VERSION}. Use the "
-                f"version of sts_jax that wrote it, or {_COMMISSION} again."
+                f"{file} has format {version!r} (field device.version), but this version of sts_jax reads format "
+                f"{VERSION}. Use the version of sts_jax that wrote the file, or {_COMMISSION} again."
             )
         try:
             loaded = _decoded(cls, device, "device")
@@ -254,7 +254,7 @@ class Device:
 
         Raises:
             SensorFileError: No background is recorded for this stream, or its image file is missing or damaged.
-            ValueError: The image has another size than the lens.
+            ValueError: The image does not have the `height` and `width` of this device.
         """
         background = self._named(stream)
         if background is None:
@@ -388,4 +388,4 @@ def _decoded_dataclass(kind: Any, value: Any, name: str) -> Any:
     try:
         return kind(**{field: _decoded(kinds[field], value[field], f"{name}.{field}") for field in known})
     except OverflowError as error:  # a whole number beyond float's range
-        raise ValueError(f"a number of {name} is too large ({error})") from error
+        raise ValueError(f"field {name} contains a whole number that is too large for a float ({error})") from error

@@ -51,7 +51,7 @@ class Refusal:
 
 
 def asked(config: CameraConfig) -> dict[str, float]:
-    """Return the settings whose values are given in a configuration, by field name of `CameraConfig`."""
+    """Return `exposure`, `gain`, `white_balance` and `focus` of a configuration by name, except those that are None."""
     values = {setting.field: getattr(config, setting.field) for setting in _SETTINGS}
     return {field: value for field, value in values.items() if value is not None}
 
@@ -69,8 +69,8 @@ def lock(
 
     Returns:
         The values that the device has now, by field name, and a list of the properties that the driver did not set.
-        If the driver lacks a property, the list contains the property in two cases: `values` contains its setting, or
-        the property turns automatic exposure or automatic white balance on and off.
+        A property that the driver lacks is in the list only if `values` requires it, or if it turns automatic exposure
+        or automatic white balance on and off.
     """
     held: dict[str, float] = {}
     refused: list[Refusal] = []

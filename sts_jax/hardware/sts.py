@@ -56,10 +56,10 @@ class STS:
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
       lights. Earlier frames may show the former lights.
     - Two successive frames since the switch have shown the effect of the new lights.
-    - The controller's next answer shows that the lights have not changed since the acknowledgement.
+    - The controller's next answer after the frame shows that the lights have not changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
     - It is not identical to the frame before. Identical frames are allowed if `CameraConfig.frozen_after_s` is None.
-    - It is not black. Black frames are allowed if the last image of the same stream was black, or if it is missing.
+    - It is not black. Black frames are allowed if the last image of the same stream was black, or if there was none.
 
     All other frames are discarded. Only one thread may use a sensor at a time.
     """
@@ -277,8 +277,8 @@ class STS:
         """Take one image of each stream.
 
         Both frames arrive after the call. The first one may have been exposed before the call, but not earlier than one
-        settling time before its arrival. The stream for which the lights were set last comes first, so each pair needs
-        only one switch of the lights.
+        settling time before its arrival. The first image belongs to the stream for which the lights are already set, so
+        each pair needs only one switch of the lights.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
@@ -289,7 +289,7 @@ class STS:
             The two images.
 
         Raises:
-            LightError: No frame in time was proven to show the lights of its stream.
+            LightError: The time ended before one frame of each stream was proven to show the right lights.
             LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
             CameraError: The sensor is not connected, or the camera sends no usable frames. `Camera.read` lists the
                 subclasses.
@@ -360,7 +360,7 @@ class STS:
 
         Raises:
             ValueError: An argument is out of range.
-            LightError, LedError, CameraError: The iterator raises them at an image. The causes are those of `read`.
+            LightError, LedError, CameraError: A step of the iterator raises them. The causes are those of `read`.
         """
         stream_order(duty, dwell)
         self._stop_background()
@@ -391,7 +391,7 @@ class STS:
         """Measure the settling times, and use them from now on. The scene must be at rest.
 
         The settling time is the longest time from the controller's acknowledgement of a switch to the arrival of a
-        frame that does not show the new lights completely, plus one period of the camera. The lights are switched
+        frame that does not show the new lights completely, plus the time between two frames. The lights are switched
         several times in each direction, and the frames after each switch are compared.
 
         Args:
@@ -457,8 +457,8 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
     """Return an endless iterator over the streams of successive images.
 
     Args:
-        duty: Share of tactile images, 0 to 1. After each group of `dwell` images, the share of all images so far is as
-            close to `duty` as possible.
+        duty: Share of tactile images, 0 to 1. After each group of `dwell` images, the share of tactile images so far
+            is as close to `duty` as possible.
         dwell: Number of successive images of one stream in a group, >= 1.
 
     Returns:

@@ -15,11 +15,11 @@ class Hand(AutomaticPerson):
 
     `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
     confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person
-    would. If `hardware.collect` detects no contact while a pose is held, the hand continues with the next pose, and the
-    session leaves out the number of this trajectory.
+    would. If `hardware.collect` detects no contact while a pose is held, the hand continues with the pose of the next
+    trajectory, and the session leaves one number unused.
 
-    Trajectory n of the session is therefore trajectory n of the scene, if the scene starts with the session's next
-    number (`ObjectScene(first=hardware.next_recording(folder))`).
+    A trajectory therefore has the same number in the session and in the scene, if the scene starts with the session's
+    next number (`ObjectScene(first=hardware.next_recording(folder))`).
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
@@ -73,8 +73,8 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect still shows the instruction `{view.instruction}` after "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): its thresholds "
-                "do not suit the twin's images, so change the argument config (a GuideConfig)"
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): the thresholds "
+                "of hardware.collect do not suit the twin's images, so change its argument config (a GuideConfig)"
             )
 
     def action(self) -> Action | None:

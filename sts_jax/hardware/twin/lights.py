@@ -63,7 +63,7 @@ class LightHistory:
         """
         last, target = self._changes[-1], sum(levels) / (255 * len(levels))
         if time_s < last.time_s:
-            raise ValueError(f"time_s must be at least that of the last change, {last.time_s} s, got {time_s} s")
+            raise ValueError(f"time_s must be at least {last.time_s} s, the time of the last change, got {time_s} s")
         if target != last.target:
             self._changes.append(_Change(time_s, self._share(last, time_s), target))
 
@@ -71,7 +71,7 @@ class LightHistory:
         """The brightness of the LEDs between two times.
 
         Args:
-            start_s: Begin of the interval (s).
+            start_s: Start of the interval (s).
             end_s: End of the interval (s), later than `start_s`.
 
         Returns:

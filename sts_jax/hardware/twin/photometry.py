@@ -64,7 +64,7 @@ class Ends(NamedTuple):
 
 
 class Warp(NamedTuple):
-    """The mapping from a rendered image to the raw image of a camera with lens distortion, made by `lens_warp`."""
+    """The mapping from a rendered image to the raw image of a camera with lens distortion. `lens_warp` makes it."""
 
     maps: tuple[np.ndarray, np.ndarray]  # maps for `cv2.remap`, with n x n samples per raw pixel, which are averaged
     size: tuple[int, int]  # (height, width) of the raw image (pixels)
@@ -76,7 +76,8 @@ class Warp(NamedTuple):
             image: Rendered image in linear light, shape (height, width, 3).
 
         Returns:
-            Raw image of shape (*size, 3) and the data type of `image`. Pixels whose view is outside `image` are 0.
+            Raw image of the same data type, shape (height, width, 3) with the height and width in the field `size`.
+            Pixels whose view is outside `image` are 0.
         """
         sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)

@@ -49,7 +49,7 @@ class LedPort:
 
     @property
     def device(self) -> str:
-        """Name of the port: that of the symbolic link if there is one, else that of the pseudo-terminal."""
+        """Path of the port: the symbolic link if there is one, else the pseudo-terminal."""
         return self._name if self._link is None else str(self._link)
 
     def inject(self, fault: faults.Fault) -> None:

@@ -22,7 +22,7 @@ def lens_warp(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int], *, samp
         lens: Fisheye camera whose raw image is wanted.
         pinhole: Pinhole camera of the rendered view, such as `sts_jax.Sensor().camera`.
         resolution: (height, width) of the rendered image (pixels).
-        samples: Number of samples along each axis of a raw pixel, >= 1. The value of the pixel is their mean. Default:
+        samples: Number of samples along each axis of a raw pixel, >= 1. The value of the pixel is their mean. None:
             the number that avoids aliasing, but at most 3.
 
     Returns:

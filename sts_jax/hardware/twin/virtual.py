@@ -112,8 +112,9 @@ class VirtualSensor:
                 return Shot(image, stream, time_s, exposure.index, 0, before, after.sent_s)
             self._lit = None
         raise LightError(
-            f"the lights changed in each of {_ATTEMPTS} attempts to take a {stream} image: lower the settling time of "
-            f"{settled_s:g} s below 1 s, because the LED controller turns its lights off after 1 s without a request"
+            f"the lights changed in each of {_ATTEMPTS} attempts to take a {stream} image. The settling time is "
+            f"{settled_s:g} s, but the LED controller turns its lights off after 1 s without a request: give a "
+            "settling time below 1 s (argument settling)"
         )
 
     def _set(self, stream: Stream) -> Lit:
