@@ -266,7 +266,7 @@ def test_hull_gap_is_the_error_of_a_hull_of_64_vertices(tmp_path):
         ({"longest_side": -0.1}, "longest_side must be a positive"),
         ({"longest_side": 0.2}, "the pad is 0.15 m"),
         ({"longest_side": 0.004}, "longest_side is 0.004 m, but the smallest object is 0.005 m"),
-        ({"scale": 0.001}, r"longest side is 0\.1 mm, but the smallest object is 5 mm long.*longest_side, or scale"),
+        ({"scale": 0.001}, r"longest side is 0\.1 mm, but the smallest object is 5 mm long.*longest_side in metres, or scale"),
         ({"category": 99}, "category is 99, but it must be from 0 to 7"),
         ({"category": -2}, "category is -2, but it must be from 0 to 7"),
         ({"category": "mouse"}, r"category is 'mouse', but .*CATEGORIES\.index\('mouse'\)"),
@@ -384,6 +384,12 @@ def test_too_many_faces_are_refused(tmp_path, monkeypatch):
 def test_an_invalid_number_of_faces_is_refused(tmp_path, faces):
     with pytest.raises(ValueError, match=rf"faces must be a whole number, at least 4, got {faces!r}"):
         inspect.unwrap(objects.load)(tmp_path / "none.stl", faces=faces)
+
+
+@pytest.mark.parametrize("up", [(0.0, 1.0), ("x", "y", "z"), 1.0])
+def test_an_invalid_direction_is_refused(tmp_path, up):
+    with pytest.raises(ValueError, match="each must be three finite numbers"):
+        inspect.unwrap(meshes.rotation)(up, (0.0, -1.0, 0.0))
 
 
 def test_a_public_textured_mesh_loads():

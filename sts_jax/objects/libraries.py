@@ -20,7 +20,7 @@ from scipy.spatial import ConvexHull
 
 from sts_jax.objects import body_cache, shapenet
 from sts_jax.objects.assembly import STEEL, WALL
-from sts_jax.objects.body import CATEGORIES, PAD, Body
+from sts_jax.objects.body import CATEGORIES, PAD, SMALLEST, Body
 from sts_jax.objects.items import LARGEST, NUM_FACES, Entry, Item, Library
 from sts_jax.objects.meshes import AXES, load
 from sts_jax.objects.parts import decompose, gaps
@@ -60,13 +60,13 @@ def library(
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
         scale: Length of one unit of the files (m), above 0. None uses ShapeNetSem's table, or 1 m without a table.
-        longest_side: Longest side to which every object is scaled (m), at most 0.15 m. None keeps the sizes. Must
+        longest_side: Longest side to which every object is scaled (m), from 5 mm to 0.15 m. None keeps the sizes. Must
             be None if `scale` is given.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
             fast-simplification.
-        largest: Longest side to which longer objects are scaled down (m), at most 0.15 m.
+        largest: Longest side to which longer objects are scaled down (m), from 5 mm to 0.15 m.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
 
@@ -83,18 +83,15 @@ def library(
         raise FileNotFoundError(f"{folder}: no such folder of objects: check the path")
     if scale is not None and longest_side is not None:
         raise ValueError(f"{folder}: give scale or longest_side, not both")
-    for name, value, most in (
-        ("scale", scale, math.inf),
-        ("longest_side", longest_side, PAD),
-        ("largest", largest, PAD),
-    ):
-        if value is not None and not (0 < value <= most and math.isfinite(value)):
-            allowed = "positive and finite" if most == math.inf else f"positive and at most {most} m"
-            raise ValueError(f"{folder}: {name} is {value} m, but it must be {allowed}")
+    if scale is not None and not (scale > 0 and math.isfinite(scale)):
+        raise ValueError(f"{folder}: scale is {scale} m, but it must be positive and finite")
+    for name, value in (("longest_side", longest_side), ("largest", largest)):
+        if value is not None and not SMALLEST <= value <= PAD:
+            raise ValueError(f"{folder}: {name} is {value} m, but it must be from {SMALLEST} to {PAD} m")
     if up is not None and up not in AXES:
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
-    if faces < 4:
-        raise ValueError(f"{folder}: faces must be at least 4, got {faces}")
+    if isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4:
+        raise ValueError(f"{folder}: faces must be a whole number, at least 4, got {faces!r}")
     root = shapenet.find_root(folder)
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:

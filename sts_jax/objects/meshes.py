@@ -43,8 +43,12 @@ def rotation(up: Sequence[float], front: Sequence[float]) -> Float[np.ndarray, "
     Raises:
         ValueError: A direction is zero or not finite, or the two directions are parallel.
     """
-    z, y = np.array(up, float), -np.array(front, float)
-    if not (np.isfinite([z, y]).all() and np.linalg.norm(z) > 0):
+    try:
+        z, y = np.array(up, float), -np.array(front, float)
+        valid = z.shape == y.shape == (3,) and np.isfinite([z, y]).all() and np.linalg.norm(z) > 0
+    except (TypeError, ValueError):  # not numbers
+        valid = False
+    if not valid:
         raise ValueError(
             f"up is {up} and front is {front}, but each must be three finite numbers, and up must not be (0, 0, 0)"
         )
