@@ -25,7 +25,7 @@ PENALTY = 10.0  # weight of the classifier's L2 regularisation, for features of 
 
 
 class Streams(NamedTuple):
-    """n images of the visual stream and n of the tactile stream, with the number of their trajectory."""
+    """n images of the visual stream and n of the tactile stream, and the trajectory number of each image."""
 
     visual: np.ndarray  # uint8 (n, height, width, 3)
     tactile: np.ndarray  # uint8 (n, height, width, 3)
@@ -59,7 +59,7 @@ class Distance(NamedTuple):
 def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> PixelErrors:
     """Compute the differences between real and simulated images that show the same object in the same pose.
 
-    The bootstrap of the intervals draws whole trajectories with replacement.
+    Each difference has a 95 % interval from a bootstrap that draws whole trajectories with replacement.
 
     Args:
         real: Real images, uint8 `(n, height, width, 3)`.
@@ -72,7 +72,10 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
     """
     _check(real, simulated, group, group)
     if real.shape != simulated.shape:
-        raise ValueError(f"real and simulated must have equal shapes, got {real.shape} and {simulated.shape}")
+        raise ValueError(
+            f"real and simulated must have equal shapes, got {real.shape} and {simulated.shape}: give one simulated "
+            "image of the same resolution for each real image"
+        )
     each = np.array([_differences(a, b) for a, b in zip(real, simulated, strict=True)])
 
     def summary(weight: np.ndarray) -> np.ndarray:
@@ -105,7 +108,9 @@ def features(images: np.ndarray) -> np.ndarray:
         ValueError: The images are not uint8 or are smaller than 64 pixels.
     """
     if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3:
-        raise ValueError(f"images must be uint8 of shape (n, height, width, 3), got {images.dtype} of {images.shape}")
+        raise ValueError(
+            f"images must be uint8 of shape (n, height, width, 3), got {images.dtype} of shape {images.shape}"
+        )
     if min(images.shape[1:3]) < LEAST_SIDE:
         raise ValueError(
             f"images must be at least {LEAST_SIDE} pixels high and wide, got {images.shape[1]} x {images.shape[2]}: "
@@ -124,9 +129,9 @@ def energy_distance(
     far apart. Each feature is first divided by its standard deviation over both sets. If this deviation is below one
     grey level (1/255), the feature is divided by one grey level instead.
 
-    The three means are only over pairs of images from different trajectories. Therefore, the number of images and
-    common trajectories of both sets cause no bias. For equal distributions, the estimate varies around 0 and may be
-    negative.
+    The three means are only over pairs of images from different trajectories. Therefore, the number of images
+    causes no bias, and neither do trajectories that occur in both sets. For equal distributions, the estimate
+    varies around 0 and may be negative.
 
     The p-value comes from a permutation test. If both sets have the same trajectories, a permutation exchanges the real
     and the simulated images of randomly selected trajectories. If they have no common trajectory, a permutation
@@ -141,7 +146,7 @@ def energy_distance(
 
     Raises:
         ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 2 trajectories. The error
-            is also raised if the sets have some but not all trajectories in common, or all of them but different
+            is also raised if the sets share only some of their trajectories, or share all of them but have different
             numbers of images.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
@@ -192,7 +197,7 @@ def told_apart(
 
     Raises:
         ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 5 trajectories. The error
-            is also raised if the sets have some but not all trajectories in common, or all of them but different
+            is also raised if the sets share only some of their trajectories, or share all of them but have different
             numbers of images.
         ImportError: scikit-learn is not installed.
     """
@@ -260,10 +265,14 @@ def _check(real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simu
     for name, images, group in (("real", real, real_group), ("simulated", simulated, simulated_group)):
         if images.dtype != np.uint8 or images.ndim != 4 or images.shape[3] != 3 or not len(images):
             raise ValueError(
-                f"{name} must be uint8 of shape (n, height, width, 3) with n >= 1, got {images.dtype} of {images.shape}"
+                f"{name} must be uint8 of shape (n, height, width, 3) with n >= 1, got {images.dtype} of shape "
+                f"{images.shape}"
             )
         if group.shape != images.shape[:1]:
-            raise ValueError(f"group must have one number per image of {name} ({len(images)}), got shape {group.shape}")
+            raise ValueError(
+                f"group must have one trajectory number for each of the {len(images)} images of {name}, "
+                f"got shape {group.shape}"
+            )
 
 
 def _matched(
@@ -279,7 +288,9 @@ def _matched(
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite, got {values[~np.isfinite(values)][0]}")
         if (number := len(np.unique(group))) < least:
-            raise ValueError(f"{name} must have images of at least {least} trajectories, got {number}: collect more")
+            raise ValueError(
+                f"{name} must have images of at least {least} trajectories, got {number}: collect more trajectories"
+            )
     common = np.intersect1d(real_group, simulated_group)
     if not len(common):
         return False

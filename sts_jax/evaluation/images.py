@@ -96,7 +96,10 @@ def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str,
         if images is None:
             continue
         if images.shape != truth.shape:
-            raise ValueError(f"prediction {name}: {stream} has shape {images.shape}, but it must be {truth.shape}")
+            raise ValueError(
+                f"prediction {name!r}: {stream} has shape {images.shape}, but it must have the shape of the true last "
+                f"images, {truth.shape}"
+            )
         errors[name] = image_error(in_unit(images), truth)
     reference = errors[CONSTANT]
     floor = mean_per_pixel(reference.bce - reference.excess, reference.pixels)

@@ -23,14 +23,14 @@ _CLOSE = 1e-6  # m, least distance in the weights of the geometric median, which
 
 
 class ImageError(NamedTuple):
-    """Errors of n predicted images, each summed over the selected pixels of the image.
+    """Errors of n predicted images, each summed over all pixels of the image or over those of a mask.
 
     The excess is the cross-entropy minus the entropy of the true image. It is 0 for a perfect prediction.
     """
 
     bce: np.ndarray  # (n,): binary cross-entropy, summed over pixels and channels (nats)
     excess: np.ndarray  # (n,): `bce` minus the entropy of the target (nats)
-    pixels: np.ndarray  # (n,): number of selected pixels times the number of channels
+    pixels: np.ndarray  # (n,): number of summed pixels times the number of channels
 
 
 def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> ImageError:
@@ -74,11 +74,11 @@ def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = N
 
 
 def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Divide the sum of an error over all items by the sum of the numbers of pixels.
+    """Divide the sum of an error over all items (predicted images) by the sum of their numbers of pixels.
 
     Args:
         values: Errors of the items, each summed over its pixels, `(n,)`.
-        count: Numbers of pixels of the items, `(n,)`.
+        count: Number of pixels of each item times the number of channels (`ImageError.pixels`), `(n,)`.
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
@@ -119,7 +119,7 @@ def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
 def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Compute the angles between predicted and true up axes, which are the z axes of the objects.
 
-    A rotation about the up axis has no effect. It is invisible for round objects.
+    The angle does not change with rotations about the up axis, which are invisible for round objects.
 
     Args:
         predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
@@ -170,7 +170,7 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
     does not depend on k. The score of a single sample is its distance from the true position.
 
     Args:
-        samples: k samples of the positions, `(k, n, d)`.
+        samples: k samples of n positions with d coordinates, `(k, n, d)`.
         target: True positions, `(n, d)`.
 
     Returns:
@@ -201,7 +201,7 @@ def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> n
     fraction for the rank at the border of the region. Points with equal mean distances get the mean of their results.
 
     Args:
-        samples: k samples of the positions, `(k, n, d)`, k >= 1.
+        samples: k >= 1 samples of n positions with d coordinates, `(k, n, d)`.
         target: True positions, `(n, d)`.
         level: Probability of the central region (default: 0.9).
 
@@ -261,9 +261,9 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
 
 
 class Reliability(NamedTuple):
-    """Comparison of predicted probabilities and observed frequencies, for items in bins of the probability.
+    """Comparison of the probability of the likeliest outcome with the frequency at which it is the true outcome.
 
-    The probability of an item is that of its likeliest outcome.
+    The items (held-out trajectories) are divided into bins by this probability.
     """
 
     confidence: np.ndarray  # (bins,): mean probability of the likeliest outcome, NaN in empty bins
@@ -356,7 +356,7 @@ def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
 
 
 def balanced_accuracy(predicted: np.ndarray, target: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Compute the balanced accuracy: the mean, over the classes, of the share of their items predicted correctly.
+    """Compute the balanced accuracy: the share of correctly predicted items in each class, averaged over the classes.
 
     Args:
         predicted: Predicted classes, int `(n,)`.
@@ -419,7 +419,7 @@ def bootstrap(
 
 
 def interval(draws: np.ndarray) -> tuple[float, float]:
-    """Compute a 95 % interval from bootstrap values: their 2.5 % and 97.5 % quantiles, without NaN."""
+    """Compute a 95 % interval from bootstrap values: their 2.5 % and 97.5 % quantiles. NaN is ignored."""
     low, high = np.nanpercentile(draws, [2.5, 97.5])
     return float(low), float(high)
 

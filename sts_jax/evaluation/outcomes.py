@@ -30,7 +30,7 @@ def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndar
 
     Args:
         scenario: The scenario of the trajectories.
-        first: First poses, `(n, 7)`.
+        first: First poses, position (m) and quaternion, `(n, 7)`.
         last: Last poses, true or predicted, `(n, 7)`.
 
     Returns:
@@ -76,14 +76,14 @@ def outcome_of_image(
 ) -> np.ndarray:
     """Determine from the last visual images whether the objects fell off.
 
-    The outcome is `FELL_OFF` if the image shows no object. All objects that stay on the pad get the same outcome,
-    because their actual outcome depends on the pose.
+    The outcome is `FELL_OFF` if the image shows no object. Otherwise, it is always `stays`, because only poses
+    distinguish the outcomes of objects that stay on the pad.
 
     Args:
         visual: Images in [0, 1], `(n, height, width, 3)`.
         blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
         threshold: Largest mean absolute difference from `blank` (see `emptiness`) at which an image shows no object.
-        stays: Number of the outcome of objects that stay on the pad (default: `physics.Outcome.RESTS`).
+        stays: Number of the outcome for objects that stay on the pad (default: `physics.Outcome.RESTS`).
 
     Returns:
         Numbers of the outcomes, int `(n,)`.

@@ -82,7 +82,7 @@ class Forecaster(Protocol):
 
     @property
     def preprocessing(self) -> training.Preprocessing:
-        """The preprocessing of the model. It encodes poses for the input `state` (true pose, shape and mass)."""
+        """Settings with which `predict` encodes the true pose, shape and mass as the model's input `state`."""
 
     def __call__(
         self,
@@ -107,8 +107,11 @@ class Forecaster(Protocol):
 
         Args:
             shape: Leading axes of the prediction.
-            condition: The input that the scenario applies, such as an acceleration of the pad, `(*shape, c)` in SI
-                units. None for scenarios without a condition.
+            condition: The c numbers of the input that the scenario applies, such as an acceleration of the pad,
+                `(*shape, c)` in SI units. None for scenarios without such an input.
+
+        Returns:
+            An object with the same fields as the result of `__call__`.
         """
 
 
@@ -172,7 +175,10 @@ def predict(
     names = tuple(inputs)
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
-        """Predict some trajectories at a time, which limits the memory. The last call repeats the last trajectory."""
+        """Predict the trajectories in parts of equal size, which limits the memory.
+
+        The last part is filled with copies of the last trajectory, and their predictions are removed.
+        """
         count = len(pairs.object)
         size, parts = min(count, _CHUNK), []
         for number, start in enumerate(range(0, count, size)):

@@ -68,14 +68,15 @@ class Metric:
     """A number that describes the quality of a predictor in summaries and tables.
 
     A metric is computed in two steps, because predicted images are too large to keep. First, `score` calls `errors`,
-    which returns one number per item. Then `summarise` calls `statistic`, which returns a function of the weights of
-    the items. The bootstrap over objects evaluates this function with many weights.
+    which returns one number per item (held-out trajectory). Then `summarise` calls `statistic`, which returns a
+    function of the weights of the items. The bootstrap over objects evaluates this function with many weights.
 
     A metric needs at least one of the two functions. Without `statistic`, it is the weighted mean of `errors`. Without
     `errors`, `statistic` uses the fields of `Scores`.
 
     Raises:
-        ValueError: The metric has neither `errors` nor `statistic`, its name is empty, or a field is out of range.
+        ValueError: `name` is empty, the metric has neither `errors` nor `statistic`, `digits` is not a whole
+            number >= 0, or `compared` is not 'higher', 'lower' or None.
     """
 
     name: str  # name of the metric in summaries

@@ -21,9 +21,9 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
       outcome probabilities are the frequencies.
     - The copy predicts that the last frame equals the first one.
     - The nearest neighbour is the last frame of the training trajectory whose first visual image has the smallest
-      squared distance. A condition is the input that some scenarios apply, such as an acceleration of the pad. If the
-      scenario has a condition, the squared distance of the conditions is added. Both distances have the same weight,
-      because each is divided by the variance in the training set (for conditions, separately for each number).
+      squared distance. In scenarios with a condition (an input such as an acceleration of the pad), the squared
+      distance of the conditions is added. Both distances are then divided by their variances in the training set, so
+      that they have the same weight.
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. Its height is the median height
       of the training objects that stay on the pad. It predicts no images.
 

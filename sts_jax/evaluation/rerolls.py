@@ -49,7 +49,7 @@ def ceiling(
     this image can therefore exceed the ceiling.
 
     Args:
-        collection: The collection of the items.
+        collection: The description of the dataset that contains the items.
         sensor: The sensor that renders the last frames.
         test: The items. The predicted images have the resolution of their images.
         times: Number of re-rolls per item, >= 1.
@@ -77,9 +77,9 @@ def ceiling(
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
         raise RuntimeError(
-            f"the first pose of a re-roll differs by {off:.3g} (m, or quaternion) from that of its item, but at most "
-            f"{_SAME:g} is allowed. This is an error in sts_jax: adapt _replayed in sts_jax/evaluation/rerolls.py to "
-            "the random keys that physics.simulate uses"
+            f"the first pose of a re-roll differs by {off:.3g} (metres, or an entry of the quaternion) from that of "
+            f"the held-out trajectory, but at most {_SAME:g} is allowed. This is an error in sts_jax: adapt _replayed "
+            "in sts_jax/evaluation/rerolls.py to the random keys that physics.simulate uses"
         )
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])

@@ -13,13 +13,15 @@ def train_share(shares: Sequence[float], split: str) -> float:
     Args:
         shares: Shares of the objects for training, validation and test, `Collection.shares`.
         split: `object` if whole objects are held out, `trajectory` if single trajectories are held out. As in the
-            paper, a split by trajectory has no validation part. Its share is added to the training part.
+            paper, a split by trajectory has no validation part, and the training part also gets the validation share.
     """
     return shares[0] if split == "object" else 1 - shares[2]
 
 
 def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
-    """Split the trajectories with images into parts for training, validation and test.
+    """Split the trajectories of a dataset into parts for training, validation and test.
+
+    Trajectories without images are left out.
 
     Args:
         data: The dataset.

@@ -60,7 +60,9 @@ def summarise(
         )
     missing = [name for name in BASELINES if name not in scores]
     if missing:
-        raise ValueError(f"scores lacks {', '.join(missing)}: add the scores of each of evaluation.baselines")
+        raise ValueError(
+            f"scores lacks {', '.join(missing)}: score the predictions of evaluation.baselines and add them"
+        )
     names = list(scores)
     scored = {name: _count(own, len(test.object)) for name, own in scores.items()}
     statistics = {name: _statistics(scores, name, scored[name], test, metrics) for name in names}

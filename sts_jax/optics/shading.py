@@ -21,7 +21,7 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """External light on the object, and its path through the skin and the gel to the camera.
+    """External light on the object, and its path to the camera through the gel and its skin, a translucent paint.
 
     Colours are linear RGB, unless stated otherwise. Values without a source are our choice.
     """
@@ -107,7 +107,7 @@ def hidden_sky(
     x: Float[Array, "w"],
     y: Float[Array, "h"],
 ) -> Float[Array, "h w"]:
-    """Compute the share of the sky that an object hides from points on the skin.
+    """Compute the share of the sky that an object hides from points on the skin, which is the paint on the gel's face.
 
     Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
     slices at a few heights z, from its lowest to its highest point. The slice at z extends over all places where the
@@ -217,7 +217,7 @@ def empty_view(
     Args:
         room: Constants of the external light.
         square_radius: Squared distance from the pad's centre on the gel's face, `(2 x / width)^2 + (2 y / height)^2`
-            for a pad of this width and height. It is 1 at the middle of each edge.
+            with the width and height of the pad. It is 1 at the middle of each edge.
         walls: Brightness of the housing's walls relative to the pad, as a ratio of sRGB values, from `housing`. This
             function squares the ratio to approximate the ratio of linear light.
         hidden: Share of the sky that the object hides, from `hidden_sky`. Zeros give the view of the empty sensor.
@@ -248,7 +248,7 @@ def shade(
     3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        background, `empty`, replaces the rest.
     4. Milky skin: the share `1 - milk` of the result is transmitted. The share `milk * (1 - hidden)` of the background
-       is added, where the background is that without the object's shadow.
+       without the object's shadow is added.
 
     Args:
         room: Constants of the external light.

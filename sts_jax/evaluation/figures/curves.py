@@ -12,7 +12,7 @@ from sts_jax.evaluation.figures import drawing
 
 
 class Trained(NamedTuple):
-    """One trained model, which is a point of a scaling curve."""
+    """One trained model, which `scaling` draws as a point."""
 
     name: str  # name of the curve in the legend, such as the inputs of the model
     trajectories: int  # number of training trajectories
@@ -87,8 +87,9 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
     The figure has a panel for each of these terms that at least one log contains:
 
     - `loss`: The total loss.
-    - `kl`: The KL divergence of the latent variables from their prior (`mvae`).
-    - `look`: The KL divergence of the appearance code from its prior (`statespace`).
+    - `kl`: The KL divergence of the latent variables from their prior (only models of `sts_jax.mvae`).
+    - `look`: The KL divergence of the appearance code from its prior (only models of `sts_jax.statespace`). This code
+        is the latent for all visible properties other than pose, shape and mass.
     - `visual`, `tactile`, `state`, `outcome` and `pose`: The errors or negative log likelihoods of these quantities.
 
     Args:

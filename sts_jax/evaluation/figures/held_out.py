@@ -149,10 +149,10 @@ def ends(
     Args:
         path: The PNG file to write.
         size: Size of the pad along x and y (m).
-        start: First pose, `(7,)`.
+        start: First pose, position (m) and quaternion, `(7,)`.
         truth: True last pose, `(7,)`.
-        rerolled: Last poses of m simulations from the same first pose, each with other random values of the properties
-            that a camera cannot see (such as fill level and friction), `(m, 7)`.
+        rerolled: Last poses of m simulations (re-rolls) from the same first pose, each with other random values of
+            the properties that a camera cannot see (such as fill level and friction), `(m, 7)`.
         sampled: k samples of the last pose that a model predicted, `(k, 7)`.
         title: Title of the figure.
     """

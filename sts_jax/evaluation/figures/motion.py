@@ -98,8 +98,8 @@ def animation(
     """Write an animation of one trajectory: a view from outside, both streams, and the wrench of the pad on the object.
 
     Curves below the images show the wrench from the first to the current frame. A red arrow on the visual stream shows
-    the component of the apparent gravity along the pad. It appears on a slope and while the pad accelerates. The
-    animation runs at half the speed of the motion (the constant `SLOWER` is 2).
+    the component of `gravity` along the pad. It appears on a slope and while the pad accelerates. The animation runs at
+    half the speed of the motion (the constant `SLOWER` is 2).
 
     Args:
         path: The GIF file to write.
@@ -110,7 +110,7 @@ def animation(
         wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
         gravity: Gravity minus the acceleration of the pad in each frame, sensor frame (m/s^2), `(frames, 3)`.
         title: Title above the images.
-        outcome: Text above the images in the last frame, such as the outcome.
+        outcome: Text above the images in the last frame, such as `fell off`.
         side: Side of each of the three images (pixels).
     """
     width, height = 3 * side, _HEAD + side + 2 * _PANEL
