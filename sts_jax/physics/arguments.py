@@ -64,7 +64,7 @@ def check_condition(scenario: Scenario, start: Start) -> None:
 
 
 def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
-    """Raise a ValueError unless each number in `outcome`, (n,), is the number of a member of `scenario.outcomes`."""
+    """Raise a ValueError unless each of the n outcomes, (n,), is the number of a member of `scenario.outcomes`."""
     known = [int(one) for one in scenario.outcomes]
     other = sorted(set(outcome.tolist()) - set(known))
     if other:
@@ -78,7 +78,7 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
     """Check the hidden properties that a caller passes to `simulate`, and return them as JAX arrays.
 
     Args:
-        hidden: Arrays of shape (n,), and `up` of shape (n, 3), for n trajectories.
+        hidden: Hidden properties of n trajectories. Its field `up` has the shape (n, 3), the other fields (n,).
         count: Number n of trajectories.
 
     Raises:

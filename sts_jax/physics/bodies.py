@@ -117,7 +117,8 @@ def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
         scenario: Scenario in which the bodies are to start.
 
     Returns:
-        Arrays with a leading axis of bodies. Bodies with fewer vertices or stable faces are padded.
+        Arrays with a leading axis of bodies. They are padded where a body has fewer vertices, or fewer faces on which
+            it can rest, than another body.
 
     Raises:
         BodyError: A body cannot start in the scenario.

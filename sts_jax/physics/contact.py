@@ -106,7 +106,8 @@ class _Crossing(NamedTuple):
 
 
 def turned(rotation: Float[Array, "3 3"], points: Float[Array | np.ndarray, "*n 3 h"]) -> Float[Array, "*n 3 h"]:
-    """Rotate h points, the columns of `points`. A small matrix product would be slow in XLA on a CPU."""
+    """Rotate the h points in the columns of `points` by a rotation matrix."""
+    # A product of small matrices would be slow in XLA on a CPU.
     x, y, z = points[..., :1, :], points[..., 1:2, :], points[..., 2:, :]
     return rotation[:, :1] * x + rotation[:, 1:2] * y + rotation[:, 2:] * z
 
@@ -236,10 +237,10 @@ def collide(
 ) -> Contacts:
     """Find the contacts of an object with a box whose top is centred at the origin.
 
-    The first contact is the deepest point. The second is the deepest of the points that are more than 1 mm (`APART`)
-    away from the first one. The other contacts are the points that reach farthest in `num` - 2 evenly spaced
-    directions. Deeper points have an advantage in this choice. Distances and directions are measured in `plane`. The
-    depth of a contact is at most 1 mm (`SKIN`) smaller than the largest depth.
+    A point can become a contact if its depth is less than 1 mm (`SKIN`) smaller than the largest depth. The first
+    contact is the deepest point. The second is the deepest of the points that are more than 1 mm (`APART`) away from
+    the first one. The other contacts are the points that reach farthest in `num` - 2 evenly spaced directions. Deeper
+    points have an advantage in this choice. Distances and directions are measured in `plane`.
 
     Args:
         body: Convex parts of the object.
@@ -249,7 +250,8 @@ def collide(
         plane: Indices of the two axes of the plane in which the contacts lie far apart, such as (0, 1) for x and y.
 
     Returns:
-        `num` contacts in the frame of the box's top. If there are fewer, the others have a distance of 1 m.
+        `num` contacts in the frame of the box's top. If the object has fewer contacts, the field `dist` of the
+            remaining entries is 1 m.
     """
     rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

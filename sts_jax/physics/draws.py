@@ -66,8 +66,9 @@ def draw(
 def starts(
     key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
 ) -> Starts:
-    """Draw `num` random starts of each body without a simulation: initial poses and hidden properties.
+    """Draw `num` random starts of each body without a simulation.
 
+    A start contains an initial pose and hidden properties (friction, mass of the shell, and contents).
     `simulate` draws its starts from the same distribution. The starts of the two functions are independent, even if
     both functions receive the same key. Start j of body i depends on `key`, i, j and the body, not on the number of
     other starts.

@@ -113,9 +113,10 @@ def drawn_fields(
     constants: Contact,
     wall: float,
 ) -> dict[str, np.ndarray]:
-    """Compute the fields of MJX's model that depend on mass properties and friction, for each of n draws.
+    """Compute the fields of MJX's model that depend on mass properties and friction.
 
-    MuJoCo computes these fields (`scene.set_rigid`).
+    The fields are computed for each of n draws of hidden properties. They are copies of the fields of a model of C
+    MuJoCo (`scene.set_rigid`).
 
     Args:
         bodies: All bodies.
@@ -160,8 +161,8 @@ def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
         chunk: Largest number of trajectories in a call of the returned function.
 
     Returns:
-        Function of the indices of at most `chunk` trajectories that returns their results. The hulls of the bodies of
-            these trajectories must have arrays of the same size.
+        Function that takes the indices of at most `chunk` trajectories and returns their results. The hulls of
+            their bodies must have arrays of the same size.
 
     Raises:
         BodyError: The mass properties or the friction of a body are out of range.
@@ -195,8 +196,8 @@ def in_c(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
         chunk: Largest number of trajectories in a call of the returned function.
 
     Returns:
-        Function of the indices of at most `chunk` trajectories of one body that returns their results. It raises a
-            BodyError if the mass properties or the friction of the body are out of range.
+        Function that takes the indices of at most `chunk` trajectories of one body and returns their results. It raises
+            a BodyError if the mass properties or the friction of the body are out of range.
     """
     bodies, scenario = setup.bodies, setup.scenario
     rigid = rigids(bodies, setup.which, hidden)

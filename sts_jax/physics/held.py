@@ -1,4 +1,4 @@
-"""The wrench of the pad on an object that a hand presses into the gel."""
+"""The wrench of the pad on an object that a hand holds on the gel."""
 
 import jax
 import jax.numpy as jnp
@@ -9,20 +9,20 @@ from sts_jax import geometry, tactile
 from sts_jax.objects.body import Body
 from sts_jax.rendering.equilibrium import underside
 
-DEEPEST = 0.98  # largest depth to which a hand presses an object, as a share of the gel's largest depth
+DEEPEST = 0.98  # largest depth of a held object, as a share of the gel's largest depth
 HALVINGS = 50  # bisection steps for the depth
 
 
 def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], force: float) -> Float[np.ndarray, "6"]:
-    """Compute the wrench of the pad on an object that a hand presses into the gel.
+    """Compute the wrench of the pad on an object that a hand holds on the gel.
 
-    The hand balances all moments, so the object keeps its orientation. It sinks until the pressure of the gel carries
-    `force`. The pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is `gel.stiffness`, d is the
-    depth of the object's lowest point, and h is the height of the object's underside above this point. The moment
+    The hand balances all moments, so the object keeps its orientation. The object sinks until the pressure of the gel
+    carries `force`. The pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is `gel.stiffness`, d is
+    the depth of the object's lowest point, and h is the height of the object's underside above this point. The moment
     follows from the pressures of all cells. Given the same pose and this wrench, `sense` finds the same balance.
 
-    A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The hand then carries more of the weight, so
-    the returned force is smaller than `force`. The wrench does not depend on the motion after the release.
+    A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The object then stops just above this depth,
+    and the returned force is smaller than `force`.
 
     Args:
         gel: Gel of the sensor.

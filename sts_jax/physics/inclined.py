@@ -39,8 +39,9 @@ class Inclined(Scenario):
     before the start and do not move on the slope. The centre of pressure in frame 0 then reveals where the contents
     lie. The weight alone reveals little.
 
-    Without a choice of poses, the contents would rarely matter: flat objects hold and high objects tip, wherever their
-    contents lie. A start at rest therefore has a pose in which the contents decide whether the object tips (`tries`).
+    In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie. A
+    start at rest therefore has one of `tries` random poses, the one in which the contents matter most for whether the
+    object tips.
 
     Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
     section "Data Collection".
@@ -82,7 +83,9 @@ class Inclined(Scenario):
         check_length("across", self.across)
         check_range("gap", self.gap, positive=False)
         if not (math.isfinite(sum(self.along)) and self.along[0] <= self.along[1]):
-            raise ValueError(f"scenario.along is {self.along}, but it must be (low, high), finite and low <= high")
+            raise ValueError(
+                f"scenario.along is {self.along}, but it must be (low, high) with finite numbers and low <= high"
+            )
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
         if not 0 <= self.resting <= 1:
@@ -91,10 +94,11 @@ class Inclined(Scenario):
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one start uphill of the stop wall. `Scenario.start` describes the arguments.
 
-        A start at rest has the best of `tries` random poses. In such a pose, some contents hold the object and others
-        tip it. Each of several random contents gives a margin m: the distance by which the centre of mass, projected
-        vertically onto the pad, lies inside the area that supports the object. It is negative if the object tips. The
-        best pose has the largest value of `min(mean(max(m, 0)), mean(max(-m, 0)))`.
+        A start at rest has the best of `tries` random poses. In a good pose, the object tips with some contents and
+        stays with others. Each pose is tested with several random contents. The margin m of one test is the distance by
+        which the centre of mass, projected vertically onto the pad, lies inside the area that supports the object. The
+        margin is negative if the object tips. The best pose has the largest value of
+        `min(mean(max(m, 0)), mean(max(-m, 0)))`, with means over the tests.
         """
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting

@@ -47,13 +47,13 @@ def check_range(name: str, values: tuple[float, float], *, positive: bool = True
     low, high = values
     if not (math.isfinite(low) and math.isfinite(high) and low <= high and (low > 0 if positive else low >= 0)):
         raise ValueError(
-            f"scenario.{name} is {values}, but it must be (low, high), finite, low <= high and "
-            f"{'>' if positive else '>='} 0"
+            f"scenario.{name} is {values}, but it must be (low, high) with finite numbers and "
+            f"0 {'<' if positive else '<='} low <= high"
         )
 
 
 def check_length(name: str, value: float) -> None:
-    """Raise a ValueError unless a length (m) is finite and >= 0. `name` is the scenario's field in the message."""
+    """Raise a ValueError unless a length (m), the field `name` of a scenario, is finite and >= 0."""
     if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"scenario.{name} is {value} m, but it must be finite and >= 0")
 

@@ -82,7 +82,9 @@ class _Steps(NamedTuple):
 def compile_body(
     parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
 ) -> mujoco.MjModel:
-    """Compile the scene for `roll`, with a contact point at each vertex of the hull and with contact sensors.
+    """Compile the scene for `roll`: pad, stop wall and object, with a contact point at each vertex of the hull.
+
+    MuJoCo's contact sensors in the scene measure the contact forces and the depth of the deepest contact.
 
     Args:
         parts: n points of each of the p convex parts of the hull, (p, n, 3), in the mesh frame (m).
@@ -192,8 +194,8 @@ def roll(
 ) -> tuple[Ends, Record]:
     """Simulate n trajectories of one body from their starts to the last frame, each independent of the others.
 
-    The gravity of a model is constant in MuJoCo. The function sets it to the gravity of the last time step. In steps
-    with another gravity, it applies the difference as a force on the object's centre of mass.
+    The gravity of a model is constant in MuJoCo. It is set to the gravity of the last time step. In steps with another
+    gravity, the difference acts as a force on the object's centre of mass.
 
     Args:
         models: Models of the n trajectories, each a copy of the result of `compile_body`. Their gravity is overwritten.

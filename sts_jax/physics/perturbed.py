@@ -105,7 +105,7 @@ class Perturbed(Scenario):
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return the velocity after the jerk that an object without friction would have relative to the pad.
+        """Return the velocity relative to the pad that an object without friction would have after the jerk.
 
         Args:
             condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (3,).

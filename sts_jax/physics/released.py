@@ -90,17 +90,21 @@ class Released(Scenario):
             )
         check_range("carried", self.carried)
         if self.carried[1] > 1:
-            raise ValueError(f"scenario.carried is {self.carried}, but both limits of the share must be > 0 and <= 1")
+            raise ValueError(
+                f"scenario.carried is {self.carried}, but both limits must be > 0 and <= 1 (share of the weight on the "
+                "pad)"
+            )
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one held pose and the share of the weight on the pad. `Scenario.start` describes the arguments.
 
-        The object stands on one of the two faces at an edge and is tilted over this edge. The face is the narrower one,
-        so the object balances on the edge at a tilt of 15 to 45 degrees. An object that returns to the face then
-        usually turns by less than 45 degrees, and one that topples turns by more. `outcome` uses this difference. If an
-        object has no such edge, for example a cylinder on its side, it is tilted over another edge.
+        The object stands on a stable face and is tilted over an edge of this face. Edges at which the object balances
+        at a tilt of 15 to 45 degrees are preferred. At such an edge, the object stands on the narrower of the two
+        faces. An object that returns to its face then usually turns by less than 45 degrees, and one that topples turns
+        by more. `outcome` uses this difference. If none of `tries` random edges meets the condition, for example for a
+        cylinder on its side, the object is tilted over another edge.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
@@ -138,7 +142,7 @@ class Released(Scenario):
         The outcome is the first of these that applies:
 
         - `FELL_OFF`, if the object has left the pad,
-        - `TOPPLES`, if it has turned by more than 45 degrees, without turns about the vertical,
+        - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
         `start` usually leans an object by less than 45 degrees from the narrower of two faces. If the faces meet at a

@@ -56,7 +56,7 @@ def stable_faces(
         up: Unit vector in the mesh frame that pointed up when the contents settled.
 
     Returns:
-        The stable faces, the most likely first. Both arrays are empty if the body cannot rest on any face.
+        The stable faces, the most likely first. If the body cannot rest on any face, both fields are empty arrays.
 
     Raises:
         TypeError: `body` is not a Body, or an argument is traced.
@@ -72,7 +72,9 @@ def stable_faces(
     com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
     points = np.unique(np.asarray(body.hulls, np.float64).reshape(-1, 3), axis=0)
     if np.linalg.matrix_rank(points - points[:1], tol=1e-6) < 3:
-        raise ValueError("the points of the body's hulls span no volume: give at least four that are not in one plane")
+        raise ValueError(
+            "the points of the body's hulls span no volume: give at least four points that are not in one plane"
+        )
     ups, shares = objects.rest_poses(points, com)
     order = np.argsort(-shares, kind="stable")
     return StableFaces(ups[order], shares[order])
@@ -148,8 +150,8 @@ def place(
 
     Raises:
         TypeError: An argument is traced, or `body` or `sensor` has the wrong type.
-        ValueError: The body has no stable face or not the given one, its centre of mass does not lie above the pad, or
-            an argument is out of range or not finite.
+        ValueError: The body has no stable face or cannot rest on `face`, its centre of mass does not lie above the pad,
+            or an argument is out of range or not finite.
     """
     _check_body(body)
     if not isinstance(sensor, Sensor):

@@ -79,7 +79,10 @@ class Shape(NamedTuple):
 
 
 class Start(NamedTuple):
-    """The start of a trajectory: the initial pose, the time of release, and the condition (`Scenario.quantities`)."""
+    """The start of a trajectory: the initial pose, the time of release, and the condition.
+
+    The condition contains the numbers that `Scenario.quantities` describes, such as the acceleration of the pad.
+    """
 
     pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m), quaternion.
     # Number of time steps for which the object is held, from the beginning of the interval that ends with frame 0. With
@@ -91,7 +94,10 @@ class Start(NamedTuple):
 
 
 class Quantity(NamedTuple):
-    """A quantity of a condition, such as an acceleration: a number, or a vector (x, y) in the plane of the pad."""
+    """A quantity that a scenario draws and that predictors receive, such as the acceleration of the pad.
+
+    The quantity is a number, or a vector (x, y) in the plane of the pad.
+    """
 
     name: str  # Name in texts and figures.
     unit: str  # Unit in texts and figures.
@@ -143,7 +149,7 @@ class Scenario(abc.ABC):
             pad: Size of the pad along x and y (m).
 
         Returns:
-            Initial pose, time of the release and condition.
+            Initial pose, time of release, and condition (the numbers that `quantities` describes).
         """
 
     @abc.abstractmethod
@@ -157,7 +163,7 @@ class Scenario(abc.ABC):
 
     @abc.abstractmethod
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the number of the outcome of one trajectory.
+        """Return the outcome of one trajectory, as the number of a member of `outcomes`.
 
         Args:
             first: Pose in the first frame, (7,), simulated or predicted.
@@ -262,7 +268,9 @@ class Scenario(abc.ABC):
         check_range("shell_scale", self.shell_scale)
         check_range("friction", self.friction)
         if self.fill[1] > 1:
-            raise ValueError(f"scenario.fill is {self.fill}, but both limits of the share must be from 0 to 1")
+            raise ValueError(
+                f"scenario.fill is {self.fill}, but both limits must be from 0 to 1 (share of the interior's volume)"
+            )
         if not 0 <= self.tilt <= math.pi:
             raise ValueError(
                 f"scenario.tilt is {self.tilt} rad, but it must be from 0 to pi (give degrees as math.radians(30))"
@@ -374,13 +382,19 @@ def upright(up: Float[Array, "3"]) -> Float[Array, "4"]:
 
 
 def random_yaw(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """Draw the quaternion of a rotation about the vertical by a uniform angle."""
+    """Draw the quaternion of a rotation about the vertical by a uniformly random angle."""
     angle = jax.random.uniform(key, maxval=2 * jnp.pi)
     return geometry.quat_canonical(geometry.quat_from_rotvec(jnp.stack([0.0, 0.0, angle])))
 
 
 def random_place(radius: PRNGKeyArray, angle: PRNGKeyArray, size: float) -> Float[Array, "2"]:
-    """Draw a place (m) from a disc of radius `size` (m) about the pad's centre. `radius` and `angle` are keys."""
+    """Draw x and y (m) uniformly from a disc about the pad's centre.
+
+    Args:
+        radius: Key for the distance from the centre.
+        angle: Key for the direction.
+        size: Radius of the disc (m).
+    """
     r = size * jnp.sqrt(jax.random.uniform(radius))
     a = jax.random.uniform(angle, maxval=2 * jnp.pi)
     return jnp.stack([r * jnp.cos(a), r * jnp.sin(a)])

@@ -81,7 +81,12 @@ class Box(NamedTuple):
 
 
 def boxes(pad: tuple[float, float], wall: float) -> list[Box]:
-    """Return the fixed boxes: the pad of size (x, y) `pad` (m), and the stop wall if its height `wall` (m) is not 0."""
+    """Return the box of the pad, followed by the box of the stop wall if there is one.
+
+    Args:
+        pad: Size of the pad along x and y (m).
+        wall: Height of the stop wall (m), 0 for none.
+    """
     beneath = WALL_DEPTH if wall else 0.0  # the pad extends beneath the wall
     centre, half = [0, beneath / 2, -PAD_DEPTH / 2], [pad[0] / 2, (pad[1] + beneath) / 2, PAD_DEPTH / 2]
     found = [Box(np.array(centre), np.array(half))]
@@ -110,9 +115,9 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 
 
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
-    """Compile the scene with the object's mesh for C MuJoCo. MuJoCo finds the contacts of the mesh.
+    """Compile the scene for C MuJoCo: pad, stop wall and the object as a mesh.
 
-    The object has placeholder mass properties, which `set_rigid` replaces.
+    MuJoCo finds the contacts of the mesh. The object has placeholder mass properties, which `set_rigid` replaces.
 
     Args:
         parts: n points of each of the p convex parts that collide, (p, n, 3), in the mesh frame (m).
@@ -217,7 +222,7 @@ def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
 
 
 def position(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
-    """Run the position stage of `mjx.forward` with given contacts, which replace those of the boxes of `template`."""
+    """Run the position stage of `mjx.forward`, with `contacts` in place of the contacts that MJX finds."""
     data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
     data = mjx.collision(model, data)
     # MJX has no public way to pass contacts in. If this path moves, `tree_replace` fails at the first step.

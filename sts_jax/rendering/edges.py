@@ -21,16 +21,16 @@ def with_moving_edges(
 ) -> Float[Array, "h w"]:
     """Return the imprint unchanged, but with a derivative that includes the motion of its edges.
 
-    The derivative of the depth that is interpolated at a pixel ignores edges that move across pixels. The imprint of a
-    flat object with upright walls changes only at such edges. The derivative here is
+    The depth at a pixel is interpolated on the nearest face. The derivative of this depth ignores edges that move
+    across pixels. The imprint of a flat object with upright walls changes only at such edges. The derivative here is
 
         d imprint = rate - v . grad imprint
 
     v is the motion of the visible surface in the image (pixels), and `rate` is the change of its depth below the gel's
-    face (m). Each pair of neighbouring pixels contributes to the second term the difference of their imprints, times
-    the v of the pixel that is nearer to the camera. Each pixel of the pair receives half of this product. The pairs are
-    the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on average over a
-    few pixels.
+    face (m). The second term is a sum over pairs of neighbouring pixels. For each pair, the difference of the two
+    imprints is multiplied by the v of the pixel at which the object is nearer to the camera. Each pixel of the pair
+    receives half of this product. The pairs are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients".
+    The derivative is accurate on average over a few pixels.
 
     Args:
         imprint: Depth of the imprint below the gel's face (m).

@@ -25,7 +25,8 @@ def lit_skin(
         imprint: Depth of the imprint below the gel's face (m), for the ray at each row and column of the grid.
         window: Part of the gel's face that the grid covers: left, top, width, height (m).
         pitch: Distance between rays along x and y on the gel's face (m).
-        slopes: x / depth of the ray at each column, and y / depth of the ray at each row.
+        slopes: Slopes of the rays: x / depth at each column, and y / depth at each row. Here, depth is the distance
+            from the pinhole along the camera's axis.
 
     Returns:
         Red, green and blue channel, not clipped to [0, 1]. The outermost ring of the grid is missing

@@ -53,7 +53,10 @@ def where_active(
 
 
 def lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
-    """First row of an image of x values with equal rows, first column of an image of y values with equal columns."""
+    """Return the first row of an image of x values, and the first column of an image of y values.
+
+    All rows of the first image are equal, and all columns of the second image are equal.
+    """
     return images[0][:1], images[1][:, :1]
 
 
