@@ -96,7 +96,7 @@ def main(args: Args) -> str:
     judge = evaluation.scorer(scenario, train)
     scores = {title: judge(row, test) for title, row in evaluation.baselines(scenario, train, test).items()}
     every = evaluation.subsets(predictor.modalities)
-    subsets = {title: every[title] for title in MAIN_SUBSETS if title in every}
+    subsets = {title: every[title] for title in (f"from {given}" for given in MAIN_SUBSETS) if title in every}
     with Bar() as bar:
         for number, (given_by, subset) in enumerate(subsets.items()):
             bar("predict", number, len(subsets), given_by)

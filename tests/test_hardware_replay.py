@@ -252,6 +252,16 @@ def test_waiting_until_still_uses_recorded_time(tmp_path, speed):
             replay.stream(0.5)
 
 
+def test_images_of_different_connections_form_no_pairs(tmp_path):
+    with hardware.Recorder(tmp_path / "made", ORIGIN) as recorder:
+        for number in range(4):
+            recorder.add(dataclasses.replace(shot(number), epoch=number))
+    with hardware.Replay(tmp_path / "made", speed=None) as replay:
+        assert len(list(itertools.islice(replay.stream(), 4))) == 4
+        with pytest.raises(hardware.CameraError, match="was connected again between them, so they form no pairs"):
+            replay.read()
+
+
 def test_a_gap_exceeds_a_timeout(tmp_path):
     with hardware.Recorder(tmp_path / "made", ORIGIN) as recorder:
         recorder.add(shot(0))

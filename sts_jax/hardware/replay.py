@@ -355,6 +355,11 @@ class Replay:
         return lap * count + first, lap * count + second
 
     def _one_sided(self) -> CameraError:
+        if len(self._streams) == 2:
+            return CameraError(
+                f"{self._name} has images of both streams, but the camera or the LED controller was connected again "
+                "between them, so they form no pairs: read them with stream(), or record again."
+            )
         return CameraError(
             f"{self._name} has {' and '.join(sorted(self._streams))} images only, which form no pairs: read them with "
             "stream(), or record both streams."

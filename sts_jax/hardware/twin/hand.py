@@ -74,7 +74,8 @@ class Hand(AutomaticPerson):
             raise ValueError(
                 f"hardware.collect still shows the instruction `{view.instruction}` after "
                 f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): the thresholds "
-                "of hardware.collect do not suit the twin's images, so change its argument config (a GuideConfig)"
+                "of hardware.collect do not suit the twin's images, so change its argument config (a GuideConfig). If "
+                "they do, give Hand a larger patience_s"
             )
 
     def action(self) -> Action | None:
