@@ -128,14 +128,18 @@ def checked_samples(num_samples: Any, key: Any) -> int:
 
 
 def plausible(name: str, array: Float[Array, "..."]) -> Bool[Array, "*n"]:
-    """Find the items of a batch that `check_values` accepts. The array may be traced.
+    """Find the items of a batch whose numbers are in range. The array may be traced.
+
+    The numbers of an image must be in [0, 1]. A pose must have coordinates of at most 10 m in magnitude and a
+    quaternion of length 1, with a tolerance of 0.01.
 
     Args:
         name: Name of the modality. All modalities but "pose" are images.
-        array: Images (*n, height, width, 3), or poses (*n, 7): position (m) and unit quaternion.
+        array: Images (*n, height, width, 3), or poses (*n, 7): position (m) and unit quaternion. There may be any
+            number of leading axes *n.
 
     Returns:
-        Mask of the accepted items.
+        Mask of the items in range.
     """
     if name == "pose":
         lengths = jnp.linalg.norm(jax.lax.stop_gradient(array[..., 3:]), axis=-1)
@@ -151,8 +155,8 @@ def check_values(name: str, array: np.ndarray) -> None:
         array: Images (..., height, width, 3), or poses (..., 7): position (m) and unit quaternion.
 
     Raises:
-        ValueError: A number is NaN or infinite, an image has values outside [0, 1], a quaternion's length is not 1, or
-            a position is more than 10 m away.
+        ValueError: A number is NaN or infinite, an image has values outside [0, 1], a quaternion's length is not 1
+            (tolerance 0.01), or a coordinate of a position is more than 10 m in magnitude.
     """
     if not np.isfinite(array).all():
         raise ValueError(

@@ -39,7 +39,7 @@ def cumsum(counts: Array) -> Int[Array, "n"]:
 
 
 def flatnonzero(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
-    """Indices of the true flags in ascending order. The number n of all flags fills the remaining places."""
+    """Indices of the true flags in ascending order, padded with the value n to length n, the length of `flags`."""
     size = len(flags)
     place = jnp.where(flags, cumsum(flags) - 1, size)
     return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")

@@ -188,7 +188,7 @@ def lock(folder: Path) -> Iterator[None]:
         ) from None
     except OSError as error:
         held.release()
-        raise OSError(f"cannot work in {folder}: {error}. Choose a folder that can be written to.") from error
+        raise OSError(f"cannot create or write to {folder}: {error}. Choose a folder you can write to.") from error
     try:
         yield
     finally:

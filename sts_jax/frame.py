@@ -74,7 +74,7 @@ def sense(
     show the object in this balanced pose. Without a wrench, the object stays in the given pose. The images show an
     empty sensor if no part of the object is above the plane of the gel's outer face (z > 0).
 
-    The images also show an empty sensor, and `balanced` is False, in these cases:
+    The images also show an empty sensor, and `Frame.balanced` is False, in these cases:
 
     - The pose or the wrench is not finite.
     - The squared length of the quaternion is zero or infinite in float32.
@@ -82,8 +82,9 @@ def sense(
     - The sensor is traced, and a constant is out of range (`Sensor.check`). Traced constants then have their default
       values. A sensor that is not traced raises an error instead.
 
-    The function is compiled once for each resolution and each size class of bodies (numbers of faces and texture
-    pixels). It can be called under `jit`, `vmap` and `grad`.
+    The function is compiled once for each resolution and each size of the body's arrays (faces, vertices and texture).
+    Bodies are padded to a few sizes, so that many bodies share a compiled program. The function can be called under
+    `jit`, `vmap` and `grad`.
 
     Args:
         sensor: Constants of the sensor.
@@ -190,10 +191,10 @@ def touch(
             largest centred part of the camera's view with the aspect ratio of `imprint`.
 
     Returns:
-        Image in [0, 1]. It equals `Frame.tactile` of the same imprint, except that `sense` samples small images more
-        finely (`Sensor.fine_below`). Traced numbers cannot raise errors. If a traced constant of the sensor or a traced
-        `window` is invalid, the image shows flat skin, and `window` counts as None. If a constant is invalid, all
-        traced constants also have their default values.
+        Image in [0, 1]. It equals `Frame.tactile` of the same imprint, except that `sense` samples more finely if the
+        shorter side of the image is below `Sensor.fine_below` pixels. Traced numbers cannot raise errors. If a traced
+        constant of the sensor or a traced `window` is invalid, the image shows flat skin, and `window` counts as None.
+        If a constant is invalid, all traced constants also have their default values.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
@@ -307,5 +308,5 @@ def _check_shapes(body: Body, pose: Array, wrench: Array | None, resolution: Any
     if len(body.faces) > FACE_CLASSES[-1]:
         raise ValueError(
             f"body has {len(body.faces):,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn. Decimate the mesh "
-            "file with objects.load(..., faces=)"
+            f"file with objects.load(path, faces={FACE_CLASSES[-1]})"
         )

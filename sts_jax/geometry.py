@@ -30,7 +30,7 @@ def normalize(x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
 
 
 def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Hamilton product of two quaternions: the rotation `b`, followed by the rotation `a`."""
+    """Hamilton product of two quaternions [w, x, y, z]: the rotation `b`, followed by the rotation `a`."""
     a, b = _checked("a", a, 4), _checked("b", b, 4)
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
     bw, bx, by, bz = jnp.moveaxis(b, -1, 0)
@@ -46,20 +46,20 @@ def quat_multiply(a: Float[Array, "*n 4"], b: Float[Array, "*n 4"]) -> Float[Arr
 
 
 def quat_inverse(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Quaternion of the inverse rotation, the conjugate of the unit quaternion `q`."""
+    """Quaternion of the inverse rotation: the conjugate [w, -x, -y, -z] of the unit quaternion `q`, [w, x, y, z]."""
     q = _checked("q", q, 4)
     return jnp.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
 
 
 def quat_canonical(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
-    """Normalise a quaternion, and negate it if `w < 0`, which does not change the rotation."""
+    """Normalise a quaternion [w, x, y, z], and negate it if `w < 0`, which does not change the rotation."""
     q = _checked("q", q, 4)
     q = normalize(q)
     return jnp.where(q[..., :1] < 0, -q, q)
 
 
 def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Rotation matrix R of a unit quaternion. It rotates a column vector v to R v."""
+    """Rotation matrix R of a unit quaternion [w, x, y, z]. It rotates a column vector v to R v."""
     q = _checked("q", q, 4)
     w, x, y, z = jnp.moveaxis(q, -1, 0)
     rows = [
@@ -71,7 +71,7 @@ def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
-    """Unit quaternion with `w >= 0` of a rotation matrix, or of the rotation nearest to any other 3x3 matrix.
+    """Unit quaternion [w, x, y, z], `w >= 0`, of a rotation matrix, or of the rotation nearest to any other 3x3 matrix.
 
     The nearest rotation is the rotation matrix R with the largest `sum(R * matrix)`. Its quaternion is the eigenvector
     of the largest eigenvalue of Davenport's matrix K (Markley and Mortari 2000, "Quaternion attitude estimation using
@@ -108,14 +108,14 @@ def _largest_eigenvector_jvp(primals: tuple[Array], tangents: tuple[Array]) -> t
 
 
 def quat_from_rotvec(v: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """Quaternion of a rotation vector (rad): the rotation about `v` by the angle `|v|`."""
+    """Quaternion [w, x, y, z] of a rotation vector (rad): the rotation about `v` by the angle `|v|`."""
     v = _checked("v", v, 3)
     half = 0.5 * norm(v)[..., None]
     return jnp.concatenate([jnp.cos(half), 0.5 * v * jnp.sinc(half / jnp.pi)], axis=-1)
 
 
 def quat_to_rotvec(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
-    """Rotation vector (rad) of a unit quaternion: the unit axis times the angle in [0, pi]."""
+    """Rotation vector (rad) of a unit quaternion [w, x, y, z]: the unit axis times the angle in [0, pi]."""
     q = _checked("q", q, 4)
     q = quat_canonical(q)
     sine = norm(q[..., 1:])[..., None]
@@ -125,7 +125,7 @@ def quat_to_rotvec(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
 
 
 def random_quat(key: PRNGKeyArray) -> Float[Array, "4"]:
-    """Draw a quaternion with `w >= 0` from the uniform distribution of rotations."""
+    """Draw a quaternion [w, x, y, z] with `w >= 0` from the uniform distribution of rotations."""
     return quat_canonical(jax.random.normal(key, (4,)))
 
 
@@ -133,7 +133,7 @@ def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Ar
     """Transform points from the mesh frame to the sensor frame.
 
     Args:
-        pose: One pose: position (m) and unit quaternion. For several poses use `jax.vmap`.
+        pose: One pose: position (m) and unit quaternion [w, x, y, z]. For several poses use `jax.vmap`.
         points: Points in the mesh frame (m).
 
     Returns:
@@ -152,7 +152,10 @@ def transform(pose: Float[Array, "7"], points: Float[Array, "*n 3"]) -> Float[Ar
 
 
 def pose_to_matrix(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 4 4"]:
-    """Homogeneous 4x4 matrix of a pose: it maps points (x, y, z, 1) of the mesh frame to the sensor frame."""
+    """Homogeneous 4x4 matrix of a pose: it maps points (x, y, z, 1) of the mesh frame to the sensor frame.
+
+    A pose is a position (m) and a unit quaternion [w, x, y, z].
+    """
     pose = _checked("pose", pose, 7)
     top = jnp.concatenate([quat_to_matrix(pose[..., 3:]), pose[..., :3, None]], axis=-1)
     bottom = jnp.broadcast_to(jnp.array([0.0, 0, 0, 1]), (*pose.shape[:-1], 1, 4))
@@ -160,7 +163,7 @@ def pose_to_matrix(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 4 4"]:
 
 
 def pose_from_matrix(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 7"]:
-    """Pose of a homogeneous 4x4 matrix, as a position and a quaternion with `w >= 0`.
+    """Pose of a homogeneous 4x4 matrix, as a position (m) and a unit quaternion [w, x, y, z] with `w >= 0`.
 
     If the upper left 3x3 matrix is not a rotation, the pose has the nearest rotation.
     """
@@ -169,7 +172,10 @@ def pose_from_matrix(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 7"]:
 
 
 def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """Composition of two poses: `b` is applied first, then `a`. Its matrix is the matrix of `a` times that of `b`."""
+    """Composition of two poses: `b` is applied first, then `a`. Its matrix is the matrix of `a` times that of `b`.
+
+    A pose is a position (m) and a unit quaternion [w, x, y, z].
+    """
     a, b = _checked("a", a, 7), _checked("b", b, 7)
     quat = quat_multiply(a[..., 3:], b[..., 3:])
     turned = jnp.einsum("...ij,...j->...i", quat_to_matrix(a[..., 3:]), b[..., :3], precision="highest")
@@ -177,7 +183,10 @@ def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Arr
 
 
 def pose_inverse(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """Inverse of a pose: it maps points of the sensor frame to the mesh frame."""
+    """Inverse of a pose: it maps points of the sensor frame to the mesh frame.
+
+    A pose is a position (m) and a unit quaternion [w, x, y, z].
+    """
     pose = _checked("pose", pose, 7)
     quat = quat_inverse(pose[..., 3:])
     position = -jnp.einsum("...ij,...j->...i", quat_to_matrix(quat), pose[..., :3], precision="highest")

@@ -327,7 +327,7 @@ class Predictor:
         if array.shape != (*lead, statespace.STATE_CODE):
             raise ValueError(f"state has shape {array.shape}, but it must have shape {(*lead, statespace.STATE_CODE)}.")
         if not _arguments.traced(array) and not np.isfinite(array).all():
-            raise ValueError("state has NaN or infinite values: give finite codes for every item, or leave state= out.")
+            raise ValueError("state has NaN or infinite values: give finite numbers, or leave state= out.")
         return _arguments.float32(array)
 
     def _checked_condition(
@@ -354,8 +354,8 @@ class Predictor:
         if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
             raise ValueError(
                 f"condition has magnitudes up to {np.abs(condition).reshape(-1, width).max(0).tolist()}, but at most "
-                f"{(_LARGEST_CONDITION * scale).tolist()} is allowed, {_LARGEST_CONDITION:g} times the usual "
-                "magnitudes: give the condition in SI units."
+                f"{(_LARGEST_CONDITION * scale).tolist()} is allowed, {_LARGEST_CONDITION:g} times the "
+                "typical magnitudes of the model's scenario: give the condition in SI units."
             )
         return condition, None
 

@@ -28,7 +28,10 @@ _Condition = tuple[Any, Callable[[], str]]  # flag, True if the condition holds,
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """All constants of an STS sensor. The defaults are those of the paper, where the paper gives a value."""
+    """All constants of an STS sensor (See-Through-your-Skin).
+
+    The defaults are those of the paper (Rezaei-Shoshtari et al. 2021), where the paper gives a value.
+    """
 
     # Pinhole of the camera.
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -52,8 +55,8 @@ class Sensor:
         The arrays of internal lights (`lights`) and external lights (`room`) may have any number of rows, one for each
         light. There are further conditions:
 
-        - The distance from the pinhole to the gel's inner face is at least `camera.near`, so that objects that press on
-          the gel are drawn.
+        - The distance from the pinhole to the gel's inner face is at least `camera.near`, the smallest depth at which
+          objects are drawn. All objects that press on the gel are therefore drawn.
         - `gel.max_depth`, the largest depth of the imprint, is at most `gel.thickness`.
         - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
         - No light shines from outside through the opaque skin: z <= 0 in every direction of `Lights` and every position
@@ -264,7 +267,7 @@ def _field_conditions(
         if isinstance(default, tuple) and not isinstance(value, tuple):
             raise ValueError(f"field {name} is {value!r}, but it must be a tuple of {len(default)} numbers.")
         if isinstance(default, jax.Array) and not isinstance(value, jax.Array | np.ndarray):
-            raise ValueError(f"field {name} is {value!r}, but it must be an array.")
+            raise ValueError(f"field {name} is {value!r}, but it must be a NumPy or JAX array.")
         if static and not all(isinstance(number, int | np.integer) for number in numbers):
             raise ValueError(f"field {name} is {value!r}, but its numbers must have the type int or np.integer.")
         yield from _value_conditions(default, value, name, metadata)

@@ -273,7 +273,7 @@ def test_an_error_that_the_user_can_correct_is_one_line_unless_debug_is_set(tmp_
     path = tmp_path / "a.txt"
     path.write_text("")
     monkeypatch.setattr("sys.argv", ["freefall", "--preset", "smoke", "--workdir", str(path)])
-    with pytest.raises(SystemExit, match=rf"^error: cannot work in {path}: .*Choose a folder"):
+    with pytest.raises(SystemExit, match=rf"^error: cannot create or write to {path}: .*Choose a folder"):
         command.run(freefall.PRESETS, "unused", None)
     monkeypatch.setattr("sys.argv", ["freefall", "--classes", "teapot"])
     with pytest.raises(SystemExit, match=r"^error: category is 'teapot'"):

@@ -176,7 +176,7 @@ def test_a_file_instead_of_a_folder_cannot_be_locked(tmp_path):
     path.write_text("")
     for folder in (path, path / "below"):
         with (
-            pytest.raises(OSError, match=r"cannot work in .*Choose a folder that can be written to"),
+            pytest.raises(OSError, match=r"cannot create or write to .*Choose a folder you can write to"),
             _files.lock(folder),
         ):
             pytest.fail("held")

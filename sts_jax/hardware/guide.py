@@ -77,10 +77,10 @@ class GuideConfig:
 
 
 class Observation(NamedTuple):
-    """The block means of a pair of images.
+    """The mean colours of the blocks of a visual and a tactile image.
 
-    An image is divided into 24 rows of 32 blocks, and into 48 rows of 64 small blocks. A block mean is the mean colour
-    of one block.
+    Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
+    mean is the mean colour of one block.
     """
 
     time_s: float  # arrival time of the later image, on any clock that increases (s)
@@ -91,10 +91,10 @@ class Observation(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmptyPad:
-    """The block means of both streams while the pad is empty, and the noise of these means.
+    """The mean colours of the blocks of a visual and a tactile image of the empty pad, and the noise of these means.
 
-    An image is divided into 24 rows of 32 blocks, and into 48 rows of 64 small blocks. A block mean is the mean colour
-    of one block.
+    Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
+    mean is the mean colour of one block.
     """
 
     visual: Blocks  # block means of the visual image
@@ -152,7 +152,7 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
 
     An observation contains the mean colours of blocks of the images, see `observe`. The noise of a block is the
     standard deviation of its mean colour over the observations. A few observations can underestimate the noise.
-    Each value is therefore raised to at least the median noise of all blocks of the same kind.
+    The noise of each block is therefore raised to at least the median noise of all blocks of this size in its image.
 
     Args:
         observations: At least two observations of the empty pad without movement.
@@ -213,10 +213,10 @@ def step(config: GuideConfig, state: State, observation: Observation) -> tuple[S
         observation: Result of `observe` for the new pair of images.
 
     Returns:
-        The new state, and "initial", "final" or None. "initial" means that the caller must save the previous pair of
-        images as the pair of the held object, and "final" as the pair of the object at rest. The previous pair is saved
-        because nothing moved between the pairs before and after it. Therefore, nothing moved while it was taken. None
-        means that no pair must be saved.
+        The new state, and "initial", "final" or None. If it is "initial", the caller must save the previous pair of
+        images as the pair of the held object. If it is "final", the caller must save the previous pair as the pair of
+        the object at rest. Nothing moved while this pair was taken, because the pairs before and after it show no
+        movement. None means that there is nothing to save.
     """
     moved = not state.window or not _same(config, state, state.window[0], observation)
     window = (observation,) if moved else (state.window[0], *state.window[1:][-_KEPT:], observation)
@@ -257,8 +257,9 @@ def _clear(config: GuideConfig, state: State) -> State:
 def confirm(state: State) -> State:
     """Advance the guide after the person has confirmed the current stage of recording a trajectory.
 
-    The meaning of a confirmation depends on the stage. In `CLEAR`, the pad is empty. In `RELEASE`, the object is
-    released. In `REVIEW`, the trajectory is good. In all other stages, the state is returned unchanged.
+    The meaning of a confirmation depends on the stage (`Stage`). In `CLEAR`, the person confirms that the pad is empty,
+    in `RELEASE` that the object is released, and in `REVIEW` that the trajectory is good. In all other stages, the
+    state is returned unchanged.
 
     Args:
         state: Current state of the guide.
@@ -274,9 +275,9 @@ def confirm(state: State) -> State:
 
 
 def discard(state: State) -> State:
-    """Return to the stage `CLEAR`, because the person discards the trajectory.
+    """Discard the current trajectory, and return to the stage `CLEAR`, in which the person clears the pad.
 
-    In the stages `CLEAR` and `PLACE`, no trajectory has begun, and the state is returned unchanged.
+    In `CLEAR` and in the next stage `PLACE`, no trajectory has begun, and the state is returned unchanged.
 
     Args:
         state: Current state of the guide.
@@ -305,9 +306,10 @@ def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) 
     """Return True if the tactile image shows a contact.
 
     A tactile image shows a contact if at least `config.contact_blocks` of its 48 x 64 small blocks differ from the
-    empty pad. The median difference over all blocks is subtracted first, so that a change in the brightness of the
-    whole image is not a contact. The noise is the larger one of the noise in `empty` and 1.4826 times the median
-    absolute difference.
+    empty pad by more than a threshold. The median difference over all blocks is subtracted first, so that a change in
+    the brightness of the whole image is not a contact. The threshold is `config.deviations` times the noise, limited to
+    the range from `config.smallest_change` to `config.largest_threshold`. This noise is the larger one of two
+    estimates: `sqrt(1 + 1 / config.pairs)` times the noise in `empty`, and 1.4826 times the median absolute difference.
 
     Args:
         config: Thresholds.

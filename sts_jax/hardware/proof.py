@@ -35,9 +35,9 @@ _GRACE_S = 0.2  # s by which the wait for a frame may exceed the deadline, so th
 class ProvenFrames:
     """Switches the lights of a connected sensor, and selects frames that are proven to show the lights of one stream.
 
-    The lights are off in the visual stream and on in the tactile stream. For the last switch of the lights, the object
-    keeps the controller's answer, the last frame before the switch, and the number of frames that show its effect. Only
-    one thread may take images. Other threads may only call `stop`.
+    The lights are off in the visual stream and on in the tactile stream. The class stores the controller's
+    answer to the last switch of the lights, the last frame before this switch, and the number of frames that show the
+    effect of the switch. Only one thread may take images. Other threads may only call `stop`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class ProvenFrames:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image was still changing at the end of this collection, in each of three attempts.
+            LightError: The image was still changing at the end of a collection of frames, in each of three attempts.
         """
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(LightError):
@@ -158,9 +158,9 @@ class ProvenFrames:
         return found
 
     def pair(self, deadline: float) -> Pair:
-        """Take an image of each stream. Both images arrive after the call.
+        """Take an image of each stream. The frames of both images arrive after the start of this call.
 
-        The stream for which the lights were set last comes first, so a pair needs only one switch of the lights.
+        The first image is of the stream for which the lights are already set, so a pair needs only one switch.
 
         Args:
             deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the time
@@ -185,8 +185,9 @@ class ProvenFrames:
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
 
-        After the frame, the controller must confirm that the lights did not change. The switch from the visual to the
-        tactile stream, requested by `then`, includes this confirmation. In all other cases, one more request is sent.
+        After the frame, the controller must confirm that the lights did not change. If `then` requests the switch
+        from the visual to the tactile stream, the answer to this switch is the confirmation. Otherwise, the controller
+        receives one more request.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).
@@ -316,7 +317,7 @@ class ProvenFrames:
         if self._camera.set_exposure(exposure) is None:
             raise CameraError(
                 f"the driver of {self._camera.config.name} does not support a manual exposure, so the exposure cannot "
-                f"be set to {exposure:g}: pass exposures=None."
+                f"be set to {exposure:g}: pass exposures=None to STS."
             )
 
     def _proof(self, before: Lit, then: Stream | None) -> float | None:

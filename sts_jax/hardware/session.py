@@ -267,7 +267,7 @@ class Session:
             if self._changed.wait_for(lambda: not self._jobs, timeout_s):
                 return
             names = ", ".join(job.name for job in self._jobs)
-            cause = self._error or "the disk is too slow."
+            cause = self._error or "the disk is too slow. Pass a longer timeout_s."
         raise SessionError(f"these changes were not on disk after {timeout_s:g} s: {names}. Cause: {cause}")
 
     def close(self, timeout_s: float = 30.0) -> None:
