@@ -247,7 +247,7 @@ def test_boards_that_do_not_reach_the_corners_are_refused(tmp_path, pictures):
 
 def test_a_view_that_the_camera_does_not_see_is_refused(config):
     shifted = dataclasses.replace(hardware.Lens.ideal(WIDTH, HEIGHT), cx=60.0)
-    with pytest.raises(hardware.CalibrationError, match=r"does not show \d.*middle left.*under the centre of the pad"):
+    with pytest.raises(hardware.CalibrationError, match=r"\d% of .* outside .*middle left.*centre of the pad"):
         hardware.check_view(shifted, PINHOLE)
     with pytest.raises(hardware.CalibrationError, match="larger field of view"):
         commission.main(dataclasses.replace(config, ideal_lens=90.0))

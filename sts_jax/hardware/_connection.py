@@ -205,6 +205,7 @@ class Connection:
         if 5 * strange > len(heard):
             return (
                 f"Received {len(heard)} bytes that are not text ({heard[:24]!r}), which is typical of a wrong baud "
-                f"rate: the port was opened at {self.baud} baud, and the firmware uses {protocol.BAUD}."
+                f"rate: the port was opened at {self.baud} baud, and the firmware uses {protocol.BAUD}. Set baud to "
+                f"{protocol.BAUD}, or choose another port."
             )
         return f"Received {heard[:80]!r}, so another device may be on this port. Choose another port."

@@ -118,12 +118,12 @@ class Calibration:
 def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)) -> NDArray[np.uint8]:
     """Draw an A4 page with the board, its dimensions, a frame around the board, and a ruler of 100 mm.
 
-    The page is cut along the frame after printing.
+    Print the page, and cut it along the frame.
 
     Args:
         board: The board to draw.
-        outline: Width and height of the frame around the board (m). Choose the size of the sensor's gel pad. The cut
-            sheet then has the size of the pad, and if it covers the pad exactly, the board is centred on the pad.
+        outline: Width and height of the frame around the board (m). Choose the size of the sensor's gel pad. The
+            board is then centred on the pad if the cut sheet covers the pad exactly.
 
     Returns:
         Grey image with 10 pixels per mm, shape (2970, 2100), uint8.
@@ -169,7 +169,7 @@ def save_board(
     *,
     outline: tuple[float, float] = (0.15, 0.15),
 ) -> None:
-    """Write the page that `board_image` draws to a file that prints at its true size.
+    """Save the page of `board_image` in a file that states its resolution, so that a print at 100 % has the true size.
 
     Args:
         path: Path of the file, ending in .pdf or .png.
@@ -227,13 +227,13 @@ def calibrate(
     """Calibrate a lens and the camera's pose in the sensor from images of a board.
 
     In one image, the board must lie on the outer face of the gel pad, with the printed side towards the camera. The
-    board must be centred on the pad, and the edges of both must be parallel. Any edge of the board may be at the top.
-    In the other images, the board must have different distances, positions and tilts.
+    board must be centred on the pad, with its edges parallel to the edges of the pad. Any edge of the board may be at
+    the top of the image. In the other images, the board must have different distances, positions and tilts.
 
-    The calibration fits the parameters of the lens and the pose of the board in each image. The reprojection error of
-    a corner is the distance between the pixel at which the corner was found and the pixel to which the fitted lens
-    projects it. The fit minimises a soft L1 loss of the column and row components of the reprojection errors. A weak
-    prior keeps the coefficients `Lens.k` small.
+    The calibration fits the parameters of the lens and the pose of the board in each image. For each corner, it
+    compares the pixel at which the corner was found with the pixel to which the fitted lens projects the corner. The
+    distance between these two pixels is the reprojection error. The fit minimises a soft L1 loss of their differences
+    in column and row. A weak prior keeps the coefficients `Lens.k` small.
 
     Args:
         images: Raw images of one camera, all of the same size, shape (height, width, 3) for RGB or (height, width) for
@@ -469,9 +469,9 @@ def _check_tilts(poses: NDArray[np.float64]) -> None:
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
-            f"the board has nearly the same tilt in all images, parallel within {math.degrees(spread):.0f} degrees, so "
-            f"the focal length cannot be computed. Two images must differ by at least {math.degrees(LEAST_TILT):.0f} "
-            "degrees. Hold the board with tilts of 20 to 40 degrees to different sides in some images."
+            f"the tilts of the board in the images differ by at most {math.degrees(spread):.0f} degrees, but at least "
+            f"{math.degrees(LEAST_TILT):.0f} degrees between two images are needed to compute the focal length. Hold "
+            "the board with tilts of 20 to 40 degrees to different sides in some images."
         )
 
 

@@ -45,12 +45,12 @@ class Camera:
     def connect(self, warmup_s: float = 1.0) -> "Camera":
         """Open the camera, and wait until its automatic exposure and white balance have settled.
 
-        The settings of a device are then locked if `CameraConfig.lock` is True. The call lasts at most `warmup_s` plus
-        four times `CameraConfig.timeout_s`. A video file starts at its first frame, without a wait.
+        If the source is a V4L2 device and `CameraConfig.lock` is True, the call then locks the settings: it turns
+        automatic exposure, white balance and focus off, and discards all earlier frames. A video file starts at its
+        first frame, without a wait. The call lasts at most `warmup_s` plus four times `CameraConfig.timeout_s`.
 
         Args:
-            warmup_s: Time for the automatic exposure and white balance to settle (s). If the settings of a device are
-                locked afterwards, the frames that arrive during this time are discarded.
+            warmup_s: Time for the automatic exposure and white balance to settle (s).
 
         Returns:
             This camera.
@@ -142,7 +142,10 @@ class Camera:
 
     @property
     def locked(self) -> dict[str, float]:
-        """The values of a device's locked settings, by field name of `CameraConfig`. Empty for streams and files."""
+        """The fixed settings of a device, such as {"exposure": 200.0}, by their field names in `CameraConfig`.
+
+        Empty for streams and files.
+        """
         return self._connected().held
 
     def set_exposure(self, exposure: float) -> float | None:

@@ -100,9 +100,9 @@ class Capture:
         return rate if rate > 0 and np.isfinite(rate) else None
 
     def stamp(self) -> float | None:
-        """Return the driver's time stamp of the last frame (s), or None if there is none.
+        """Return the time of the last frame on the clock of the device's driver (s), or None if it is unknown.
 
-        The stamp has no jitter, unlike the time at which the frame reaches this process. Only devices have stamps.
+        This time has no jitter, unlike the time at which the frame reaches this process. It exists only for devices.
         """
         time_ms = self.properties.get(cv2.CAP_PROP_POS_MSEC) if self._config.kind == "device" else 0.0
         return time_ms / 1000 if time_ms > 0 else None

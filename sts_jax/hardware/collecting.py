@@ -24,7 +24,10 @@ _PASSING = (
 
 
 class Action(enum.Enum):
-    """The actions that are available to the person who collects trajectories with `collect`."""
+    """An action of the person who collects trajectories with `collect`.
+
+    A trajectory consists of two pairs of images: one of a held object, and one of the same object after its release.
+    """
 
     CONFIRM = "confirm"  # confirm the current stage: the pad is empty, the object is released, the trajectory is good
     DISCARD = "discard"  # discard the current trajectory
@@ -67,7 +70,10 @@ class Person(Protocol):
         """Show the current view. `collect` calls this method after each attempt to read a pair."""
 
     def action(self) -> Action | None:
-        """Return the next action of the person, or None if there is none. It refers to the view that was shown last."""
+        """Return the next action of the person, or None if there is none.
+
+        The action refers to the view that was shown last.
+        """
 
 
 class AutomaticPerson:
@@ -78,7 +84,7 @@ class AutomaticPerson:
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store the stage of the view for `action`."""
+        """Store the stage of the view, on which the result of `action` depends."""
         self._stage = view.stage
 
     def action(self) -> Action | None:

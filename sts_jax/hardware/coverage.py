@@ -34,7 +34,7 @@ def view_angle(lens: Lens, pinhole: Pinhole) -> float:
 
 
 def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None) -> None:
-    """Raise an error unless the raw images show the whole view and the calibration covers the corners of the view.
+    """Raise an error unless the camera sees the whole view and the calibration images cover the corners of the view.
 
     The view is the part of the gel's outer face that rectified images show.
 
@@ -46,8 +46,8 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
             optical axis. None: this angle is not checked.
 
     Raises:
-        CalibrationError: A part of the view lies outside of the raw image. Or a corner of the view is more than
-            3 degrees beyond `largest_angle`. Or the view contains rays at larger angles than `Lens.largest_angle`.
+        CalibrationError: A part of the view lies outside of the camera's image. Or a corner of the view is more than
+            3 degrees beyond `largest_angle`. Or the lens model is not valid for the whole view.
     """
     needed = view_angle(lens, pinhole)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
@@ -67,8 +67,9 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
         blocks = [b for rows in np.array_split(outside, 3) for b in np.array_split(rows, 3, axis=1)]
         parts = ", ".join(part for part, block in zip(PARTS, blocks, strict=True) if block.any())
         raise CalibrationError(
-            f"the raw image does not show {outside.mean():.1%} of the sensor's view ({parts}). Mount the camera under "
-            "the centre of the pad and parallel to the pad, or use a lens with a larger field of view."
+            f"{outside.mean():.1%} of the sensor's view lies outside of the raw image ({parts}), but the raw image "
+            "must show the whole view. Mount the camera under the centre of the pad and parallel to the pad, or use a "
+            "lens with a larger field of view."
         )
 
 

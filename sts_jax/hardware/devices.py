@@ -95,7 +95,7 @@ def users_of(device: Path) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def locked(config: CameraConfig) -> Iterator[None]:
-    """Lock a device or a stream while the context is active. Video files are not locked.
+    """Lock a device or a stream against use by others while the context is active. Video files are not locked.
 
     Args:
         config: Configuration of the camera.

@@ -42,10 +42,10 @@ class EmulatedController:
 
         Args:
             data: Any number of bytes. An incomplete line is kept until the rest of the line arrives.
-            now_s: Current time on the clock of the constructor's `now_s` (s).
+            now_s: Current time, on the same clock as `now_s` of the constructor (s).
 
         Returns:
-            The lines that the controller sends, or no bytes.
+            The lines that the controller sends, or empty bytes if it sends none.
         """
         sent = self.tick(now_s)
         *lines, self._pending = (self._pending + data).split(b"\n")
@@ -56,10 +56,10 @@ class EmulatedController:
         """Turn the lights off if no valid request has arrived for the watchdog's period, `watch_ms`.
 
         Args:
-            now_s: Current time on the clock of the constructor's `now_s` (s).
+            now_s: Current time, on the same clock as `now_s` of the constructor (s).
 
         Returns:
-            The line that reports that the lights were turned off, or no bytes if they were not.
+            The line with which the controller reports the change, or empty bytes if the lights did not change.
         """
         if self.levels == protocol.DARK or now_s - self._valid_s < self.watch_ms / 1000:
             return b""

@@ -32,7 +32,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 class Still(NamedTuple):
     """The description of a recorded image, without its pixels.
 
-    All times of a film are on the same clock, whose zero is arbitrary.
+    The times of all images of a recording are on the same clock, whose zero is arbitrary.
     """
 
     stream: Stream
@@ -103,7 +103,7 @@ class RecordedFilm(Film):
             head = _files.read_json(path, _AGAIN)
         except (FileNotFoundError, NotADirectoryError):
             raise FileNotFoundError(
-                f"{self._folder} holds no recording ({HEAD} is missing): give the folder of one, or two video files."
+                f"{self._folder} holds no recording ({HEAD} is missing): give the folder of a recording, or two videos."
             ) from None
         if not isinstance(head, dict) or head.get("format") != FORMAT:
             found = head.get("format") if isinstance(head, dict) else None
@@ -242,7 +242,9 @@ class VideoFilm(Film):
         )
 
     def image(self, index: int) -> Image:
-        """Return the RGB pixels of an image. Going back in time opens the video again.
+        """Return the RGB pixels of an image.
+
+        Reading in the order of time is fastest. To read an earlier image, the video is opened again.
 
         Args:
             index: Position of the image in `stills`.

@@ -149,7 +149,7 @@ class Grabber:
 
     @property
     def held(self) -> dict[str, float]:
-        """The values of the locked settings, by field name of `CameraConfig`."""
+        """The fixed settings of the device, such as {"exposure": 200.0}, by their field names in `CameraConfig`."""
         with self._changed:
             return dict(self._held)
 

@@ -44,9 +44,11 @@ class Pinhole(Protocol):
 class Lens:
     r"""A fisheye lens in the Kannala-Brandt model (OpenCV's `cv2.fisheye`), with the camera's pose in the sensor.
 
-    A point p of the sensor frame is at q = R p + t in the camera frame. R is the rotation matrix of the rotation vector
+    The sensor frame has its origin at the centre of the gel's outer face, and its z-axis points out of the sensor. A
+    point p of the sensor frame is at q = R p + t in the camera frame. R is the rotation matrix of the rotation vector
     `rotation`, and t is `translation`. The optical axis is the z-axis of the camera frame. Let a be the angle between q
-    and the optical axis (rad). The point appears in the camera's image at the pixel
+    and the optical axis (rad), and let k_1 to k_4 be the elements of `k`. The point appears in the camera's image at
+    the pixel
 
         (column, row) = (fx d q_x / r + cx, fy d q_y / r + cy),
         r = sqrt(q_x^2 + q_y^2),
@@ -92,7 +94,8 @@ class Lens:
             raise ValueError(
                 f"rotation {self.rotation} and translation {self.translation} place the camera at "
                 f"{tuple(round(float(c), 4) for c in self.center)} m in the sensor frame, but the camera must lie "
-                "inside the sensor, where z is negative"
+                "inside the sensor, where z is negative. Check that both describe the transformation from the sensor "
+                "frame to the camera frame."
             )
 
     @classmethod
@@ -149,7 +152,7 @@ class Lens:
     def largest_angle(self) -> float:
         """Largest angle from the optical axis at which the lens model is valid (rad), at most pi.
 
-        Up to this angle, a larger angle is projected to a pixel farther from the pixel of the optical axis. Beyond it,
+        Up to this angle, the pixel of a ray moves away from the optical axis as the angle of the ray grows. Beyond it,
         the polynomial of the model decreases, and two different angles would be projected to the same pixel. No real
         lens behaves like this.
         """
@@ -205,15 +208,15 @@ def project_camera(lens: Lens, points: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Compute the direction of the ray that meets each raw pixel. This is the inverse of `project_camera`.
+    """Compute the direction of each pixel's ray in the camera frame. This is the inverse of `project_camera`.
 
     Args:
         lens: The lens.
-        pixels: Raw pixel coordinates (column, row), shape (..., 2).
+        pixels: Pixel coordinates (column, row) in the raw image of the camera, shape (..., 2).
 
     Returns:
-        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels that correspond to no angle up to
-        `Lens.largest_angle`.
+        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels that no ray within
+        `Lens.largest_angle` of the optical axis meets.
     """
     pixels = np.asarray(pixels, np.float64)
     x, y = (pixels[..., 0] - lens.cx) / lens.fx, (pixels[..., 1] - lens.cy) / lens.fy
@@ -254,8 +257,8 @@ def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> 
     if np.isnan(pixels).any():
         raise ValueError(
             f"the model of the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from the optical "
-            "axis, but the sensor's view needs larger angles. Calibrate the lens again, with images of the board in "
-            "the corners of the view."
+            f"axis, but {np.isnan(pixels[..., 0]).sum()} of {rows * columns} points of the sensor's view lie at larger "
+            "angles. Calibrate the lens again, with images of the board in the corners of the view."
         )
     return pixels
 
@@ -309,8 +312,8 @@ def distortion(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDA
     Returns:
         Rectified pixel coordinates (column, row) of each raw pixel, shape (lens.height, lens.width, 2). They lie
         outside of the rectified image for raw pixels outside of the view. They are NaN for a raw pixel whose ray does
-        not meet the plane of the gel's outer face, and for a raw pixel that corresponds to no angle up to
-        `Lens.largest_angle`.
+        not meet the plane of the gel's outer face, and for a raw pixel that no ray within `Lens.largest_angle` of the
+        optical axis meets.
 
     Raises:
         ValueError: `resolution` or `pinhole` is out of range.
@@ -329,8 +332,8 @@ def distorted(
     """Convert a rectified image to the raw image of the same scene. This is the inverse of `rectified`.
 
     The rectified image shows the view of the simulated pinhole camera. The raw image is the image that the real camera
-    would take. Computing the positions of the samples is slow. They are cached for the two most recent combinations of
-    `lens`, `pinhole`, image size and `samples`.
+    would take. Each raw pixel is the mean of samples of the rectified image. Computing the positions of the samples is
+    slow. They are cached for the two most recent combinations of `lens`, `pinhole`, image size and `samples`.
 
     Args:
         lens: The lens and the pose of the real camera.
@@ -339,8 +342,8 @@ def distorted(
             the whole view, as an image of `sts_jax.sense` does. If the aspect ratio of the image differs from that of
             the view, the image must show the view cropped around its centre.
         outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
-        samples: Number of samples per raw pixel in each direction. The raw pixel is the mean of its samples. Fewer
-            samples are faster. None: as many samples as needed to avoid aliasing.
+        samples: Number of samples per raw pixel in each direction. Fewer samples are faster. None: as many samples as
+            needed to avoid aliasing.
 
     Returns:
         Raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
