@@ -67,7 +67,7 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
         blocks = [b for rows in np.array_split(outside, 3) for b in np.array_split(rows, 3, axis=1)]
         parts = ", ".join(part for part, block in zip(PARTS, blocks, strict=True) if block.any())
         raise CalibrationError(
-            f"{outside.mean():.1%} of the sensor's view lies outside of the raw image ({parts}), but the raw image "
+            f"{outside.mean():.2%} of the sensor's view lies outside of the raw image ({parts}), but the raw image "
             "must show the whole view. Mount the camera under the centre of the pad and parallel to the pad, or use a "
             "lens with a larger field of view."
         )
