@@ -86,7 +86,7 @@ def test_an_unknown_category_is_refused_before_anything_is_collected(tmp_path, c
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda parts: [], "family bad: the function parts must return at least one Part, got none"),
+        (lambda parts: [], r"family bad: parts\(\) must return at least one Part, got none"),
         (lambda parts: parts * 2, r"family bad: at most one part can have interior=True, got 2"),
         (lambda parts: shapes.scaled(parts, 0.08), r"longest side must be 5 to 150 mm, got 0\.08 mm: .*millimetres"),
         (lambda parts: shapes.scaled(parts, 160), "longest side must be 5 to 150 mm, got 160 mm"),

@@ -204,4 +204,6 @@ def read_log(folder: Path) -> list[dict[str, float]]:
     except FileNotFoundError:
         return []
     except ValueError as error:  # invalid UTF-8 or no JSON
-        raise dataset.DamagedFileError(f"{path} is damaged ({error}): delete {folder}, and train again") from error
+        raise dataset.DamagedFileError(
+            f"the training log {path} is damaged ({error}): delete {folder}, and train again"
+        ) from error

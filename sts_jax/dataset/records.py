@@ -50,7 +50,7 @@ class Identity(NamedTuple):
 
 
 def shard_path(folder: Path, count: int, index: int) -> Path:
-    """Path of the `.array_record` file, which has the images of shard `index` in a dataset of `count` shards."""
+    """Path of the `.array_record` file with the images of shard `index`, from 0, in a dataset of `count` shards."""
     return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
 
 
@@ -114,7 +114,7 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
     """
     small = path.with_suffix(".npz")
     arrays = read_arrays(small)
-    again = f"delete {small.name} and {path.name} and start the collection again"
+    again = f"delete {small.name} and {path.name} and start the collection again, which makes only the missing shards"
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
@@ -198,7 +198,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError:
         raise
     except Exception as error:  # np.load raises errors of five types for damaged files
-        raise DamagedFileError(f"{path} is damaged ({error}): delete it and start the collection again.") from error
+        raise DamagedFileError(
+            f"{path} is damaged ({error}): delete it and start the collection again, which makes only the missing "
+            "shards."
+        ) from error
 
 
 def read_images(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], total: int) -> Images:
@@ -252,7 +255,10 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
     """Read some records of equal length, `uint8 (n, length)`."""
     if not path.is_file():
         raise _missing(path)
-    again = f"delete it and {path.with_suffix('.npz').name} and start the collection again"
+    again = (
+        f"delete it and {path.with_suffix('.npz').name} and start the collection again, which makes only the missing "
+        "shards"
+    )
     try:
         reader = ArrayRecordReader(str(path))
         count = reader.num_records()

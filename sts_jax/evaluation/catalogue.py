@@ -1,4 +1,4 @@
-"""The metrics of summaries and tables: METRICS, and the columns of the short table."""
+"""The metrics of summaries and tables: METRICS, and the default columns of `table`."""
 
 import dataclasses
 import functools
@@ -236,12 +236,12 @@ METRICS: tuple[Metric, ...] = (
 
 
 def _brief(name: str, digits: int, *, interval: bool = False) -> Metric:
-    """A metric of METRICS as the short table shows it, with other decimals and with or without its interval."""
+    """A metric of METRICS as `table` shows it, with other decimals and with or without its interval."""
     known = {metric.name: metric for metric in METRICS}
     return dataclasses.replace(known[name], digits=digits, interval=interval)
 
 
-COLUMNS: tuple[Column, ...] = (  # of the short table
+COLUMNS: tuple[Column, ...] = (  # default columns of `table`
     Column("visual skill", (_brief("visual_skill", 3, interval=True),)),
     Column("visual skill on the object", (_brief("visual_skill_object", 3),)),
     Column("tactile skill", (_brief("tactile_skill", 3, interval=True),)),

@@ -121,11 +121,12 @@ def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tupl
     Args:
         modalities: The inputs of the model, `predictor.modalities`. If the model has no inputs, the result has only the
             empty subset.
-        state: True to add the subset of the visual image and the true state (pose, shape and mass). State-space models
-            accept the true state.
+        state: True to add the subset ("visual", "state") of the visual image and the true state (pose, shape and mass),
+            if the visual image is an input. State-space models accept the true state.
 
     Returns:
-        The subsets by their descriptions, such as "from visual and pose".
+        The subsets by their descriptions, such as "from visual and pose" for the inputs ("visual", "pose"). The
+        description of the subset with the true state is "from visual and the true state".
     """
     usable = tuple(modalities)
     if not usable:

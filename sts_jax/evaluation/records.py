@@ -131,7 +131,10 @@ class Metric:
 
 
 class Column(NamedTuple):
-    """A column of the short table. It contains one metric, or several metrics whose values are separated by slashes."""
+    """A column of the Markdown table that `table` makes.
+
+    It contains one metric, or several metrics whose values are separated by slashes.
+    """
 
     heading: str
     metrics: tuple[Metric, ...]

@@ -29,8 +29,8 @@ def outside(
 
     Args:
         body: The object.
-        pose: Pose of the object's mesh frame in the sensor frame, position (m) and quaternion. The mesh frame is the
-            coordinate system of the vertices. The face of the pad is the plane z = 0 of the sensor frame.
+        pose: Pose of the object's mesh frame in the sensor frame, position (m) and quaternion (w, x, y, z). The mesh
+            frame is the coordinate system of the vertices. The face of the pad is the plane z = 0 of the sensor frame.
         size: Size of the pad along x and y (m).
         up: Vector of any length that points upwards, in the sensor frame. It determines the tilt of the pad (default:
             the pad is level).

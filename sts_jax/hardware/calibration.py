@@ -89,7 +89,7 @@ class Board:
         """Return the same board as an OpenCV object.
 
         OpenCV's frame of the board has its origin at the top left corner. The frame of this class has its origin at
-        the centre.
+        the centre. The axes of both frames have the same directions.
         """
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._markers())
 

@@ -55,7 +55,10 @@ class CameraConfig:
             if value is not None and not (value > 0 and math.isfinite(value)):
                 raise ValueError(f"{name} must be > 0 and finite, got {value}")
         if self.in_flight < 0:
-            raise ValueError(f"in_flight must be >= 0, got {self.in_flight}")
+            raise ValueError(
+                f"in_flight must be >= 0, got {self.in_flight}: give the number of frames that may be in exposure or "
+                "transfer at once"
+            )
         if self.fourcc is not None and len(self.fourcc) != 4:
             raise ValueError(f"fourcc must have four characters, such as 'MJPG', got {self.fourcc!r}")
 

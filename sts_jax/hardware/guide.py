@@ -93,6 +93,8 @@ class Observation(NamedTuple):
 class EmptyPad:
     """The mean colours of the blocks of a visual and a tactile image of the empty pad, and the noise of these means.
 
+    The noise is the standard deviation of a mean over several images, or 0 if it is unknown. All values have the scale
+    of the images, 0 to 255.
     Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
     mean is the mean colour of one block.
     """

@@ -338,9 +338,9 @@ def distorted(
     Args:
         lens: The lens and the pose of the real camera.
         pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
-        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show
-            the whole view, as an image of `sts_jax.sense` does. If the aspect ratio of the image differs from that of
-            the view, the image must show the view cropped around its centre.
+        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. If its
+            aspect ratio is that of the view, it must show the whole view, as an image of `sts_jax.sense` does.
+            Otherwise, it must show the view cropped around its centre.
         outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
         samples: Number of samples per raw pixel in each direction. Fewer samples are faster. None: as many samples as
             needed to avoid aliasing.
@@ -349,7 +349,8 @@ def distorted(
         Raw image, shape (lens.height, lens.width) or (lens.height, lens.width, channels), uint8.
 
     Raises:
-        ValueError: The image is not uint8, `samples` is below 1, or `pinhole` is out of range.
+        ValueError: The image is not uint8, `samples` is below 1, or `pinhole` does not have distance > 0, 0 < fov < pi
+            and aspect > 0.
     """
     _check_image(image)
     if samples is not None and samples < 1:

@@ -175,7 +175,10 @@ def decode(line: bytes) -> str:
             lacks the checksum or the newline, or has a wrong checksum.
     """
     if len(line) > LONGEST_LINE:
-        raise ProtocolError(f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}", Code.LENGTH)
+        raise ProtocolError(
+            f"a line must have at most {LONGEST_LINE} bytes, got {len(line)}: {line!r}. The sender must shorten it.",
+            Code.LENGTH,
+        )
     found = re.fullmatch(rb"([ -)+-~]+)\*([0-9A-F]{4})\n", line)
     if found is None:
         raise ProtocolError(f"a line must be text, '*', four hexadecimal digits and a newline, got {line!r}")

@@ -366,7 +366,9 @@ def encoded(image: Image) -> bytes:
 
 
 def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
-    """Confirm a trajectory by writing its file `confirmed.json`. The caller must have locked the session.
+    """Confirm a trajectory, so that `load_recordings` includes it, by writing its file `confirmed.json`.
+
+    The caller must have locked the session, as `confirm_recording` and `Session.open` do.
 
     Args:
         folder: Folder of the session.
@@ -374,7 +376,8 @@ def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
         note: Text that is stored with the trajectory.
 
     Raises:
-        FileNotFoundError: The trajectory does not exist, or lacks its initial or final pair of images.
+        FileNotFoundError: The trajectory does not exist, or lacks its initial or final pair of a visual and a tactile
+            image.
         OSError: The file cannot be written.
     """
     path = trajectory_folder(folder, number)

@@ -268,7 +268,10 @@ class Session:
                 return
             names = ", ".join(job.name for job in self._jobs)
             cause = self._error or "the disk is too slow. Pass a longer timeout_s."
-        raise SessionError(f"these changes were not on disk after {timeout_s:g} s: {names}. Cause: {cause}")
+        raise SessionError(
+            f"these changes were not on disk after {timeout_s:g} s, and are lost if the session closes before they "
+            f"are: {names}. Cause: {cause}"
+        )
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Wait until all changes are on disk, end the background thread, and unlock the folder.

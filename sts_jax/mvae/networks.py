@@ -74,7 +74,8 @@ class Config:
     """Configuration of a multimodal variational autoencoder, in values that JSON can represent.
 
     Raises:
-        ValueError: `modalities` is empty, two modalities have the same name, or `widths` does not have four numbers.
+        ValueError: `modalities` is empty, two modalities have the same name, or `widths` does not have four numbers,
+            one for each convolution.
     """
 
     modalities: tuple[Modality, ...]

@@ -147,7 +147,7 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 def _check(family: Family, parts: list[Part]) -> None:
     """Raise a ValueError unless the parts form an object of an allowed size."""
     if not parts:
-        raise ValueError(f"family {family.name}: the function parts must return at least one Part, got none")
+        raise ValueError(f"family {family.name}: parts() must return at least one Part, got none")
     inner = sum(part.interior for part in parts)
     if inner > 1:
         raise ValueError(f"family {family.name}: at most one part can have interior=True, got {inner}")

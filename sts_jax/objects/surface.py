@@ -61,7 +61,7 @@ def proper(path: Path, surface: Surface) -> Surface:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Return whether faces (f, 3) form a closed surface.
+    """Return whether triangles form a closed surface. `faces` are the indices of their vertices, int (f, 3).
 
     The condition is that equally many faces run along each edge in its two directions. A surface of a single part then
     has no holes, and all of its faces have the same orientation. If several parts touch and share vertices, more than

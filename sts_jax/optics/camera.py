@@ -91,13 +91,15 @@ def to_pixels(
 
     Args:
         camera: The camera.
-        window: Part of the gel's outer face in the image: left, top, width, height (m).
+        window: Part of the gel's outer face (z = 0, on which objects lie) in the image: x of the left edge, y of the
+            top edge (the smallest y), width, height (m), in the sensor frame.
         shape: Height and width of the image (pixels).
         points: Points in the sensor frame (m).
 
     Returns:
         Columns and rows of the points (pixels, whole numbers at pixel centres), and their depths along the optical axis
-        from the pinhole (m). A point nearer than `Camera.near` is projected as if it had this depth.
+        from the pinhole (m). A point nearer than `Camera.near` is projected as if it had this depth, but its own
+        depth is returned.
     """
     depth = points[:, 2] + camera.distance
     on_face = camera.distance * points[:, :2] / jnp.maximum(depth, camera.near)[:, None]

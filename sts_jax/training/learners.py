@@ -16,7 +16,10 @@ Terms = dict[str, Array]  # scalars by name: the loss and its parts
 
 @runtime_checkable
 class Loss(Protocol):
-    """Type of a loss function: a pure function of one batch, which `jax.grad` and `jax.jit` can trace."""
+    """Type of a loss function: a pure function of a model, a random key and one batch.
+
+    `jax.grad` and `jax.jit` can trace it. `__call__` describes the arguments.
+    """
 
     def __call__(
         self,

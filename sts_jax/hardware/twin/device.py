@@ -25,7 +25,7 @@ _TICK_S = 0.005  # period with which the watchdog is checked on the virtual cloc
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The state of a `Twin` at one time: its scene, its lights and its camera."""
+    """The state of a `Twin` (a simulated sensor) at one time: its scene, its lights and its camera."""
 
     now_s: float  # time on the twin's clock (s)
     phase: str  # phase of the scene: empty, held, moving or still

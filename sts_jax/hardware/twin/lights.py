@@ -99,7 +99,13 @@ class LightHistory:
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
 
     def forget(self, before_s: float) -> None:
-        """Delete the changes that are not needed for any interval after `before_s` (s)."""
+        """Delete the changes that no interval after a time needs.
+
+        The last change at or before this time is kept, because it determines the brightness after this time.
+
+        Args:
+            before_s: The time (s), on the clock of `set`.
+        """
         keep = bisect.bisect_right(self._changes, before_s, key=lambda change: change.time_s) - 1
         del self._changes[:keep]
 

@@ -68,7 +68,7 @@ class VirtualSensor:
 
     @property
     def settling(self) -> Settling:
-        """The times for which `read` waits after the lights were switched on or off."""
+        """The times (s) for which `read` waits after the lights were switched on or off."""
         return self._settling
 
     @property
