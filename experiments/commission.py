@@ -227,8 +227,9 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
         return fit(pictures, pinhole)
     except hardware.CalibrationError as error:
         raise hardware.CalibrationError(
-            f"{error} The pictures are kept: delete the bad ones, and run the command again. To add pictures, give a "
-            f"larger --pictures than {config.pictures}."
+            f"{error} The pictures are kept in {folder}: delete those that are listed as bad (all if image 0 is bad), "
+            "and run the command again to take others in their place. To add pictures, give a larger --pictures than "
+            f"{config.pictures}."
         ) from error
 
 

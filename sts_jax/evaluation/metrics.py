@@ -93,7 +93,7 @@ def position_error(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Compute the distances between predicted and true positions.
 
     Args:
-        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        predicted: Predicted poses, position (m) and unit quaternion (w, x, y, z), `(n, 7)`.
         target: True poses, `(n, 7)`.
 
     Returns:
@@ -106,7 +106,7 @@ def geodesic_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Compute the angles between predicted and true orientations.
 
     Args:
-        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        predicted: Predicted poses, position (m) and unit quaternion (w, x, y, z), `(n, 7)`.
         target: True poses, `(n, 7)`.
 
     Returns:
@@ -122,7 +122,7 @@ def axis_angle(predicted: np.ndarray, target: np.ndarray) -> np.ndarray:
     The angle does not change with rotations about the up axis, which are invisible for round objects.
 
     Args:
-        predicted: Predicted poses, position (m) and unit quaternion, `(n, 7)`.
+        predicted: Predicted poses, position (m) and unit quaternion (w, x, y, z), `(n, 7)`.
         target: True poses, `(n, 7)`.
 
     Returns:
@@ -228,7 +228,7 @@ def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
     that of the sample with the smallest mean angle to the other samples.
 
     Args:
-        samples: k samples of n poses with unit quaternions, `(k, n, 7)`.
+        samples: k samples of n poses, position (m) and unit quaternion (w, x, y, z), `(k, n, 7)`.
         iterations: Number of iterations of Weiszfeld's method, which computes the geometric median.
 
     Returns:

@@ -54,11 +54,12 @@ def ceiling(
         test: The items. The predicted images have the resolution of their images.
         times: Number of re-rolls per item, >= 1.
         key: The random key of the re-rolls.
-        progress: Function that is called with the number of finished re-rolls.
+        progress: Function that is called with the number of re-rolls of all items that have been simulated so far.
 
     Returns:
-        A prediction with the re-rolls as samples (images in `uint8`). Its images are their means, its pose is
-        `metrics.centre` of their poses, and its outcome probabilities are `shares` of their outcomes.
+        A prediction with the re-rolls as samples (images in `uint8`). Its images are their means, and its pose is their
+        central pose (`metrics.centre`). Its outcome probabilities are the shares of the outcomes among the re-rolls and
+        one additional sample, which is spread evenly over all outcomes (`shares`).
 
     Raises:
         ValueError: `times` is below 1.

@@ -177,7 +177,8 @@ class Grabber:
             The frame.
 
         Raises:
-            CameraError: There is no frame, for the reasons that `Camera.read` lists.
+            CameraError: No frame has arrived in time, the camera was lost or disconnected, or there is another reason
+                that `Camera.read` lists.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:

@@ -59,7 +59,10 @@ class RecordedTrajectory:
 
 
 class Entry(NamedTuple):
-    """The number and the state of a trajectory, as `list_recordings` returns them."""
+    """A trajectory in the result of `list_recordings`: its number, state (`standing`), time and note.
+
+    The state is "confirmed", "unconfirmed", "incomplete" or "discarded".
+    """
 
     number: int  # number of the trajectory in its session
     standing: Standing  # "unconfirmed": both pairs exist. "incomplete": a pair is missing
@@ -84,8 +87,9 @@ class Recordings:
         trajectory.initial.visual.image, trajectory.final.tactile.image
     ```
 
-    Each access to a trajectory reads its files from disk and compares their checksums with the recorded ones. The
-    numbers of the trajectories are read once, by `load_recordings`. Later changes of the session do not change them.
+    Each access to a trajectory reads its files from disk and compares their checksums with the recorded ones. A
+    difference raises a `DamagedFileError`. `load_recordings` reads the numbers of the trajectories once. Later changes
+    of the session do not change the attribute `numbers`.
 
     Attributes:
         folder: Folder of the session.

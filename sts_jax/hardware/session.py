@@ -91,8 +91,9 @@ class Session:
     A background thread writes the files, so `save` and `confirm` return at once. The trajectories that `confirmed`
     counts are on disk and survive a loss of power. If writing fails, for example because the disk is full, the thread
     tries again every second, and `problem` describes the error. Changes (pairs of images, confirmations and discards)
-    that are not on disk yet wait in memory. At most 6 changes can wait, which are the changes of two trajectories. Call
-    `check_ready` before each trajectory, so that the session can accept all its changes.
+    that are not on disk yet wait in memory. At most 6 changes can wait, which are the changes of two trajectories. If 6
+    changes wait, `save` and `confirm` raise a `SessionError`. To avoid this error, call `check_ready` before each
+    trajectory. It raises a `SessionError` unless the session can accept all changes of the trajectory.
     """
 
     def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):

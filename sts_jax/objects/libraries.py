@@ -151,7 +151,8 @@ def read(collection: Library, index: int) -> Entry:
         index: Index of the item in `collection.items`.
 
     Returns:
-        The body, the two distances (m) that `gaps` computes, and notes on repairs.
+        The item, the body, its two `gaps`, and notes on repairs. The gaps are the largest distances (m) of the surface
+        outside the collision parts, and of the collision parts outside the surface.
 
     Raises:
         ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.

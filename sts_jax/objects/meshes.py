@@ -175,7 +175,7 @@ def _check_arguments(
         if value is not None and not (
             np.asarray(value).dtype.kind in "iuf" and np.ndim(value) == 0 and np.isfinite(value) and value > 0
         ):
-            raise ValueError(f"{path}: {name} must be a positive number of {unit}, got {value!r}")
+            raise ValueError(f"{path}: the argument {name} must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
             raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most {PAD}")

@@ -8,7 +8,11 @@ from jaxtyping import Float, Int
 
 
 class Surface(NamedTuple):
-    """A triangulated surface. Its albedo is the texture's value times the colour of the corner, in linear light."""
+    """A triangulated surface.
+
+    The albedo at a point of a face is the texture's value times the colour, in linear light. The colour is interpolated
+    between the three corners of the face.
+    """
 
     vertices: np.ndarray  # (v, 3), vertices (m), without duplicates, even where the colour changes
     faces: np.ndarray  # (f, 3), vertex indices

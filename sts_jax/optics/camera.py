@@ -1,7 +1,8 @@
 """The pinhole camera below the gel, and the part of its view that an image shows.
 
-A window is this part, as a rectangle `(left, top, width, height)` in metres on the gel's outer face (z = 0). The
-optical axis is perpendicular to this face. The cost of an image depends on its number of pixels and not on the window.
+A window is this part, as a rectangle `(left, top, width, height)` in metres on the gel's outer face (z = 0). Left is
+its smallest x, and top is its smallest y, because x points to the right of the image and y points down. The optical
+axis is perpendicular to this face. The cost of an image depends on its number of pixels and not on the window.
 """
 
 import dataclasses
@@ -41,7 +42,7 @@ def full_window(camera: Camera, resolution: tuple[int, int]) -> Float[Array, "4"
         resolution: Height and width of the image (pixels).
 
     Returns:
-        Left, top, width and height of the window (m).
+        Left edge (smallest x), top edge (smallest y), width along x and height along y of the window (m).
     """
     ratio = resolution[1] / resolution[0]
     height = 2 * camera.distance * jnp.tan(jnp.asarray(camera.fov) / 2)
@@ -56,9 +57,9 @@ def object_window(
     """Compute a window around an object, as in the paper (supplement, "Training Details").
 
     A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
-    largest one. The points are projected to this face, and their bounding box is clipped to the full window. The result
-    is the smallest window within the full window that contains this box and has the aspect ratio of the image. If the
-    box is outside the full window, the result is the full window.
+    largest one with the aspect ratio of the image. The points are projected to this face, and their bounding box is
+    clipped to the full window. The result is the smallest window of this aspect ratio within the full window that
+    contains the box. If the box is outside the full window, the result is the full window.
 
     Args:
         camera: The camera.
@@ -67,7 +68,7 @@ def object_window(
         smallest: Smallest allowed length of the window's shorter side (m).
 
     Returns:
-        Left, top, width and height of the window (m).
+        Left edge (smallest x), top edge (smallest y), width along x and height along y of the window (m).
     """
     full = full_window(camera, resolution)
     lower, size = full[:2], full[2:]

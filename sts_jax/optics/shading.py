@@ -110,22 +110,24 @@ def hidden_sky(
     """Compute the share of the sky that an object hides from points on the skin, which is the paint on the gel's face.
 
     Parts of the sky are weighted by the cosine of their angle to the vertical. The object is approximated by horizontal
-    slices at a few heights z, from its lowest to its highest point. The slice at z extends over all places where the
-    underside is below z, and fades out where the underside is between z and 2 z.
+    slices at a few heights z, from its lowest to its highest point. The slice at z covers a place completely if the
+    underside there is below z. If the underside is between z and 2 z, the slice covers a share of the place, which
+    decreases linearly from 1 to 0.
 
     The share that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`. Here d is
-    the horizontal distance from the point to the edge of the half-plane, negative if the half-plane is above the point.
-    A strip hides the difference of f between its two edges. The shares are computed on a grid of about 30 x 30 cells:
+    the horizontal distance from the point to the edge of the half-plane. It is negative if the half-plane extends over
+    the point. A strip is the difference of two half-planes, so it hides the difference of their shares. The shares are
+    computed on a grid of about 30 x 30 cells:
 
         hidden = max_z Y_z slice_z X_z^T
 
-    slice_z is the share of each cell that the slice covers. Element (i, j) of X_z is the share that a strip as wide as
-    column j of the grid hides from the centre of column i. Y_z is the matrix for rows. Quadratic splines interpolate
-    between the cells.
+    Y_z slice_z X_z^T is a product of matrices, and the maximum over the slices is taken in each cell. slice_z is the
+    share of each cell that the slice covers. Element (i, j) of X_z is the share that a strip as wide as column j of the
+    grid hides from the centre of column i. Y_z is the matrix for rows. Quadratic splines interpolate between the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns
-            over the pad, `inf` where there is no object.
+            over the pad, `inf` where there is no object. Row 0 has the smallest y, and column 0 has the smallest x.
         size: Width along x and height along y of the pad (m). The pad is centred on the sensor's z axis.
         top: Height of the object's highest point (m).
         x: x coordinate of each column of a grid of points on the skin (m).

@@ -237,21 +237,22 @@ def collide(
 ) -> Contacts:
     """Find the contacts of an object with a box whose top is centred at the origin.
 
-    A point can become a contact if its depth is less than 1 mm (`SKIN`) smaller than the largest depth. The first
+    A point can become a contact if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`). The first
     contact is the deepest point. The second is the deepest of the points that are more than 1 mm (`APART`) away from
-    the first one. The other contacts are the points that reach farthest in `num` - 2 evenly spaced directions. Deeper
-    points have an advantage in this choice. Distances and directions are measured in `plane`.
+    the first one. The other contacts belong to `num` - 2 evenly spaced directions. Each is the point with the largest
+    sum of its coordinate along the direction and 5 times (`STEEP`) its depth. Distances and directions are measured in
+    `plane`.
 
     Args:
         body: Convex parts of the object.
-        pose: Mesh frame in the frame of the box's top, (7,): position (m), quaternion.
-        half: Half the size of the box along x and y, (2,) (m). The box has its top at z = 0 and no bottom.
-        num: Number of contacts.
+        pose: Mesh frame in the frame of the box's top, (7,): position (m), quaternion (w, x, y, z).
+        half: Half the size of the box along x and y, (2,) (m). The box has its top at z = 0 and is infinitely deep.
+        num: Number of contacts, >= 2.
         plane: Indices of the two axes of the plane in which the contacts lie far apart, such as (0, 1) for x and y.
 
     Returns:
-        `num` contacts in the frame of the box's top. If the object has fewer contacts, the field `dist` of the
-            remaining entries is 1 m.
+        `num` contacts in the frame of the box's top. Their field `dist` is minus the depth. If the object has fewer
+            contacts, `dist` of the remaining entries is 1 m.
     """
     rotation, place = geometry.quat_to_matrix(pose[3:]), pose[:3, None]
     points = turned(rotation, jnp.reshape(body.vertices, (3, -1))) + place

@@ -96,7 +96,7 @@ def weight(
 
     Args:
         body: One body.
-        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion.
+        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion (w, x, y, z).
         fill: Share of the interior's volume that is filled, 0 to 1.
         shell_scale: Factor on the shell's mass.
         up: Unit vector in the mesh frame that pointed up when the contents settled.

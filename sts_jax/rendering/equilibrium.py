@@ -13,7 +13,7 @@ from sts_jax.rendering.tiles import lines, where_active
 
 
 class Resting(NamedTuple):
-    """An object in balance on the gel."""
+    """An object in balance on the gel: its vertices, its pose, the heights of its underside, and the pressure."""
 
     points: Float[Array, "v 3"]  # vertices in the sensor frame (m)
     pose: Float[Array, "7"]  # pose in balance, or a pose below the pad if an input is invalid

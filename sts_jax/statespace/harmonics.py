@@ -86,11 +86,11 @@ def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -
 
     Args:
         angle: Cosine and sine of the rotation angle of each object.
-        variance: Variances of the k coefficients, for c functions of each of n objects. The coefficients are assumed
-            to be independent.
+        variance: Variances of the k coefficients, for c functions of each of n objects. k is `number(degree)`, and the
+            order is that of `basis`. The coefficients are assumed to be independent.
 
     Returns:
-        Variances of the coefficients of the rotated functions.
+        Variances of the coefficients of the rotated functions. Covariances, which the rotation causes, are left out.
     """
     cosine, sine, partner = _about_vertical(angle, variance.shape[-1])
     return cosine**2 * variance + sine**2 * variance[..., partner]

@@ -66,9 +66,9 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
 
     Args:
         model: Configuration of the model.
-        targets: For `mvae` models: modalities to predict from each subset of the inputs. `all` means every modality.
-            `own` means only the modalities in the subset.
-        absent: For `mvae` models: names of modalities that no sample has as an input.
+        targets: Modalities to predict from each subset of the inputs. `all` means every modality. `own` means only the
+            modalities in the subset. Ignored for state-space models.
+        absent: Names of modalities that no sample has as an input. Ignored for state-space models.
 
     Returns:
         The learner.

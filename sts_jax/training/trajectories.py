@@ -24,7 +24,8 @@ def frame_arrays(
     Args:
         pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
         modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
-        preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
+        preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images. If the
+            first tactile image of a trajectory shows no contact, this sample does not have the input `tactile`.
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:

@@ -187,8 +187,9 @@ class Twin:
             The state after the command.
 
         Raises:
-            ValueError: The command is unknown, the scene cannot change, `release` comes without a held object, or the
-                object comes to rest in no simulated trajectory.
+            ValueError: The command is unknown, the scene cannot change (such as the constant images of a `Picture`),
+                or `release` comes without a held object. The object comes to rest in none of 32 successive simulated
+                trajectories.
         """
         with self._commands:
             if self._clock is not None:

@@ -49,7 +49,7 @@ class Imperfections:
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be a share from 0 to 1, got {getattr(self, name)}")
         if self.jpeg_quality not in range(1, 101):
-            raise ValueError(f"jpeg_quality must be in 1..100, got {self.jpeg_quality}")
+            raise ValueError(f"jpeg_quality must be a whole number from 1 to 100, got {self.jpeg_quality}")
 
 
 class Ends(NamedTuple):
