@@ -1,6 +1,6 @@
 """Metrics of the models that come with the library, on many objects that no model was trained on.
 
-    python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 2 GB of memory
+    python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 5 GB of memory
 
 The held-out objects of an experiment are few, so its table has wide intervals for the metrics of the outcome. This
 command draws new objects from the distribution of the experiment, and simulates and renders four trajectories of each.

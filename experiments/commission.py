@@ -227,7 +227,7 @@ def live(config: Config, sensor: hardware.STS, pinhole: hardware.Pinhole) -> har
         return fit(pictures, pinhole)
     except hardware.CalibrationError as error:
         raise hardware.CalibrationError(
-            f"{error} The pictures are kept in {folder}: delete those that are listed as bad (all if image 0 is bad), "
+            f"{error} The pictures are kept in {folder}: delete those that are listed as bad, "
             "and run the command again to take others in their place. To add pictures, give a larger --pictures than "
             f"{config.pictures}."
         ) from error

@@ -291,6 +291,20 @@ def test_pictures_without_or_with_a_moving_board_are_not_kept(tmp_path, pictures
     np.testing.assert_array_equal(read.found[0].pixels, taken.found[0].pixels)
 
 
+def test_a_deleted_picture_of_the_board_on_the_pad_is_taken_again_first(tmp_path, pictures, monkeypatch):
+    folder = held(tmp_path / "board", pictures, 3)
+    (folder / "000.png").unlink()
+    asked = []
+    monkeypatch.setattr(boards, "wait", lambda text, every: asked.append(text) or "")
+    sensor = Handheld([image for image in (pictures[0], pictures[3]) for _ in range(2)])
+    read = boards.Pictures.read(folder, hardware.Board(), (WIDTH, HEIGHT))
+    taken = boards.take(read, sensor, 4, every=None, say=asked.append)
+    assert asked[0].startswith("Lay the board on the pad")
+    assert asked[2].startswith("Hold the board above the pad")
+    assert taken.names == ("000.png", "001.png", "002.png", "003.png")
+    np.testing.assert_array_equal(taken.found[0].pixels, hardware.find_board(pictures[0], hardware.Board()).pixels)
+
+
 def test_covered_parts_are_named():
     corners = hardware.FoundCorners(np.arange(2), np.array([[1.0, 1.0], [WIDTH - 1.0, HEIGHT / 2]]))
     assert hardware.covered([corners], (WIDTH, HEIGHT)) == ("top left", "middle right")

@@ -1,5 +1,6 @@
 """Pictures of the calibration board: take them with a sensor, keep them in a folder, and calibrate the lens."""
 
+import bisect
 import dataclasses
 import io
 import time
@@ -15,6 +16,7 @@ from sts_jax.hardware.calibration import FEWEST_CORNERS, FEWEST_IMAGES
 from sts_jax.hardware.coverage import PARTS
 
 STILL = 1.0  # largest median movement of the corners between two frames of a board that is held still (pixels)
+_FIRST = "000.png"  # picture of the board on the pad
 _LAY = "Lay the board on the pad, print to the camera, edges on edges."
 _HOLD = "Hold the board above the pad, tilted by 20 to 40 degrees, each time at another place."
 
@@ -86,13 +88,15 @@ class Pictures:
         return pictures
 
     def with_one(self, name: str, found: hardware.FoundCorners) -> "Pictures":
-        """Return these pictures and one more.
+        """Return these pictures and one more, in the order of their names.
 
         Args:
             name: File name of the new picture.
             found: Corners of the board in the new picture.
         """
-        return dataclasses.replace(self, names=(*self.names, name), found=(*self.found, found))
+        place = bisect.bisect(self.names, name)
+        names, there = (*self.names[:place], name, *self.names[place:]), self.found
+        return dataclasses.replace(self, names=names, found=(*there[:place], found, *there[place:]))
 
     def describe(self) -> str:
         """A text with the parts of the image in which corners of the board were found, and those without."""
@@ -126,7 +130,7 @@ def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | N
     """Take pictures of the board until there are enough. Each picture is written to the folder at once.
 
     Args:
-        pictures: Pictures of an earlier run, which count too.
+        pictures: Pictures of an earlier run, which count too. If `000.png` was deleted, it is taken first.
         sensor: Connected sensor.
         number: Number of pictures in which the board must be found.
         every: Time to wait before each picture (s). None: wait for the Enter key.
@@ -141,18 +145,20 @@ def take(pictures: Pictures, sensor: hardware.STS, number: int, every: float | N
     """
     while len(pictures.names) < number:
         enough = len(pictures.names) >= FEWEST_IMAGES
-        if not pictures.names:
+        lay = _FIRST not in pictures.names
+        if lay:
             text = _LAY
         else:
             text = f"{_HOLD} {'Type `done` if there are enough pictures.' if enough and every is None else ''}".rstrip()
         typed = wait(text, every)
-        if typed == "done" and enough:
+        if typed == "done" and enough and not lay:
             break
         image, found, problem = _picture(sensor, pictures.board)
         if problem:
             say(f"  picture not kept: {problem}")
             continue
-        name = f"{1 + max((int(Path(n).stem) for n in pictures.names if Path(n).stem.isdecimal()), default=-1):03d}.png"
+        last = max((int(Path(name).stem) for name in pictures.names if Path(name).stem.isdecimal()), default=0)
+        name = _FIRST if lay else f"{last + 1:03d}.png"
         _write(pictures.folder / name, image)
         pictures = pictures.with_one(name, found)
         say(f"  {name}: {len(found.numbers)} corners, {len(pictures.names)} of {number}, {pictures.describe()}")
