@@ -65,7 +65,8 @@ class Background:
         with self._changed:
             if not self._changed.wait_for(lambda: self._fresh or self._error is not None, limit_s):
                 raise LightError(
-                    f"no pair was taken within {limit_s:g} s: raise timeout_ms, or call read() to see the reason."
+                    f"no pair was taken within {limit_s:g} s: raise the timeout_ms of async_read(), or call read() to "
+                    "see the reason."
                 )
             self._raise()
             self._fresh = False

@@ -45,8 +45,9 @@ class Camera:
     def connect(self, warmup_s: float = 1.0) -> "Camera":
         """Open the camera, and wait until its automatic exposure and white balance have settled.
 
-        The settings of a device are then locked if `CameraConfig.lock` is True. The call lasts at most `warmup_s` plus
-        four times `CameraConfig.timeout_s`. A video file starts at its first frame, without a wait.
+        If `CameraConfig.lock` is True, the automatic exposure, white balance and focus of a device are then turned off,
+        so that these settings keep their values. The call lasts at most `warmup_s` plus four times
+        `CameraConfig.timeout_s`. A video file starts at its first frame, without a wait.
 
         Args:
             warmup_s: Time for the automatic exposure and white balance to settle (s). If the settings of a device are
@@ -60,7 +61,7 @@ class Camera:
             ValueError: `warmup_s` is negative or not finite.
 
         Warns:
-            UserWarning: The source did not accept a setting, or its settings cannot be locked.
+            UserWarning: The source did not accept a setting, or is a stream although `CameraConfig.lock` is True.
         """
         if not 0 <= warmup_s < float("inf"):
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -186,7 +187,7 @@ class Camera:
             CameraTimeoutError: No such frame has arrived in time.
             CameraLostError: The camera was lost during the call, or was not found again in time.
             FrozenCameraError: The camera has sent the same image for longer than `CameraConfig.frozen_after_s`.
-            FrameSizeError: The camera sends frames of another size.
+            FrameSizeError: The size of the camera's frames has changed.
             EndOfVideoError: The video file has ended.
             CameraNotConnectedError: The camera is not connected, or was disconnected during the call.
             ValueError: `timeout_ms` is not positive.

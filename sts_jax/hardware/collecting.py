@@ -53,7 +53,7 @@ class PairReader(Protocol):
     """A sensor that returns pairs of images, such as `STS` or the digital twin's `VirtualSensor`."""
 
     def read(self) -> Pair:
-        """Return a new image of each stream. Both images arrive after the beginning of the call."""
+        """Return a new visual and a new tactile image. Both arrive after the beginning of the call."""
 
 
 @runtime_checkable
@@ -67,22 +67,25 @@ class Person(Protocol):
         """Show the current view. `collect` calls this method after each attempt to read a pair."""
 
     def action(self) -> Action | None:
-        """Return the next action of the person, or None if there is none. It refers to the view that was shown last."""
+        """Return the person's next action, or None if there is none.
+
+        The action refers to the view that `show` received last.
+        """
 
 
 class AutomaticPerson:
-    """A `Person` that confirms every trajectory automatically. Another program must move the objects."""
+    """A `Person` that confirms every recorded trajectory automatically. Another program must move the objects."""
 
     def __init__(self) -> None:
         """Begin in the stage `CLEAR`."""
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store the stage of the view for `action`."""
+        """Store `view.stage`, the current step of recording a trajectory, for `action`."""
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `Action.CONFIRM` if the last view was in the stage `Stage.REVIEW`, else None."""
+        """Return `Action.CONFIRM` if the last view asks to confirm or discard a recorded trajectory, else None."""
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 
 
@@ -102,7 +105,7 @@ def collect(
 
     A trajectory consists of two pairs of images: one of an object that a person holds on the pad, and one of the same
     object at rest after its release. The guide, a state machine that evaluates the images, chooses the instruction for
-    the person and decides when each pair is saved.
+    the person and decides when each pair is saved. At the end of each trajectory, the person confirms or discards it.
 
     Args:
         sensor: Connected sensor.

@@ -95,13 +95,13 @@ def users_of(device: Path) -> tuple[int, ...]:
 
 @contextlib.contextmanager
 def locked(config: CameraConfig) -> Iterator[None]:
-    """Lock a device or a stream while the context is active. Video files are not locked.
+    """Reserve a device or a stream for this context, so that no other `Camera` opens it. Files are not reserved.
 
     Args:
         config: Configuration of the camera.
 
     Raises:
-        CameraBusyError: Another process, or another part of this process, has locked the camera.
+        CameraBusyError: Another process, or another part of this process, has reserved the camera.
         CameraError: The lock file cannot be created.
     """
     with contextlib.ExitStack() as stack:

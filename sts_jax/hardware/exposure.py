@@ -29,7 +29,8 @@ class Exposed(NamedTuple):
 def brightness(image: UInt8[np.ndarray, "height width 3"]) -> float:
     """Return the brightness of an image, 0 to 255.
 
-    It is the 99th percentile over all pixels of the largest of the three colour values.
+    Each pixel counts with the largest of its red, green and blue values. The brightness is the 99th percentile of these
+    values.
 
     Args:
         image: RGB image.

@@ -32,7 +32,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 class Still(NamedTuple):
     """The description of a recorded image, without its pixels.
 
-    All times of a film are on the same clock, whose zero is arbitrary.
+    All images of a `Film` have times on the same clock, whose zero is arbitrary.
     """
 
     stream: Stream
@@ -53,7 +53,7 @@ class Film(abc.ABC):
         """Return the RGB pixels of an image. Reading in the order of time is fastest.
 
         Args:
-            index: Position of the image in `stills`.
+            index: Position of the image in `Film.stills`, the descriptions of all images.
         """
 
     @abc.abstractmethod
@@ -103,7 +103,8 @@ class RecordedFilm(Film):
             head = _files.read_json(path, _AGAIN)
         except (FileNotFoundError, NotADirectoryError):
             raise FileNotFoundError(
-                f"{self._folder} holds no recording ({HEAD} is missing): give the folder of one, or two video files."
+                f"{self._folder} holds no recording ({HEAD} is missing): give the folder of a recording, or two "
+                "video files."
             ) from None
         if not isinstance(head, dict) or head.get("format") != FORMAT:
             found = head.get("format") if isinstance(head, dict) else None
@@ -135,7 +136,7 @@ class RecordedFilm(Film):
         """Return the RGB pixels of an image.
 
         Args:
-            index: Position of the image in `stills`.
+            index: Position of the image in `Film.stills`, the descriptions of all images.
 
         Raises:
             DamagedFileError: The image is damaged.
@@ -198,8 +199,8 @@ def _still(values: dict[str, Any]) -> Still:
 class VideoFilm(Film):
     """The images of two video files, one for each stream. Frames with the same number have the same time.
 
-    A video file does not record when the lights were switched. In each `Still`, `until_s` and the times in `before` are
-    therefore NaN.
+    A video file does not record when the lights were switched. The times of the lights in each `Still` (`until_s`,
+    `before.sent_s` and `before.acknowledged_s`) are therefore NaN.
     """
 
     def __init__(self, visual: str | os.PathLike, tactile: str | os.PathLike, fps: float | None = None):
@@ -242,10 +243,10 @@ class VideoFilm(Film):
         )
 
     def image(self, index: int) -> Image:
-        """Return the RGB pixels of an image. Going back in time opens the video again.
+        """Return the RGB pixels of an image. Reading an earlier image opens the video file again, which is slow.
 
         Args:
-            index: Position of the image in `stills`.
+            index: Position of the image in `Film.stills`, the descriptions of all images.
 
         Raises:
             CameraOpenError: The video is truncated or damaged.

@@ -73,8 +73,8 @@ class Pace:
     """Measures the period of a camera's frames, and estimates how many frames were lost.
 
     After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the total.
-    If the next frames arrive early, the missing frames were only late, and `dropped` is reduced again. The numbers of
-    lost frames that `arrived` returned before this correction remain too large.
+    If the next frames arrive early, the missing frames were only late, and `dropped` is reduced again. In this
+    case, the number of lost frames that `arrived` returned earlier was too large.
     """
 
     def __init__(self, nominal: float | None):

@@ -44,7 +44,8 @@ class Pinhole(Protocol):
 class Lens:
     r"""A fisheye lens in the Kannala-Brandt model (OpenCV's `cv2.fisheye`), with the camera's pose in the sensor.
 
-    A point p of the sensor frame is at q = R p + t in the camera frame. R is the rotation matrix of the rotation vector
+    The sensor frame has its origin at the centre of the gel's outer face, and its z-axis points out of the sensor. A
+    point p of the sensor frame is at q = R p + t in the camera frame. R is the rotation matrix of the rotation vector
     `rotation`, and t is `translation`. The optical axis is the z-axis of the camera frame. Let a be the angle between q
     and the optical axis (rad). The point appears in the camera's image at the pixel
 
@@ -92,7 +93,8 @@ class Lens:
             raise ValueError(
                 f"rotation {self.rotation} and translation {self.translation} place the camera at "
                 f"{tuple(round(float(c), 4) for c in self.center)} m in the sensor frame, but the camera must lie "
-                "inside the sensor, where z is negative"
+                "inside the sensor, where z is negative. Check that rotation and translation convert from the sensor "
+                "frame to the camera frame."
             )
 
     @classmethod
@@ -113,9 +115,9 @@ class Lens:
             width: Width of the raw image (pixels).
             height: Height of the raw image (pixels).
             field_of_view: Field of view across the image's diagonal, in (0, 2 pi] (rad). The default is 160 degrees,
-                as in the sensor of the original paper.
+                as in the sensor of the paper (Rezaei-Shoshtari et al. 2021).
             distance: Distance from the camera to the gel's outer face (m). The default is the value in the code of the
-                original paper.
+                paper (Rezaei-Shoshtari et al. 2021).
 
         Raises:
             ValueError: An argument is out of range.
@@ -149,9 +151,9 @@ class Lens:
     def largest_angle(self) -> float:
         """Largest angle from the optical axis at which the lens model is valid (rad), at most pi.
 
-        Up to this angle, a larger angle is projected to a pixel farther from the pixel of the optical axis. Beyond it,
-        the polynomial of the model decreases, and two different angles would be projected to the same pixel. No real
-        lens behaves like this.
+        Up to this angle, the distance of a point's pixel from the pixel of the optical axis increases with the point's
+        angle. Beyond it, the polynomial of the model decreases, and two different angles would be projected to the same
+        pixel. No real lens behaves like this.
         """
         return _largest_angle(self.k)
 
@@ -212,8 +214,8 @@ def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         pixels: Raw pixel coordinates (column, row), shape (..., 2).
 
     Returns:
-        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels that correspond to no angle up to
-        `Lens.largest_angle`.
+        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels that no ray within the angle
+        `Lens.largest_angle` of the optical axis reaches.
     """
     pixels = np.asarray(pixels, np.float64)
     x, y = (pixels[..., 0] - lens.cx) / lens.fx, (pixels[..., 1] - lens.cy) / lens.fy
@@ -309,8 +311,8 @@ def distortion(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDA
     Returns:
         Rectified pixel coordinates (column, row) of each raw pixel, shape (lens.height, lens.width, 2). They lie
         outside of the rectified image for raw pixels outside of the view. They are NaN for a raw pixel whose ray does
-        not meet the plane of the gel's outer face, and for a raw pixel that corresponds to no angle up to
-        `Lens.largest_angle`.
+        not meet the plane of the gel's outer face, and for a raw pixel that no ray within the angle
+        `Lens.largest_angle` of the optical axis reaches.
 
     Raises:
         ValueError: `resolution` or `pinhole` is out of range.
@@ -337,7 +339,7 @@ def distorted(
         pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
         image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. It must show
             the whole view, as an image of `sts_jax.sense` does. If the aspect ratio of the image differs from that of
-            the view, the image must show the view cropped around its centre.
+            the view, it must instead show the view cropped around its centre.
         outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
         samples: Number of samples per raw pixel in each direction. The raw pixel is the mean of its samples. Fewer
             samples are faster. None: as many samples as needed to avoid aliasing.
