@@ -108,8 +108,8 @@ class Connection:
                         self.answered_s = time.monotonic()
                         return reply, sent_s, self.answered_s
             raise ports.LedTimeoutError(
-                f"the LED controller on {self.name} gave no valid answer to {line.decode().strip()} within "
-                f"{timeout_s:g} s. {self._description()}"
+                f"the LED controller on {self.name} gave no valid answer to the request "
+                f"{line.decode().strip()!r} within {timeout_s:g} s. {self._description()}"
             )
 
     def close(self) -> None:
@@ -185,8 +185,8 @@ class Connection:
         if reply.code == protocol.Code.VERSION:
             return self._wrong_version(reply.text)
         return ports.LedError(
-            f"the LED controller on {self.name} refused {line.decode().strip()} with error {int(reply.code)} "
-            f"({reply.text}). Flash the firmware of this version of sts_jax."
+            f"the LED controller on {self.name} refused the request {line.decode().strip()!r} with error "
+            f"{int(reply.code)} ({reply.text}). Flash the firmware of this version of sts_jax."
         )
 
     def _wrong_version(self, found: str) -> ports.WrongVersionError:

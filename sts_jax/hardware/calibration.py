@@ -246,9 +246,9 @@ def calibrate(
         The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or the board on the pad is not found, or is not parallel to the
-            image. Or the board has nearly the same tilt in all images. Or the reprojection error of an image is larger
-            than `largest_error`.
+        CalibrationError: Too few images show the board. Or the board on the pad is not found, or its plane or its
+            edges are rotated by more than 30 degrees against those of the image. Or the board has nearly the same tilt
+            in all images. Or the reprojection error of an image is larger than `largest_error`.
         ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
     """
     height, width = _common_size(images)
@@ -277,9 +277,9 @@ def fit_lens(
         The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or the board on the pad is not found, or is not parallel to the
-            image. Or the board has nearly the same tilt in all images. Or the reprojection error of an image is larger
-            than `largest_error`.
+        CalibrationError: Too few images show the board. Or the board on the pad is not found, or its plane or its
+            edges are rotated by more than 30 degrees against those of the image. Or the board has nearly the same tilt
+            in all images. Or the reprojection error of an image is larger than `largest_error`.
         ValueError: `on_pad` is not the index of an image.
     """
     width, height = size

@@ -60,7 +60,7 @@ class Camera:
             ValueError: `warmup_s` is negative or not finite.
 
         Warns:
-            UserWarning: The source did not accept a setting, or its settings cannot be locked.
+            UserWarning: The source did not accept a setting, or is a stream although `CameraConfig.lock` is True.
         """
         if not 0 <= warmup_s < float("inf"):
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -189,7 +189,7 @@ class Camera:
             CameraTimeoutError: No such frame has arrived in time.
             CameraLostError: The camera was lost during the call, or was not found again in time.
             FrozenCameraError: The camera has sent the same image for longer than `CameraConfig.frozen_after_s`.
-            FrameSizeError: The camera sends frames of another size.
+            FrameSizeError: The size of the camera's frames has changed.
             EndOfVideoError: The video file has ended.
             CameraNotConnectedError: The camera is not connected, or was disconnected during the call.
             ValueError: `timeout_ms` is not positive.

@@ -56,7 +56,7 @@ class PairReader(Protocol):
     """A sensor that returns pairs of images, such as `STS` or the digital twin's `VirtualSensor`."""
 
     def read(self) -> Pair:
-        """Return a new image of each stream. Both images arrive after the beginning of the call."""
+        """Return a new visual and a new tactile image. Both arrive after the beginning of the call."""
 
 
 @runtime_checkable
@@ -77,7 +77,7 @@ class Person(Protocol):
 
 
 class AutomaticPerson:
-    """A `Person` that confirms every trajectory automatically. Another program must move the objects."""
+    """A `Person` that confirms every recorded trajectory automatically. Another program must move the objects."""
 
     def __init__(self) -> None:
         """Begin in the stage `CLEAR`."""
@@ -88,7 +88,7 @@ class AutomaticPerson:
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `Action.CONFIRM` if the last view was in the stage `Stage.REVIEW`, else None."""
+        """Return `Action.CONFIRM` if the last view asks to confirm or discard a recorded trajectory, else None."""
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 
 
@@ -108,7 +108,7 @@ def collect(
 
     A trajectory consists of two pairs of images: one of an object that a person holds on the pad, and one of the same
     object at rest after its release. The guide, a state machine that evaluates the images, chooses the instruction for
-    the person and decides when each pair is saved.
+    the person and decides when each pair is saved. At the end of each trajectory, the person confirms or discards it.
 
     Args:
         sensor: Connected sensor.

@@ -101,7 +101,7 @@ def locked(config: CameraConfig) -> Iterator[None]:
         config: Configuration of the camera.
 
     Raises:
-        CameraBusyError: Another process, or another part of this process, has locked the camera.
+        CameraBusyError: Another process, or another part of this process, has reserved the camera.
         CameraError: The lock file cannot be created.
     """
     with contextlib.ExitStack() as stack:

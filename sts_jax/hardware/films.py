@@ -53,7 +53,7 @@ class Film(abc.ABC):
         """Return the RGB pixels of an image. Reading in the order of time is fastest.
 
         Args:
-            index: Position of the image in `stills`.
+            index: Position of the image in `Film.stills`, the descriptions of all images.
         """
 
     @abc.abstractmethod
@@ -135,7 +135,7 @@ class RecordedFilm(Film):
         """Return the RGB pixels of an image.
 
         Args:
-            index: Position of the image in `stills`.
+            index: Position of the image in `Film.stills`, the descriptions of all images.
 
         Raises:
             DamagedFileError: The image is damaged.
@@ -198,8 +198,8 @@ def _still(values: dict[str, Any]) -> Still:
 class VideoFilm(Film):
     """The images of two video files, one for each stream. Frames with the same number have the same time.
 
-    A video file does not record when the lights were switched. In each `Still`, `until_s` and the times in `before` are
-    therefore NaN.
+    A video file does not record when the lights were switched. The times of the lights in each `Still` (`until_s`,
+    `before.sent_s` and `before.acknowledged_s`) are therefore NaN.
     """
 
     def __init__(self, visual: str | os.PathLike, tactile: str | os.PathLike, fps: float | None = None):
@@ -247,7 +247,7 @@ class VideoFilm(Film):
         Reading in the order of time is fastest. To read an earlier image, the video is opened again.
 
         Args:
-            index: Position of the image in `stills`.
+            index: Position of the image in `Film.stills`, the descriptions of all images.
 
         Raises:
             CameraOpenError: The video is truncated or damaged.

@@ -101,9 +101,9 @@ class Grabber:
         return not self._thread.is_alive()
 
     def lock_settings(self, timeout_s: float) -> list[str]:
-        """Lock the settings of the device at their current values, and discard all earlier frames.
+        """Turn the automatic exposure, white balance and focus off, so that these settings keep their current values.
 
-        The thread locks the settings when the next frame has arrived.
+        The thread does this when the next frame has arrived. All frames in the queue are then discarded.
 
         Args:
             timeout_s: Longest wait for this frame (s).

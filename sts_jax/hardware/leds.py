@@ -200,7 +200,7 @@ class Leds:
         lit = self._state(functools.partial(protocol.Set, levels=checked))
         if lit.levels != checked:
             raise ports.LedError(
-                f"the LED controller on {self._port} applied {lit.levels} instead of {checked}. "
+                f"the LED controller on {self._port} applied the levels {lit.levels} instead of {checked}. "
                 "Flash the firmware of this version of sts_jax."
             )
         return lit

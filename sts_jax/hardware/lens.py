@@ -116,9 +116,9 @@ class Lens:
             width: Width of the raw image (pixels).
             height: Height of the raw image (pixels).
             field_of_view: Field of view across the image's diagonal, in (0, 2 pi] (rad). The default is 160 degrees,
-                as in the sensor of the original paper.
+                as in the sensor of the paper (Rezaei-Shoshtari et al. 2021).
             distance: Distance from the camera to the gel's outer face (m). The default is the value in the code of the
-                original paper.
+                paper (Rezaei-Shoshtari et al. 2021).
 
         Raises:
             ValueError: An argument is out of range.
