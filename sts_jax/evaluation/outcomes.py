@@ -16,7 +16,7 @@ def named(outcome: int, outcomes: Sequence[enum.IntEnum] = OUTCOMES) -> str:
     """Return the name of an outcome, such as `fell_off`.
 
     Args:
-        outcome: Number of the outcome.
+        outcome: Value of the outcome, which is a member of an `IntEnum`.
         outcomes: The outcomes of the scenario, `scenario.outcomes` (default: all members of `physics.Outcome`).
 
     Raises:
@@ -46,7 +46,7 @@ def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
     outcomes, so no probability is 0.
 
     Args:
-        outcome: Number of the outcome of each of k samples for n items, int `(k, n)`.
+        outcome: Outcomes of k samples for each of n items, int `(k, n)`. Each is the value of a member of `outcomes`.
         outcomes: The c outcomes of the scenario, `scenario.outcomes`.
 
     Returns:
@@ -62,7 +62,7 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
     One additional trajectory is spread evenly over all outcomes, so no frequency is 0.
 
     Args:
-        outcome: Number of the outcome of each trajectory, int `(n,)`.
+        outcome: Outcome of each trajectory, the value of a member of `outcomes`, int `(n,)`.
         outcomes: The c outcomes of the scenario, `scenario.outcomes`.
 
     Returns:

@@ -80,7 +80,9 @@ class Perturbed(Scenario):
         check_range("duration", self.duration, positive=False)
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start. The object stands with its +z up, and the condition is a random jerk.
+        """Draw one start. The object stands with its +z up.
+
+        The condition is a random acceleration of the pad along x and y (m/s^2), and its duration (s).
 
         `Scenario.start` describes the arguments.
         """

@@ -135,8 +135,8 @@ def state_arrays(
         preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
         empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
             The size is `model.input_size`.
-        views: Visual images of objects in initial poses that were not simulated, from `dataset.Dataset.views`. They are
-            used only if `visual` is an input of the model.
+        views: Rendered visual images of objects in initial poses, without a simulation of the motion that follows, from
+            `dataset.Dataset.views`. They are used only if `visual` is an input of the model.
         falls: First and last poses of further trajectories without images, from `dataset.Dataset.ends`.
 
     Returns:
