@@ -81,8 +81,12 @@ def main(args: Args) -> str:
     """Simulate the trajectories, and return the table of the metrics.
 
     Raises:
-        ValueError: The work directory has the trajectories of other options.
+        ValueError: There are fewer than 5 objects, or the work directory has the trajectories of other options.
     """
+    if args.objects < 5:
+        raise ValueError(
+            f"--objects must be at least 5, so that a fifth of them can be for the baselines, got {args.objects}"
+        )
     sts.enable_compilation_cache()
     folder = args.workdir or Path("runs") / f"shipped-{args.model}"
     made, scenario = collection(args), EXPERIMENTS[args.model].COLLECTION.scenario

@@ -20,6 +20,12 @@ def test_no_object_is_shared_with_the_training_of_the_model():
     assert not any(np.array_equal(one.vertices, two.vertices) for one in new for two in old)
 
 
+def test_too_few_objects_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="--objects must be at least 5, .* got 4"):
+        shipped.main(shipped.Args("perturbed", objects=4, workdir=tmp_path / "work"))
+    assert not (tmp_path / "work").exists()
+
+
 @pytest.mark.slow
 def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     args = shipped.Args("released", objects=10, workdir=tmp_path / "work")

@@ -141,12 +141,8 @@ def observe(
     Returns:
         The time and the block means of both images.
     """
-    return Observation(time_s, thumbnail(visual), thumbnail(tactile), _imprint(tactile))
-
-
-def _imprint(tactile: UInt8[np.ndarray, "height width 3"]) -> SmallBlocks:
-    """The means of the small blocks of a tactile image."""
-    return cv2.resize(tactile, _SMALL_BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
+    imprint = cv2.resize(tactile, _SMALL_BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return Observation(time_s, thumbnail(visual), thumbnail(tactile), imprint)
 
 
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:

@@ -23,10 +23,9 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     """The heading of each object: the direction of one of its mesh axes, projected onto the plane of the pad.
 
     A mesh axis counts as level if the projection of its unit vector is longer than 0.85. The axis is x if x is level,
-    else z if z is level, else the axis with the longest projection. Small rotations do not change this choice for an
-    object that rests on one of its faces, because the projection of its level axis has a length of 1. If the
-    projection of the chosen axis is almost 0, the heading is the x axis of the sensor frame. No gradient flows through
-    the heading.
+    else z if z is level, else the axis with the longest projection. The projection of an axis that is parallel to the
+    pad has a length of 1, so this axis still counts as level after a small rotation. If the projection of the chosen
+    axis is almost 0, the heading is the x axis of the sensor frame. No gradient flows through the heading.
 
     Args:
         code: Pose codes (position and rotation matrix). The matrix may be inexact, for example the mean of several
