@@ -96,6 +96,7 @@ def test_the_true_shape_and_mass_are_those_of_the_body_with_its_hidden_values(fo
     assert {leaf.dtype for leaf in (pairs.support, pairs.mass, pairs.com, pairs.pose)} == {np.dtype(np.float32)}
 
 
+@pytest.mark.slow
 def test_views_are_drawn_by_sense_at_starts_of_no_trajectory(sparse):
     data = dataset.load(sparse)
     sense = jax.jit(lambda body, pose: sts.sense(sts.Sensor(), body, pose, jnp.zeros(6)).visual)

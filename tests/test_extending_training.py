@@ -74,6 +74,7 @@ def test_gradient_descent_on_half_the_square_shrinks_the_parameters_geometricall
         np.testing.assert_allclose(record["beta"], np.mean([min(s / 3, 1) for s in (step - 2, step - 1)]), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_term_is_added_to_the_usual_loss(tmp_path):
     training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "usual")
     training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / "none", loss=with_penalty(MODEL, 0.0))

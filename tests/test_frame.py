@@ -211,6 +211,7 @@ def test_a_crop_agrees_with_the_whole_image():
     assert seen.mean() > 0.8
 
 
+@pytest.mark.slow
 def test_vmap_agrees_with_single_frames():
     poses = jnp.stack([at(0.01 * k, -0.005 * k, 0.029) for k in range(3)])
     wrenches = jnp.stack([weight(0.3 * k, 0.01 * k, -0.005 * k) for k in range(3)])
@@ -299,6 +300,7 @@ def test_moving_edges_derivative_equals_finite_differences_at_upright_walls():
         assert float(lengths[0] / lengths[1]) == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_bodies_with_other_hulls_and_contents_share_a_compilation():
     body, other = (sts.objects.make(jax.random.key(0), category) for category in ("bottle", "fork"))
     other = dataclasses.replace(other, hulls=other.hulls[:, :32], interior=other.interior[:8])

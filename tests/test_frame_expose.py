@@ -57,6 +57,7 @@ def test_light_0_and_1_return_the_streams_exactly(shape, exposure):
         assert np.array_equal(call(sensor, frame, 1.0), frame.tactile)
 
 
+@pytest.mark.slow
 def test_half_light_of_a_pressed_object_lies_between_the_streams():
     body = objects.make(jax.random.key(0), "mouse")
     low = float(jnp.min(body.vertices[:, 2]))

@@ -342,6 +342,7 @@ def test_object_is_held_moves_and_lies_still_as_simulated(held):
     assert all(truth.frame == 59 for truth in frames if truth.phase == "still")
 
 
+@pytest.mark.slow
 def test_ends_are_the_frame_of_sense(held):
     body, scene = held
     blender = twin.Blender(PERFECT)

@@ -146,6 +146,7 @@ def test_the_loss_equals_a_loop_over_subsets_and_samples(asked):
     np.testing.assert_allclose(terms.kl, kl / counted, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_values_of_a_masked_modality_change_no_bit():
     present = {
         "visual": jnp.array([1, 1, 0, 1, 0, 1], bool),

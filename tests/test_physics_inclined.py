@@ -67,6 +67,7 @@ def test_a_block_above_the_friction_angle_slides_by_coulombs_law(friction: float
     assert np.all(across < 0.01 * speed[:, 4])
 
 
+@pytest.mark.slow
 def test_a_block_slides_as_in_c_mujoco() -> None:
     friction, frames = 0.4, 4
     found = slide(friction, SCENARIO.contact, frames)

@@ -85,6 +85,7 @@ def test_gravity_contains_the_whole_impulse_and_returns_to_normal() -> None:
     np.testing.assert_array_equal(gravity[32 + 76 :, :2], 0)
 
 
+@pytest.mark.slow
 def test_a_jerk_in_gravity_equals_a_moving_pad(
     bottles: list[objects.Body], shaken: physics.Trajectory, engine: physics.Engine
 ) -> None:

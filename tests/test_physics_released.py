@@ -158,6 +158,7 @@ def test_the_balance_of_the_centre_of_mass_decides_on_which_side_an_object_falls
     assert np.mean(agree) > 0.85
 
 
+@pytest.mark.slow
 def test_a_block_beyond_its_balance_topples_and_one_short_of_it_returns() -> None:
     shares = []
     for beyond in (-np.radians(6), np.radians(6)):

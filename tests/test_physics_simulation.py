@@ -210,6 +210,7 @@ def released(height: float) -> roll.State:
 CALM = jnp.tile(jnp.array([0, 0, -G]), (3, 100, 1))
 
 
+@pytest.mark.slow
 def test_contact_stiffness_does_not_depend_on_mass() -> None:
     light, heavy = (0.01 - float(ROLL(*block(mass), released(0.01), CALM)[0].qpos[2]) for mass in (0.01, 1.0))
     assert 0 < light < 1e-4

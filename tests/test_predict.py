@@ -457,6 +457,7 @@ def test_a_state_space_model_works_in_jit_vmap_and_grad(state_predictor):
     assert np.abs(slope).max() > 0
 
 
+@pytest.mark.slow
 def test_a_true_state_determines_the_belief_and_a_wrong_one_is_refused(state_predictor, predictor):
     given, code = measurement(2), np.asarray(random_states(np.random.default_rng(0), 2))
     out = state_predictor(visual=given["visual"], condition=CONDITION, state=code)
@@ -471,6 +472,7 @@ def test_a_true_state_determines_the_belief_and_a_wrong_one_is_refused(state_pre
         predictor(pose=given["pose"], state=code)
 
 
+@pytest.mark.slow
 def test_the_prior_of_a_state_space_model_is_standard_normal(state_predictor):
     out = state_predictor.prior((2,), condition=CONDITION)
     np.testing.assert_array_equal(out.mean, 0)

@@ -146,6 +146,7 @@ def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
             np.testing.assert_allclose(a[i], b[i], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_calibration_is_at_the_minimum_and_other_subsets_stay(folder):
     given = arrays(present={"tactile": np.zeros(NUMBER, bool)})
     found = training.calibrate(folder, given).calibration

@@ -325,6 +325,7 @@ def test_belief_from_several_inputs_is_the_product_of_their_beliefs(sample, batc
     same(belief(), jax.tree.map(jnp.zeros_like, fused))
 
 
+@pytest.mark.slow
 def test_items_that_do_not_count_may_be_nan(sample, loss, batch):
     present = {name: x.at[i].set(False) for i, (name, x) in enumerate(batch.present.items())}
     masked = batch._replace(present=present)
@@ -364,6 +365,7 @@ def test_target_changes_only_its_parts_of_the_loss(loss, batch, name, concerned)
     assert {part for part in before if before[part] != after[part]} == concerned
 
 
+@pytest.mark.slow
 def test_views_and_falls_change_only_their_parts_of_the_loss(loss, batch, complete):
     (_, without), _ = loss(batch)
     (_, before), gradient = loss(complete)

@@ -278,6 +278,7 @@ def test_views_and_falls_that_do_not_fit_are_refused(tmp_path, name, key, change
         training.train(STATE_CONFIG, STATE, wrong, workdir=tmp_path)
 
 
+@pytest.mark.slow
 def test_a_batch_has_as_many_views_and_falls_as_configured(tmp_path, monkeypatch):
     asked = []
     take = training.Arrays.take
