@@ -90,7 +90,7 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
 
 
 def of_state(belief: Gaussian) -> Gaussian:
-    """The belief about the state code alone, `(n, code)`, from a belief about both codes, `(n, code + look)`."""
+    """Remove the appearance code from a belief, `(n, code + look)`. The result has only the state code, `(n, code)`."""
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
 
@@ -150,7 +150,7 @@ def excess(
 
 
 def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
-    """Reduce images to `size` x `size` pixels by means over blocks. `size` must divide their height and width."""
+    """Reduce images to `size` x `size` pixels by averaging over blocks. `size` must divide their height and width."""
     *lead, height, width, channels = images.shape
     blocks = images.reshape(*lead, size, height // size, size, width // size, channels)
     return jnp.mean(blocks, axis=(-4, -2))
@@ -217,8 +217,8 @@ def loss(
     Returns:
         The loss, and its terms by name without their weights. A term that depends on inputs is a mean over the items
         that have these inputs. The term `state` is a squared error of state codes, and all other terms are in nats.
-        `state`, `doubt` and `first` are summed over the images `visual` and `tactile` that are inputs. `covered` is
-        summed over the first and the last frame.
+        The terms `state`, `doubt` and `first` are sums over the image inputs of the model. `covered` is a sum over the
+        first and the last frame.
     """
     model = nnx.merge(graphdef, params)
     config = model.config

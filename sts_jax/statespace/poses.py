@@ -22,10 +22,10 @@ LEVEL = 0.85  # an axis is level if the length of its projection onto the pad is
 def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
     """The heading of each object: the direction of one of its mesh axes, projected onto the plane of the pad.
 
-    A mesh axis counts as level if the projection of its unit vector is longer than 0.85. The axis is x if x is level,
-    else z if z is level, else the axis with the longest projection. The projection of an axis that is parallel to the
-    pad has a length of 1, so this axis still counts as level after a small rotation. If the projection of the chosen
-    axis is almost 0, the heading is the x axis of the sensor frame. No gradient flows through the heading.
+    A mesh axis counts as level if the projection of its unit vector is longer than 0.85. The chosen axis is x if x is
+    level, else z if z is level, else the axis with the longest projection. The projection of an axis that is parallel
+    to the pad has a length of 1, so this axis still counts as level after a small rotation. If the projection of the
+    chosen axis is almost 0, the heading is the x axis of the sensor frame. No gradient flows through the heading.
 
     Args:
         code: Pose codes (position and rotation matrix). The matrix may be inexact, for example the mean of several
@@ -47,8 +47,9 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
 def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
     """The certainty of each object's rotation: 0 if the rotation is unknown, 0.8 to 1 if the rotation is known exactly.
 
-    The columns of a rotation matrix are the mesh axes. The mean of uncertain rotation matrices has shorter columns. The
-    certainty is the length of the longest projection of a column onto the plane of the pad.
+    The columns of a rotation matrix are the mesh axes, which have a length of 1. If the rotation is uncertain, the
+    columns of the mean matrix are shorter. The certainty is the length of the longest projection of a column onto the
+    plane of the pad.
 
     Args:
         code: Means of pose codes (position and rotation matrix) under the density of an uncertain pose.
@@ -120,7 +121,7 @@ def turn_variance(angle: Float[Array, "*#n 2"], variance: Float[Array, "*#n 12"]
 
     Args:
         angle: Cosine and sine of the rotation angle.
-        variance: Variances of the numbers of the pose codes, which are assumed to be independent.
+        variance: Variances of the numbers in the pose codes. The numbers are assumed to be independent.
 
     Returns:
         Variances of the numbers after the rotation.

@@ -14,10 +14,7 @@ from sts_jax.statespace.objective import reduced
 
 
 class Samples(NamedTuple):
-    """Samples of the last frame: k final poses for each of n items, and images of the first poses.
-
-    `drawn` is the number of poses with images.
-    """
+    """Samples of the last frame: k final poses for each of n items, and images of the first `drawn` of these poses."""
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome
@@ -45,7 +42,7 @@ def sample(
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
         key: Random key for the samples.
-        inputs: Inputs of n items by name, at least one: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1]
+        inputs: One or more inputs of n items, by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1]
             with the side `Config.input_size`, pose codes `pose` `(n, 12)` and true state codes `state` `(n, code)`.
             Inputs other than `state` must be in the model's `Config.inputs`.
         present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
@@ -56,8 +53,8 @@ def sample(
         correction: Calibration of the density of the final pose, from `fit_calibration`. None leaves the density
             unchanged.
         num: Number of final poses for each item.
-        drawn: Number of final poses, from 1 to `num`, for which the visual and the tactile image are rendered. A random
-            appearance code is drawn for each of these poses.
+        drawn: Number of final poses with rendered visual and tactile images, from 1 to `num`. A random appearance code
+            is drawn for each of these poses.
 
     Returns:
         The posterior in the first frame, the probabilities of the outcomes, the sampled final poses and images, and the

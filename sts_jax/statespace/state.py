@@ -39,7 +39,7 @@ class State(NamedTuple):
     """The parts of state codes, which describe the pose, the shape and the mass of n objects.
 
     The shape is given by the support function `h(d)` of the convex hull: the maximum of `x . d` over the points x of
-    the hull, for a unit vector d. The same class holds the variances of these parts.
+    the hull, for a unit vector d. A `State` can also hold the variances of all parts.
     """
 
     pose: Float[Array, "n 12"]  # pose code
@@ -115,7 +115,7 @@ def turn_variance(angle: Float[Array, "n 2"], variance: State) -> State:
 
     Args:
         angle: Cosine and sine of the rotation angle of each item.
-        variance: Variances of the numbers of the state codes, which are assumed to be independent.
+        variance: Variances of the numbers in the state codes. The numbers are assumed to be independent.
 
     Returns:
         Variances of the numbers after the rotation.
@@ -147,8 +147,9 @@ def heading(state: State) -> Float[Array, "n 2"]:
 
     If `poses.certainty` is above 0.5, the rotation is known well enough, and the heading is the direction of one of the
     mesh axes, see `poses.heading`. Otherwise, the heading is the long axis of the object's shape in the plane of the
-    pad, with an arbitrary sign. This shape is `State.shown`, the support function in the sensor frame, which an image
-    determines even if the rotation of the mesh is uncertain. No gradient flows through the heading.
+    pad, with an arbitrary sign. The long axis is computed from `State.shown`, the support function in the sensor frame.
+    An image determines this function even if the rotation of the mesh is uncertain. No gradient flows through the
+    heading.
 
     Args:
         state: Parts of state codes. For uncertain states, their means.

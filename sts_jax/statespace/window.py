@@ -107,7 +107,7 @@ def sample(images: Float[Array, "n side side c"], places: Float[Array, "n m 2"])
         places: Column and row of each place (pixels). Whole numbers are pixel centres.
 
     Returns:
-        Values at the places, which are 0 outside the image.
+        Values at the places. Values outside the image are 0.
     """
     framed = jnp.pad(images, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return bilinear_batch(framed, places[..., 0] + 1, places[..., 1] + 1)

@@ -52,7 +52,7 @@ class Gel:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """Equilibrium of a rigid object on the gel: its motion from the given pose, and the pressure on the gel."""
+    """Equilibrium of a rigid object that is placed on the gel in some pose: motion from this pose, and pressure."""
 
     # Motion along -z (m), which follows the rotation.
     sink: Float[Array, "*n"]
@@ -96,7 +96,7 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 
 
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
-    """Find the depth and the two tilts of an object at which the gel balances Fz, Mx and My of the wrench.
+    """Find the equilibrium of an object: the depth and tilts at which the gel balances Fz, Mx and My of the wrench.
 
     The gel is a grid of cells, and each cell is an independent spring. An object with heights h over the cells at x and
     y sinks by d, and turns by the small angles a about x and b about y. With the stiffness k of the gel, its heights h'

@@ -27,8 +27,8 @@ Scalar = float | Array
 class Lights:
     """Lights inside the sensor, modelled as directional lights. There may be any number m of lights.
 
-    The defaults are those of the code of the See-Through-your-Skin paper: four lights in the gel's plane, one from each
-    edge of the image.
+    The defaults are taken from the code of the See-Through-your-Skin paper: four lights in the gel's plane, one from
+    each edge of the image.
     """
 
     # Directions from the skin towards the lights, sensor frame. Any length > 0. Defaults: left, right, top and bottom
@@ -74,7 +74,7 @@ class Leds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Skin:
-    """Constants for the shape of the skin around an imprint, and for shadows that pressed parts of the skin cast."""
+    """Constants for the shape of the skin around an imprint, and for the shadows of the skin on itself."""
 
     # Standard deviation of the Gaussian that smooths the imprint (m). The default is 0, as in the paper.
     coupling: Scalar = dataclasses.field(default=0.0, metadata=NOT_NEGATIVE)

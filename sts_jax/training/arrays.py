@@ -59,7 +59,7 @@ class Arrays:
         Args:
             index: Indices of the samples.
             further: Indices into the first axis of the fields `views` and `falls`, given as `views=` and `falls=`.
-                The batch does not contain a field without indices.
+                A field for which no indices are given is left out of the batch.
 
         Returns:
             The selected arrays by name of the field, and the whole field `empty`.

@@ -161,7 +161,8 @@ def read(path: Path, like: State) -> State:
                 raise ValueError(
                     f"{path} has no state of this optimiser {reason}: the training used another optimiser, or the "
                     "model was written by Predictor.save, which leaves out the optimiser. Give the optimiser that the "
-                    "training began with, or train in another folder. Predictor.load reads this model either way."
+                    "training began with, or train in another folder. Predictor.load reads this model without an "
+                    "optimiser."
                 ) from None
             raise ValueError(
                 f"{path} cannot be read {reason}: the checkpoint was damaged before its checksums were taken, or it "

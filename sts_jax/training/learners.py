@@ -60,9 +60,10 @@ class Learner(NamedTuple):
 
 
 def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
-    """Make the learner of a model, the functions that train it: initialisation, loss and check of the training set.
+    """Make the learner of a model.
 
-    The loss is `mvae.loss` or `statespace.loss`, depending on the type of the model.
+    A learner has the functions that train a model: initialisation, loss and check of the training set. The loss is
+    `mvae.loss` or `statespace.loss`, depending on the type of the model.
 
     Args:
         model: Configuration of the model.
@@ -105,8 +106,8 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
             f"present has masks for {sorted(arrays.present)}, target_present has masks for "
-            f"{sorted(arrays.target_present)}, but a state-space model can have masks only for its inputs "
-            f"{list(model.inputs)}, in `present`: remove all other masks"
+            f"{sorted(arrays.target_present)}, but a state-space model allows masks only in `present`, for its "
+            f"inputs {list(model.inputs)}: remove all other masks"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES
@@ -163,15 +164,15 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
     for name in absent:
         if np.any(arrays.present.get(name, False)):
             raise ValueError(
-                f"absent names {name!r}, but present[{name!r}] marks {int(np.sum(arrays.present[name]))} samples that "
-                "have it: remove the name from `absent`"
+                f"absent contains {name!r}, but present[{name!r}] marks {int(np.sum(arrays.present[name]))} samples "
+                "that have it: remove the name from `absent`"
             )
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())
         if not needed <= set(values) <= set(model.names):
             raise ValueError(
                 f"{kind} has the modalities {sorted(values)}, but the model needs {sorted(needed)} and allows only "
-                f"{sorted(model.names)}: add or remove arrays, or name missing inputs in `absent`"
+                f"{sorted(model.names)}: add or remove arrays, or add the names of missing inputs to `absent`"
             )
     for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
         if not set(masks) <= set(model.names):

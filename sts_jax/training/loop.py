@@ -129,7 +129,7 @@ def train(
         loss: Loss that replaces the loss of the model (default: that of `training.learner`). `targets` and `absent` are
             not passed to it.
         optimiser: Optimiser that replaces Adam (default: that of `training.optimiser`). The fields of `config` for
-            Adam, the learning rate and the clipping are then not used.
+            Adam, for the learning rate and for the clipping are then not used.
         notes: JSON values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
             must have the same notes, because the functions themselves cannot be compared.
         progress: Function that is called after every step with the number of steps done, their total number, and the
@@ -141,8 +141,9 @@ def train(
         The trained model.
 
     Raises:
-        ValueError: `workdir` has a training with other settings, other data or another optimiser, or a checkpoint
-            without `manifest.json`, or the names, shapes or values of `arrays` do not fit the model.
+        ValueError: The training in `workdir` has other settings, other data or another optimiser. Also raised if
+            `workdir` has a checkpoint but no `manifest.json`, or if the names, shapes or values of `arrays` do not fit
+            the model.
         OSError: A file in `workdir` is damaged or cannot be written.
         LockedError: Another process trains in `workdir`.
         FloatingPointError: The loss is not finite.

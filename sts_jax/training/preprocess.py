@@ -116,9 +116,9 @@ class Preprocessing:
             blank: Tactile image of the empty sensor in [0, 1].
 
         Returns:
-            True for images in which at least `touch_blocks` square blocks of `touch_block` pixels on a side differ from
-            the blank image. A block differs if its mean changes by more than `touch_threshold` in any channel. If
-            `touch_level` is True, the median change of each image and channel is subtracted first. If
+            True for images in which at least `touch_blocks` blocks differ from the blank image. A block is a square
+            with a side of `touch_block` pixels. It differs if its mean changes by more than `touch_threshold` in any
+            channel. If `touch_level` is True, the median change of each image and channel is subtracted first. If
             `mask_blank_touch` is False, the result is True for all images.
         """
         if not self.mask_blank_touch:
@@ -141,8 +141,8 @@ def touch_of_noisy_images(
 
     The standard deviation is estimated as 1.4826 times the median absolute difference between the block means of the
     images and of the blank image. The median difference of each image and channel is subtracted first, so a change of
-    all light does not count. Contacts on less than half of the pad hardly change the estimate. Uneven changes of the
-    light after the blank image was taken increase it.
+    all light does not count. Contacts on less than half of the pad hardly change the estimate. An uneven change of the
+    light since the blank image increases the estimate.
 
     Args:
         preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.
@@ -259,5 +259,5 @@ def preprocessing_from_json(content: dict) -> Preprocessing:
     except (KeyError, TypeError) as error:
         raise ValueError(
             f"{content!r} does not describe a preprocessing ({type(error).__name__}: {error}): train the model with "
-            "the argument preprocessing=dataclasses.asdict(p) of training.train, where p is a training.Preprocessing."
+            "training.train(..., preprocessing=dataclasses.asdict(p)), where p is a training.Preprocessing."
         ) from error

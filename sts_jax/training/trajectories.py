@@ -25,13 +25,14 @@ def frame_arrays(
         pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
         modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
         preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images. If the
-            first tactile image of a trajectory shows no contact, this sample does not have the input `tactile`.
+            first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
+            `tactile`.
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:
-        The arrays, and the preprocessing with a new value of `absent`, the modalities that no sample has as an input.
-        If `tactile` is a modality and no first frame shows a contact, `absent` is `("tactile",)`, and the arrays have
-        no input `tactile`. Otherwise `absent` is empty.
+        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that no sample
+        has as an input. If `tactile` is a modality and no first frame shows a contact, `absent` is `("tactile",)`, and
+        the arrays have no input `tactile`. Otherwise `absent` is empty.
     """
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -53,13 +54,14 @@ def image_arrays(
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
         preprocessing: Preprocessing with the test that finds contacts in tactile images, see `touch_of_noisy_images`.
-            If the first tactile image of a trajectory shows no contact, this sample does not have the input `tactile`.
+            If the first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
+            `tactile`.
         blank: Tactile image of the empty sensor.
 
     Returns:
-        The arrays, and the preprocessing with a new value of `absent`, the modalities that no sample has as an input.
-        If `tactile` is a modality and no first image shows a contact, `absent` is `("tactile",)`, and the arrays have
-        no input `tactile`. Otherwise `absent` is empty.
+        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that no sample
+        has as an input. If `tactile` is a modality and no first image shows a contact, `absent` is `("tactile",)`, and
+        the arrays have no input `tactile`. Otherwise `absent` is empty.
 
     Raises:
         ValueError: `modalities` is empty or has a name other than `visual` and `tactile`, or the images are not uint8
@@ -135,8 +137,8 @@ def state_arrays(
         preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
         empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
             The size is `model.input_size`.
-        views: Rendered visual images of objects in initial poses, without a simulation of the motion that follows, from
-            `dataset.Dataset.views`. They are used only if `visual` is an input of the model.
+        views: Rendered visual images of objects in initial poses, from `dataset.Dataset.views`. The motion of these
+            objects is not simulated. The images are used only if `visual` is an input of the model.
         falls: First and last poses of further trajectories without images, from `dataset.Dataset.ends`.
 
     Returns:
@@ -239,9 +241,9 @@ def state_model(
         image_size: Side length of the predicted images (pixels). It must divide the side length of the input images.
 
     Returns:
-        The configuration, and the preprocessing with a new value of `absent`, the modalities that no sample has as an
-        input. If no first frame shows a contact, `tactile` is not an input of the model, and `absent` is
-        `("tactile",)`. Otherwise `absent` is empty.
+        The configuration, and the preprocessing with a new value of `absent`. This field names the modalities that no
+        sample has as an input. If no first frame shows a contact, `tactile` is not an input of the model, and `absent`
+        is `("tactile",)`. Otherwise `absent` is empty.
 
     Raises:
         ValueError: The images are not square or are cropped, or their side length is not a multiple of `image_size`.
