@@ -267,7 +267,7 @@ def _imprint_in_metres(imprint: Any) -> Float[Array, "h w"]:
     if not jnp.issubdtype(imprint.dtype, jnp.floating):
         raise ValueError(
             f"imprint has the type {imprint.dtype}, but it must be a floating-point array in metres (0.0005 is half a "
-            "millimetre). Multiply an image of integers by the size of its unit in metres first"
+            "millimetre). Convert integers to metres first, for instance with 1e-6 * imprint if they are micrometres"
         )
     if imprint.ndim != 2 or 0 in imprint.shape:
         raise ValueError(

@@ -71,11 +71,11 @@ def quat_to_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def quat_from_matrix(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 4"]:
-    """Unit quaternion [w, x, y, z], `w >= 0`, of a rotation matrix, or of the rotation nearest to any other 3x3 matrix.
+    """Unit quaternion [w, x, y, z] of a rotation matrix, with `w >= 0`.
 
-    The nearest rotation is the rotation matrix R with the largest `sum(R * matrix)`. Its quaternion is the eigenvector
-    of the largest eigenvalue of Davenport's matrix K (Markley and Mortari 2000, "Quaternion attitude estimation using
-    vector observations").
+    For any other 3x3 matrix, the result is the quaternion of the nearest rotation. The nearest rotation is the rotation
+    matrix R with the largest `sum(R * matrix)`. Its quaternion is the eigenvector of the largest eigenvalue of
+    Davenport's matrix K (Markley and Mortari 2000, "Quaternion attitude estimation using vector observations").
     """
     m = _checked("matrix", matrix, 3, 3)
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]

@@ -91,7 +91,7 @@ def test_a_summary_without_the_metric_is_refused(items):
     judge = evaluation.scorer(physics.Freefall(), train)
     rows = evaluation.baselines(physics.Freefall(), train, test)
     plain = evaluation.summarise({name: judge(row, test) for name, row in rows.items()}, test, num=2)
-    with pytest.raises(ValueError, match="summary lacks the metrics height_error: add them to the argument metrics"):
+    with pytest.raises(ValueError, match="summary lacks the metrics height_error: pass these metrics to the functions"):
         evaluation.full_table(plain, title="t", metrics=(HEIGHT,))
 
 
@@ -117,7 +117,7 @@ def test_a_metric_needs_a_name_of_its_own_and_one_number_per_item(items):
     with pytest.raises(ValueError, match="metrics has more than one metric named 'position': give each metric its own"):
         evaluation.summarise({}, test, metrics=(*evaluation.METRICS, dataclasses.replace(HEIGHT, name="position")))
     wrong = dataclasses.replace(HEIGHT, errors=lambda predicted, test: predicted.pose)
-    with pytest.raises(ValueError, match=r"'height_error': errors returned the shape \(6, 7\), but .* \(6,\): reduce"):
+    with pytest.raises(ValueError, match=r"'height_error': the function errors .* \(6, 7\), but .* \(6,\): reduce"):
         evaluation.scorer(physics.Freefall(), train, metrics=(wrong,))(predicted, test)
 
 

@@ -185,9 +185,9 @@ def told_apart(
     cross-validations of five folds. All real and simulated images of a trajectory are in the same fold. The classifier
     is therefore never tested on a trajectory to which it was fitted.
 
-    The accuracy is the mean of the accuracies for real and for simulated images, so 0.5 is chance. The bootstrap of the
-    interval draws the tested trajectories with replacement. The interval does not include the variation that comes from
-    the choice of the trajectories to which the classifier is fitted.
+    The accuracy is the mean of the accuracies for real and for simulated images, so 0.5 is chance. The 95 %
+    interval of the accuracy comes from a bootstrap, which draws tested trajectories with replacement. The bootstrap
+    does not fit the classifier again, so the interval does not include the variation between training sets.
 
     Args:
         real: Features of the real images, from `features`, `(n, k)`.

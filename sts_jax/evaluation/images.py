@@ -30,8 +30,8 @@ def image_baselines(train: Streams, test: Streams) -> dict[str, Predicted]:
 
     - The constant is the mean last image of the training trajectories.
     - The copy predicts that the last image equals the first one.
-    - The nearest neighbour is the last image of the training trajectory whose first visual image has the smallest
-      squared distance.
+    - The nearest neighbour is the last image of the most similar training trajectory. Two trajectories are compared by
+      the squared distance between their first visual images.
 
     Args:
         train: The training trajectories.

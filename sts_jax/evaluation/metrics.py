@@ -23,7 +23,7 @@ _CLOSE = 1e-6  # m, least distance in the weights of the geometric median, which
 
 
 class ImageError(NamedTuple):
-    """Errors of n predicted images, each summed over all pixels of the image or over those of a mask.
+    """Errors of n predicted images. Each error is a sum over all pixels of an image, or over the pixels of a mask.
 
     The excess is the cross-entropy minus the entropy of the true image. It is 0 for a perfect prediction.
     """
@@ -299,7 +299,8 @@ def calibration_error(
 
     The items are divided into bins by the probability of their likeliest outcome. The accuracy of a bin is the share of
     its items whose likeliest outcome is the true one. The confidence of a bin is the mean probability of the likeliest
-    outcome of its items. The error is the mean of |accuracy - confidence| over the bins, weighted by their items.
+    outcome of its items. The error is the mean of |accuracy - confidence| over the bins. The weight of a bin is the
+    sum of the weights of its items.
 
     Args:
         confidence: Probability of the likeliest outcome of each item, `(n,)`.
@@ -403,8 +404,8 @@ def bootstrap(
 
     Args:
         groups: Group of each item, such as its object, `(n,)`.
-        statistic: Function of the weights of the items, `(n,)`, that returns a value or an array of values. The weight
-            of an item is how often its group was drawn.
+        statistic: Function that takes the weights of the items, `(n,)`, and returns a value or an array of values. The
+            weight of an item is how often its group was drawn.
         num: Number of bootstrap samples.
         seed: Seed of the random numbers.
 

@@ -107,8 +107,8 @@ class Forecaster(Protocol):
 
         Args:
             shape: Leading axes of the prediction.
-            condition: The c numbers of the input that the scenario applies, such as an acceleration of the pad,
-                `(*shape, c)` in SI units. None for scenarios without such an input.
+            condition: Known quantities of the scenario, such as an acceleration of the pad, as c numbers in SI units,
+                `(*shape, c)`. None for scenarios without such quantities.
 
         Returns:
             An object with the same fields as the result of `__call__`.
@@ -121,8 +121,8 @@ def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tupl
     Args:
         modalities: The inputs of the model, `predictor.modalities`. If the model has no inputs, the result has only the
             empty subset.
-        state: True to add the subset ("visual", "state") of the visual image and the true state (pose, shape and mass),
-            if the visual image is an input. State-space models accept the true state.
+        state: True to add the subset ("visual", "state"), if the visual image is an input. Here, "state" is the true
+            pose, shape and mass, which state-space models accept as an input.
 
     Returns:
         The subsets by their descriptions, such as "from visual and pose" for the inputs ("visual", "pose"). The

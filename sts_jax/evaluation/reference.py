@@ -20,10 +20,10 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     - The constant is the mean last frame of the training trajectories. Its outcome is the most frequent one, and its
       outcome probabilities are the frequencies.
     - The copy predicts that the last frame equals the first one.
-    - The nearest neighbour is the last frame of the training trajectory whose first visual image has the smallest
-      squared distance. In scenarios with a condition (an input such as an acceleration of the pad), the squared
-      distance of the conditions is added. Both distances are then divided by their variances in the training set, so
-      that they have the same weight.
+    - The nearest neighbour is the last frame of the most similar training trajectory. Two trajectories are compared by
+      the squared distance between their first visual images. In scenarios with a condition (an input such as an
+      acceleration of the pad), the squared distance between the conditions is added. Both distances are then divided by
+      their variances in the training set, so that they have the same weight.
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. Its height is the median height
       of the training objects that stay on the pad. It predicts no images.
 

@@ -54,7 +54,7 @@ def ceiling(
         test: The items. The predicted images have the resolution of their images.
         times: Number of re-rolls per item, >= 1.
         key: The random key of the re-rolls.
-        progress: Function that is called with the number of re-rolls of all items that have been simulated so far.
+        progress: Function that is called with the number of re-rolls simulated so far, over all items.
 
     Returns:
         A prediction with the re-rolls as samples (images in `uint8`). Its images are their means, and its pose is their
@@ -78,9 +78,10 @@ def ceiling(
     off = np.abs(first - test.pose[:, :1]).max()
     if not off <= _SAME:
         raise RuntimeError(
-            f"the first pose of a re-roll differs by {off:.3g} (metres, or an entry of the quaternion) from that of "
-            f"the held-out trajectory, but at most {_SAME:g} is allowed. This is an error in sts_jax: adapt _replayed "
-            "in sts_jax/evaluation/rerolls.py to the random keys that physics.simulate uses"
+            "the first pose of a re-roll differs from that of the held-out trajectory. One of the 7 numbers of the "
+            f"pose (position in metres and quaternion) is off by {off:.3g}, but at most {_SAME:g} is allowed. This is "
+            "an error in sts_jax: adapt _replayed in sts_jax/evaluation/rerolls.py to the random keys that "
+            "physics.simulate uses"
         )
     pose, wrench = (np.asarray(leaf[:, -1]) for leaf in (traj.pose, traj.wrench))
     drawn = _drawn(collection, sensor, bodies, np.repeat(place, times), pose, wrench, test.visual.shape[2])

@@ -46,8 +46,8 @@ def score(
         outcomes: The outcomes of the scenario, `scenario.outcomes`. They are needed if the prediction has
             `outcome_probability`.
         frequency: Frequency of each of the c outcomes among the training trajectories, `(c,)`, from
-            `evaluation.frequency`. None keeps the outcome of the prediction. If the prediction has no outcome, None
-            takes the likeliest one.
+            `evaluation.frequency`. Without it, the outcome is that of the prediction, or the likeliest one if the
+            prediction has no outcome.
         metrics: The metrics of the evaluation. The function calls `Metric.errors` of the metrics that have it, and
             stores the results in `Scores.further`.
 
@@ -140,8 +140,9 @@ def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> di
         found[metric.name] = np.asarray(values, np.float64)
         if found[metric.name].shape != (len(test.object),):
             raise ValueError(
-                f"metric {metric.name!r}: errors returned the shape {found[metric.name].shape}, but it must return one "
-                f"number per item, shape {(len(test.object),)}: reduce the other axes, for instance by a mean"
+                f"metric {metric.name!r}: the function errors returned the shape {found[metric.name].shape}, but it "
+                f"must return one number per item, shape {(len(test.object),)}: reduce the other axes, for instance by "
+                "a mean"
             )
     return found or None
 

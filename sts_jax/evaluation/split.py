@@ -33,7 +33,7 @@ def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
         `split="trajectory"`, the validation part equals the training part.
 
     Raises:
-        ValueError: `split` is another word.
+        ValueError: `split` is neither `object` nor `trajectory`.
     """
     if split == "object":
         return {name: data.members(name) for name in ("train", "validation", "test")}

@@ -61,7 +61,8 @@ def summarise(
     missing = [name for name in BASELINES if name not in scores]
     if missing:
         raise ValueError(
-            f"scores lacks {', '.join(missing)}: score the predictions of evaluation.baselines and add them"
+            f"scores lacks {', '.join(missing)}: pass the predictions of evaluation.baselines to evaluation.score, "
+            "and add the results"
         )
     names = list(scores)
     scored = {name: _count(own, len(test.object)) for name, own in scores.items()}

@@ -32,9 +32,9 @@ def predictions(
 ) -> None:
     """Draw the first image, the true last image, the prediction and its samples for some held-out trajectories.
 
-    Each stream (visual or tactile) of a trajectory is a row. A red arrow on the first image shows the velocity relative
-    to the pad that an object without friction would have (`Scenario.drift`). A velocity of 0 has no arrow. An arrow for
-    1 m/s is as long as a quarter of the image's width.
+    Each stream (visual or tactile) of a trajectory is a row. A red arrow on the first image shows `Scenario.drift`, the
+    velocity of a frictionless object relative to the pad. A velocity of 0 has no arrow. An arrow for 1 m/s is as long
+    as a quarter of the image's width.
 
     Args:
         path: The PNG file to write.
@@ -43,8 +43,8 @@ def predictions(
             no rows.
         num: Largest number of trajectories to draw. They are the first ones of `predicted`.
         title: Title of the figure.
-        scenario: The scenario of the trajectories, for the names of the outcomes and the arrows. None draws no arrows
-            and uses the names of `physics.Outcome`.
+        scenario: The scenario of the trajectories, for the names of the outcomes and the arrows. If it is None, the
+            figure has no arrows, and the names are those of `physics.Outcome`.
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
     samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
@@ -153,7 +153,7 @@ def ends(
         truth: True last pose, `(7,)`.
         rerolled: Last poses of m simulations (re-rolls) from the same first pose, each with other random values of
             the properties that a camera cannot see (such as fill level and friction), `(m, 7)`.
-        sampled: k samples of the last pose that a model predicted, `(k, 7)`.
+        sampled: k samples of the last pose from a model, `(k, 7)`.
         title: Title of the figure.
     """
     figure, axes = plt.subplots(1, 2, figsize=(9, 5.4), sharex=True, sharey=True)
