@@ -57,7 +57,7 @@ class Args:
     def __post_init__(self) -> None:
         if not 0 < len(self.lags_ms) <= self.pairs:
             raise ValueError(
-                f"--lags-ms must have 1 to {self.pairs} values, at most as many as --pairs, got {len(self.lags_ms)}"
+                f"--lags-ms must have 1 to {self.pairs} values (the upper limit is --pairs), got {len(self.lags_ms)}"
             )
 
 

@@ -160,8 +160,8 @@ def check_values(name: str, array: np.ndarray) -> None:
     """
     if not np.isfinite(array).all():
         raise ValueError(
-            f"{name} has NaN or infinite values. Exclude such items with present={{{name!r}: mask}}, a mask that is "
-            "False for them."
+            f"{name} has NaN or infinite values. Exclude the items with such values: pass present={{{name!r}: mask}}, "
+            "where mask is False for these items."
         )
     if name == "pose":
         lengths = np.linalg.norm(array[..., 3:].astype(np.float64), axis=-1)  # squares of 1e30 are beyond float32

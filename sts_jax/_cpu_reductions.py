@@ -14,19 +14,19 @@ _LANES = 32  # row length in `cumsum`. `_fold` splits vectors of at least twice 
 
 
 def minimum(values: Array) -> Array:
-    """Smallest value of a vector. The result is that of `jnp.min`, which is slower on a CPU."""
+    """Smallest value of a vector. `jnp.min` gives the same result but is slower on a CPU."""
     return _fold(jnp.minimum, jnp.min, values)
 
 
 def maximum(values: Array) -> Array:
-    """Largest value of a vector. The result is that of `jnp.max`, which is slower on a CPU."""
+    """Largest value of a vector. `jnp.max` gives the same result but is slower on a CPU."""
     return _fold(jnp.maximum, jnp.max, values)
 
 
 def cumsum(counts: Array) -> Int[Array, "n"]:
     """Cumulative sum of a vector of integers or flags, computed by products with triangular matrices.
 
-    The sum of all values must be below 2^24, up to which float32 represents every integer.
+    The sum of all values must be below 2^24, because float32 cannot represent every integer above this limit.
     """
     size = len(counts)
     rows = -(-size // _LANES)
@@ -39,7 +39,10 @@ def cumsum(counts: Array) -> Int[Array, "n"]:
 
 
 def flatnonzero(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
-    """Indices of the true flags in ascending order, padded with the value n to length n, the length of `flags`."""
+    """Indices of the true flags in ascending order.
+
+    The result has n elements, like `flags`. All elements after the last index are n.
+    """
     size = len(flags)
     place = jnp.where(flags, cumsum(flags) - 1, size)
     return jnp.full(size, size, jnp.int32).at[place].set(jnp.arange(size, dtype=jnp.int32), mode="drop")

@@ -108,7 +108,7 @@ def read_json(path: Path, remedy: str) -> Any:
 def claim(path: Path, content: dict) -> None:
     """Record settings in a JSON file, or check that an existing file has the same settings.
 
-    The check keeps results of different settings out of the same folder.
+    The check ensures that all results in a folder have the same settings.
 
     Args:
         path: The file.
@@ -212,12 +212,12 @@ def write_folder(path: Path, files: dict[str, bytes]) -> None:
     All files are on disk when the function returns.
 
     Args:
-        path: The folder. It must not exist or must be empty.
+        path: The folder. A folder that already exists must be empty.
         files: The content of each file by its name.
 
     Raises:
-        OSError: A file cannot be written, or `path` is a file or a folder that is not empty. The message names the
-            folder and the remedy.
+        OSError: A file cannot be written, or `path` is a file or a non-empty folder. The message names the folder and
+            the remedy.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:

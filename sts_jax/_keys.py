@@ -9,7 +9,8 @@ def check_key(key: Any) -> None:
     """Check that an argument is one JAX key, made by `jax.random.key` or by the older `jax.random.PRNGKey`.
 
     Raises:
-        TypeError: The argument is an array of several keys or not a key. The message contains its value and the remedy.
+        TypeError: The argument is not a key, or it is an array of several keys. The message describes the argument
+            and the remedy.
     """
     if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
         if key.shape:

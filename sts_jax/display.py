@@ -44,14 +44,14 @@ def show(thing: Frame | Body | Prediction | ArrayLike, *, title: str = "") -> Fi
             (kPa). A `Body` gives an outside view of the object on a pad. A `Prediction` gives its predicted images. An
             array (height, width, 3) is drawn as an image, and must have floats in [0, 1] or the type uint8. Select item
             i of a batch with `jax.tree.map(lambda x: x[i], frames)`.
-        title: Title of the figure. The default is the description of a `Body`, and no title for other items.
+        title: Title of the figure. By default, the title of a `Body` is its description, and other items have no title.
 
     Returns:
         A Matplotlib figure.
 
     Raises:
         TypeError: `thing` has none of these types.
-        ValueError: `thing` is a batch or a prediction without images, or an image has another shape, type or range.
+        ValueError: `thing` is a batch, a prediction without images, or an image with an invalid shape, type or range.
     """
     panels = _panels(thing)
     if isinstance(thing, Body):

@@ -45,8 +45,8 @@ def wait(text: str, every: float | None) -> str:
     except EOFError:
         raise ValueError(
             "the Enter key cannot be read, because the standard input has ended: give --every SECONDS to wait for a "
-            "fixed time instead, and --board-images FOLDER or --ideal-lens DEGREES to replace live pictures of the "
-            "board"
+            "fixed time instead. To avoid live pictures of the board, also give --board-images FOLDER or --ideal-lens "
+            "DEGREES"
         ) from None
 
 

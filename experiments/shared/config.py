@@ -152,8 +152,8 @@ def check(config: Config) -> None:
     allowed = image_sizes(config)
     if not allowed:
         raise ValueError(
-            f"collection.resolution must be a size from which model {config.model!r} can predict images, got {height} "
-            f"x {width}: give --collection.resolution 64 64 or 128 128"
+            f"collection.resolution must be a size that model {config.model!r} supports, got {height} x {width}: "
+            "give --collection.resolution 64 64 or 128 128"
         )
     if config.image_size not in allowed:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))

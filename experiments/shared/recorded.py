@@ -151,8 +151,8 @@ def sensor_file(workdir: Path) -> tuple[hardware.Device, sts.Sensor]:
     path = workdir / "sensor.json"
     if not path.exists():
         raise FileNotFoundError(
-            f"the sensor file {path} is missing: copy this file and the background images (images of the empty pad), "
-            "which `python -m experiments.commission` has written, into the work directory"
+            f"the sensor file {path} is missing: copy this file and the background images (images of the empty pad) "
+            "into the work directory. `python -m experiments.commission` writes these files"
         )
     device = hardware.Device.load(path)
     if device.background_visual is None or device.background_tactile is None:

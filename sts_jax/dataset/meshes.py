@@ -39,10 +39,10 @@ def survey_meshes(
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Meshes, str]:
-    """List the mesh files in a folder that a scenario can use.
+    """Search a folder for mesh files that a scenario can use.
 
-    Files with the same mesh count as one object, whatever their names and formats. Otherwise, one object could be in
-    both the training and the test part of a dataset.
+    If several files contain the same mesh, only one of them is used, whatever their names and formats. Otherwise, one
+    object could be in both the training and the test part of a dataset.
 
     Args:
         folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
@@ -57,7 +57,8 @@ def survey_meshes(
         progress: Function that is called with a line of text after each object.
 
     Returns:
-        The usable objects, and a text. The text lists the usable objects and the others, with the reason for each.
+        The usable objects, and a text. The text describes each usable object, and gives the reason for each object
+        that is left out.
 
     Raises:
         FileNotFoundError: The folder does not exist.

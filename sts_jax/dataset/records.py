@@ -42,7 +42,7 @@ class Images(NamedTuple):
 
 
 class Identity(NamedTuple):
-    """Identity of a shard (the pair of files of some objects): its dataset, sensor and index."""
+    """Identity of a shard: its dataset, sensor and index. A shard is a pair of files with the data of some objects."""
 
     collection: str  # SHA-256 of the content of collection.json
     sensor: str  # SHA-256 of the content of sensor.json
@@ -50,7 +50,13 @@ class Identity(NamedTuple):
 
 
 def shard_path(folder: Path, count: int, index: int) -> Path:
-    """Path of the `.array_record` file with the images of shard `index`, from 0, in a dataset of `count` shards."""
+    """Path of the `.array_record` file with the images of a shard.
+
+    Args:
+        folder: The folder of the dataset.
+        count: Number of shards in the dataset.
+        index: Index of the shard. The first shard has the index 0.
+    """
     return folder / f"shard-{index:05d}-of-{count:05d}.array_record"
 
 
@@ -83,7 +89,7 @@ def write_shard(
     """Write the two files of a shard: the images (`.array_record`) and all other data (`.npz`).
 
     Args:
-        path: The `.array_record` file. The `.npz` file has the same name with this suffix.
+        path: The `.array_record` file. The `.npz` file has the same path except for the suffix.
         frames: Batches of images in the order in which they are stored. First come the batches of frames, each an
             `Images`. Then come the batches of views, each a tuple with one array of n visual images, uint8
             `(n, height, width, 3)`. A view is a visual image of an object in an initial pose, without a trajectory.
@@ -114,7 +120,7 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
     """
     small = path.with_suffix(".npz")
     arrays = read_arrays(small)
-    again = f"delete {small.name} and {path.name} and start the collection again, which makes only the missing shards"
+    again = f"delete {small.name} and {path.name} and start the collection again to make only the missing shards"
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
@@ -134,7 +140,8 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
         raise _missing(path)
     if sha256(path) != there["images"]:
         raise DamagedFileError(
-            f"{path} is damaged or belongs to another shard (its SHA-256 is not that in {small.name}): {again}."
+            f"{path} is damaged or belongs to another shard (the SHA-256 of the file differs from the value in "
+            f"{small.name}): {again}."
         )
     return arrays
 
@@ -199,8 +206,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # np.load raises errors of five types for damaged files
         raise DamagedFileError(
-            f"{path} is damaged ({error}): delete it and start the collection again, which makes only the missing "
-            "shards."
+            f"{path} is damaged ({error}): delete it and start the collection again to make only the missing shards."
         ) from error
 
 
@@ -256,8 +262,7 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
     if not path.is_file():
         raise _missing(path)
     again = (
-        f"delete it and {path.with_suffix('.npz').name} and start the collection again, which makes only the missing "
-        "shards"
+        f"delete it and {path.with_suffix('.npz').name} and start the collection again to make only the missing shards"
     )
     try:
         reader = ArrayRecordReader(str(path))

@@ -16,8 +16,8 @@ def comparison(
 
     Args:
         path: The PNG file to write.
-        groups: The groups from left to right. A group is a dictionary from the title of each of its columns to the
-            images of the column, `(n, height, width, 3)`, in [0, 1].
+        groups: The groups from left to right. A group maps the title of each column to images
+            `(n, height, width, 3)` in [0, 1].
         labels: Labels of the n rows.
         title: Title of the figure.
         heads: Titles of the groups.

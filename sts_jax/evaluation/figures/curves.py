@@ -94,8 +94,8 @@ def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]
 
     Args:
         path: The PNG file to write.
-        logs: The training logs by the name of the model. A log has one dictionary for each logged gradient step, which
-            contains the number of the step as `step`, and the terms.
+        logs: The training logs by the name of the model. A log has one dictionary for each logged gradient step. The
+            dictionary contains the number of the step as `step`, and the terms.
     """
     keys = [
         key
