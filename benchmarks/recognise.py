@@ -39,8 +39,10 @@ def main(args: Args) -> str:
     """Draw the picture and return the answers as text.
 
     Raises:
-        ValueError: The held-out list has fewer than ten trajectories from the place `first` on.
+        ValueError: `first` is negative, or the held-out list has fewer than ten trajectories from this place on.
     """
+    if args.first < 0:
+        raise ValueError(f"--first must be at least 0, got {args.first}")
     data = dataset.load(args.workdir / "dataset")
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:

@@ -65,6 +65,14 @@ def test_predictions_are_those_of_single_items_in_calls_of_equal_size(count):
     np.testing.assert_array_equal(model.calls[-1]["condition"][0], test.condition[64 * (count // 64)])
 
 
+def test_no_trajectories_are_refused():
+    test, model = pairs(np.arange(3), np.arange(3)), Echo()
+    test = test._replace(**{name: values[:0] for name, values in test._asdict().items() if values is not None})
+    with pytest.raises(ValueError, match="test has 0 trajectories, but at least one is needed"):
+        evaluation.predict(model, ("visual",), test, physics.Freefall())
+    assert not model.calls
+
+
 def test_only_the_requested_inputs_are_given():
     test, _ = judged()
     for inputs, expected in ((("pose",), {"pose"}), (("visual", "state"), {"visual", "state"})):

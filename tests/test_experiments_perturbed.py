@@ -133,6 +133,8 @@ def test_pictures_for_recognition_come_with_their_answers(workdir, tmp_path, mon
         assert picture.size[0] > 100
     with pytest.raises(ValueError, match="--first is 100, but the held-out list has only 0 trajectories"):
         recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=100))
+    with pytest.raises(ValueError, match="--first must be at least 0, got -1"):
+        recognise.main(recognise.Args(workdir, tmp_path / "no.png", first=-1))
 
 
 @pytest.fixture

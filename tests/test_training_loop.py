@@ -147,7 +147,8 @@ def test_beta_warms_up_over_its_share_of_the_steps():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"absent": ("b",)}, "absent contains 'b'"),
+        ({"absent": ("b",)}, r"absent contains 'b', but present\['b'\] marks"),
+        ({"absent": ("c",)}, r"absent contains 'c', but the model has only the modalities \['a', 'b'\]"),
         ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "inputs has"),
         ({"present": {"sound": np.ones(20, bool)}}, "present has masks"),
         ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "samples have"),

@@ -168,12 +168,19 @@ def predict(
         scenario: The scenario of the trajectories.
         validation: Trajectories for choosing the threshold that separates images with and without an object.
         blank: Visual image of the sensor without an object, in [0, 1], `(height, width, 3)`.
-        num_samples: Number of samples of each prediction, or 0 for none.
+        num_samples: Number of samples of each prediction, or 0 for none. Predictions without inputs have no samples.
 
     Returns:
         The predictions for all trajectories of `test`.
+
+    Raises:
+        ValueError: `test` has no trajectories.
     """
     names = tuple(inputs)
+    if len(test.object) == 0:
+        raise ValueError(
+            "test has 0 trajectories, but at least one is needed: choose a split with held-out trajectories"
+        )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
         """Predict the trajectories in parts of equal size, which limits the memory.

@@ -162,6 +162,11 @@ def _check_condition(expected: int, arrays: Arrays) -> None:
 def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) -> None:
     """Raise a ValueError if a training set does not fit an `mvae` model."""
     for name in absent:
+        if name not in model.names:
+            raise ValueError(
+                f"absent contains {name!r}, but the model has only the modalities {sorted(model.names)}: remove "
+                "this name"
+            )
         if np.any(arrays.present.get(name, False)):
             raise ValueError(
                 f"absent contains {name!r}, but present[{name!r}] marks {int(np.sum(arrays.present[name]))} samples "
