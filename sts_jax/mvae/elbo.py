@@ -33,7 +33,7 @@ class Terms(NamedTuple):
     """The loss of a batch, and its parts before they are multiplied by `beta` and `Modality.weight`.
 
     Each part is a mean over pairs of a sample and a subset of the modalities. The mean excludes the pairs that the loss
-    ignores, for example if the sample has other inputs, but none of the subset. See the docstring of the module.
+    ignores. For example, a pair is ignored if the sample has inputs, but none from the modalities of the subset.
     """
 
     loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch
@@ -88,8 +88,9 @@ def loss(
     it in every sample, in less time.
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
-    mean and one variance of each channel for this call. Every subset has the same weight in them as in the loss. If two
-    subsets have the same present modalities in a sample, they use the same noise for the latent `z`.
+    mean and one variance of each channel for this call. In this mean and this variance, every subset has the same
+    weight as in the loss. If two subsets have the same present modalities in a sample, they use the same noise for the
+    latent `z`.
 
     Args:
         graphdef: Definition of the model, from `init`.
@@ -111,8 +112,7 @@ def loss(
         absent: Names of modalities that no sample has as an input.
 
     Returns:
-        The loss, and a pair of the new running batch statistics, with the structure of `stats`, and the parts of the
-        loss.
+        A tuple `(loss, (stats, terms))` with the loss, the new running batch statistics, and the parts of the loss.
 
     Raises:
         ValueError: A name or `asked` is unknown, a target is missing, or `condition` has another width than the model

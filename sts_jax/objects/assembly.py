@@ -44,8 +44,8 @@ def assemble(
         interior: Vertices and faces of a closed mesh around the contents, such as the water in a bottle, in the frame
             of `vertices`. None for an object without contents.
         contents_density: Density of the contents (kg/m^3).
-        mass: Mass of the object without contents (kg), to which the masses of all faces are scaled. None computes it
-            from `density` and the areas of the faces.
+        mass: Mass of the object without contents (kg). The masses of all faces are multiplied by one factor, so that
+            their sum is `mass`. None computes the mass from `density` and the areas of the faces.
         uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row. None sets all to 0.
         texture: Square texture in linear light, [0, 1], with a side of 1, 256 or 1,024 pixels. None is a white pixel.
         two_sided: True if faces are also visible from behind.

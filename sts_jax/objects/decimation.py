@@ -28,8 +28,8 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
         import fast_simplification
     except ImportError as error:
         raise ImportError(
-            f"{path}: the mesh has {len(surface.faces):,} faces. To decimate it to {target:,}, the package "
-            "fast-simplification is needed, which is not installed: pip install -e '.[meshes]'"
+            f"{path}: decimating the mesh from {len(surface.faces):,} to {target:,} faces needs the package "
+            "fast-simplification, which is not installed: pip install -e '.[meshes]'"
         ) from error
     # Slivers can block the decimation. If so, vertices are welded first, on a grid of 1/1000 of the size or coarser.
     for weld in (0.0, 1e-3, 2e-3, 4e-3, 8e-3):
@@ -41,7 +41,7 @@ def decimate(path: Path, surface: Surface, target: int) -> Surface:
     else:
         raise ValueError(
             f"{path}: the mesh of {len(surface.faces):,} faces cannot be decimated to {target:,}, because it consists "
-            "of too many separate parts: increase the argument faces"
+            "of too many separate parts: allow more faces (argument faces)"
         )
     note = "" if surface.texture is None else ", and its texture to one colour per corner"
     warnings.warn(f"{path}: decimated from {len(surface.faces):,} to {len(faces):,} faces{note}", stacklevel=3)

@@ -28,7 +28,7 @@ DIRECTIONS = lattice(NUM_DIRECTIONS)  # (128, 3), unit vectors for which `suppor
 def convex_hull(
     points: Float[np.ndarray, "n 3"], *, limit: int = HULL_CLASSES[-1], tolerance: float = HULL_TOLERANCE
 ) -> Float[np.ndarray, "h 3"]:
-    """Compute an approximate convex hull of points that has a limited number of vertices.
+    """Compute an approximate convex hull of points, with a limited number of vertices.
 
     The hull starts as a tetrahedron of four points. Then the point farthest outside the hull is added
     repeatedly, until no point is more than `tolerance` outside the hull, or until the hull has `limit` vertices.
@@ -118,10 +118,10 @@ def rest_poses(
         com: Centre of mass (m), in the same frame.
 
     Returns:
-        For each of the k faces on which the hull can rest, the unit vector (in the frame of `points`) that then points
-        up, and the share of the face. The share is the solid angle of the face, seen from the centre of mass, divided
-        by the sum of the solid angles of these k faces. A larger share means that the object is more likely to land on
-        the face. Both arrays are empty if there is no such face.
+        A unit vector and a share for each of the k faces on which the hull can rest. The unit vector, in the frame of
+        `points`, points up when the hull rests on the face. The share is the solid angle of the face, seen from the
+        centre of mass, divided by the sum of the solid angles of these k faces. A larger share means that the object is
+        more likely to land on the face. Both arrays are empty if there is no such face.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

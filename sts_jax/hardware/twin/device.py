@@ -187,9 +187,8 @@ class Twin:
             The state after the command.
 
         Raises:
-            ValueError: The command is unknown, the scene cannot change (such as the constant images of a `Picture`),
-                or `release` comes without a held object. The object comes to rest in none of 32 successive simulated
-                trajectories.
+            ValueError: The command is unknown, the scene is constant (such as a `Picture`), `release` comes without a
+                held object, or the object comes to rest in none of 32 successive simulated trajectories.
         """
         with self._commands:
             if self._clock is not None:
@@ -199,10 +198,11 @@ class Twin:
         return self.state
 
     def operate(self) -> None:
-        """Hold or release the object if its next random time has come.
+        """Hold or release the object if the randomly chosen time for this has come.
 
-        `step` and `Served` call this method regularly. It does nothing unless the argument `release_every` of `Twin`
-        was given: the mean time for which an object is held plus the mean time for which it then rests (s).
+        The argument `release_every` of `Twin` is the mean time for which an object is held plus the mean time for which
+        it then rests (s). If this argument is None, this method does nothing. `step` and `Served` call this method
+        regularly.
         """
         if self._release_every is None:
             return
@@ -257,7 +257,7 @@ class Twin:
             )
 
     def end_s(self, index: int) -> float:
-        """The time on the twin's clock at which the exposure of frame `index`, counted from 0, ends (s)."""
+        """Return the time on the twin's clock at which the exposure of a frame ends (s). Frames are counted from 0."""
         return self._epoch_s + self.imperfections.exposure_s + index / self.rate
 
     def next_index(self, after: int, now_s: float) -> int:

@@ -16,10 +16,10 @@ class Hand(AutomaticPerson):
     `hardware.collect` shows its instructions as a `View`. The hand sends the matching commands to the twin, and
     confirms every trajectory. If an object does not move after its release, the hand confirms the release, as a person
     would. If `hardware.collect` detects no contact while a pose is held, the hand continues with the pose of the next
-    trajectory, and the session leaves one number unused.
+    trajectory, and the session skips the number of the current trajectory.
 
-    A trajectory therefore has the same number in the session and in the scene, if the scene starts with the session's
-    next number (`ObjectScene(first=hardware.next_recording(folder))`).
+    A trajectory has the same number in the session and in the scene if the scene starts with the session's next number
+    (`ObjectScene(first=hardware.next_recording(folder))`).
     """
 
     def __init__(self, twin: Twin, session: Session, *, patience_s: float = 60.0):
@@ -45,7 +45,7 @@ class Hand(AutomaticPerson):
         self._unseen = 0  # held poses in a row without a visible contact
 
     def show(self, view: View) -> None:
-        """Receive a view from `hardware.collect`, and send the command that its instruction requires to the twin.
+        """Receive a view from `hardware.collect`, and send the twin the command for its instruction.
 
         Args:
             view: Newest images and instruction.
@@ -74,12 +74,12 @@ class Hand(AutomaticPerson):
             raise ValueError(
                 f"hardware.collect still shows the instruction `{view.instruction}` after "
                 f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): the thresholds "
-                "of hardware.collect do not suit the twin's images, so change its argument config (a GuideConfig). If "
-                "they do, give Hand a larger patience_s"
+                "of hardware.collect do not suit the twin's images, or patience_s of Hand is too short. Change the "
+                "argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
 
     def action(self) -> Action | None:
-        """Return the next action of the person, which `hardware.collect` asks for.
+        """Return the next action of the person. `hardware.collect` calls this method.
 
         Returns:
             `Action.CONFIRM` if a trajectory waits for its review, or if the object has not moved in the 3 s after its

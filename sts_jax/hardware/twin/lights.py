@@ -99,7 +99,7 @@ class LightHistory:
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
 
     def forget(self, before_s: float) -> None:
-        """Delete the changes that no interval after a time needs.
+        """Delete old changes. Afterwards, the argument `start_s` of `over` must be at least `before_s`.
 
         The last change at or before this time is kept, because it determines the brightness after this time.
 

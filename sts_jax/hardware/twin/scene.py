@@ -28,7 +28,7 @@ _NOWHERE = np.array([0, 0, -1, 1, 0, 0, 0], np.float32)  # pose of an object tha
 
 
 class Phase(enum.StrEnum):
-    """The phase of a scene: no object is there, or a hand holds the object on the pad, or it moves or lies still."""
+    """The phase of a scene: no object is there, or the object is held on the pad, moves, or lies still."""
 
     EMPTY = "empty"  # no object is on the pad
     HELD = "held"  # a hand, which is not rendered, holds the object on the pad in an unstable pose
@@ -60,8 +60,8 @@ class Scene(abc.ABC):
         """Return the state of the scene at a time.
 
         Args:
-            time_s: Time on the twin's clock (s). It may be earlier than the last few commands, because a frame is made
-                after its exposure.
+            time_s: Time on the twin's clock (s). A frame is made after its exposure, so a few commands may have changed
+                the scene since this time.
         """
 
     @abc.abstractmethod

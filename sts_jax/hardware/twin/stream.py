@@ -59,8 +59,8 @@ class CameraThread:
             index: Number of the frame that the client received last, or -1.
 
         Returns:
-            The newest frame after `index` whose time of delivery has come. If this time has come for none of these
-            frames, the first of them. None if there is no frame after `index` yet.
+            The newest frame after `index` whose time of delivery has come, else the first frame after `index`, else
+            None.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
