@@ -331,9 +331,9 @@ def test_the_outcome_of_a_fall_follows_from_the_last_pose() -> None:
         (
             {"frames": 1},
             1,
-            r"scenario.frames is 1, which last 0 s, .* 0.05 m .* at least 0.301 s .* at least 11 frames",
+            r"scenario.frames is 1, so a trajectory lasts 0 s, .* 0.05 m .* at least 0.301 s .* at least 11 frames",
         ),
-        ({"height": 1000.0}, 1, r"scenario.frames is 60, which last 1.89 s, .* 1000 m .* at least 14.5 s"),
+        ({"height": 1000.0}, 1, r"scenario.frames is 60, so a trajectory lasts 1.89 s, .* 1000 m .* at least 14.5 s"),
     ],
 )
 def test_errors_name_fields_out_of_range(bodies: list[objects.Body], change: dict, num: int, match: str) -> None:

@@ -66,7 +66,8 @@ def library(
             "z" for other formats.
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package
             fast-simplification.
-        largest: Longest side to which longer objects are scaled down (m), from 5 mm to 0.15 m.
+        largest: Upper limit for the longest side (m), from 5 mm to 0.15 m. Larger objects are scaled down to this
+            limit.
         parts: If True, objects whose convex hull reaches more than 2 mm outside the surface are decomposed into convex
             parts. This takes about ten seconds per object and needs the package coacd.
 
@@ -151,8 +152,8 @@ def read(collection: Library, index: int) -> Entry:
         index: Index of the item in `collection.items`.
 
     Returns:
-        The item, the body, its two `gaps`, and notes on repairs. The gaps are the largest distances (m) of the surface
-        outside the collision parts, and of the collision parts outside the surface.
+        The item, the body, its two `gaps`, and notes on repairs. The gaps are the largest distances (m) by which the
+        surface lies outside the collision parts, and by which the parts lie outside the surface.
 
     Raises:
         ImportError: A package for the decimation or the decomposition of the mesh is needed and not installed.

@@ -24,8 +24,8 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
 
     Returns:
         Dictionary from the name of each file, as written in the mesh or material file, to its path. The path of a
-        missing file is None. Of the images of an OBJ's materials, only the colours (`map_Kd`) are listed. For other
-        formats, the dictionary is empty.
+        missing file is None. For an OBJ file, images other than colours (`map_Kd`) are not listed. For other formats,
+        the dictionary is empty.
     """
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())
@@ -88,7 +88,7 @@ def read_image(path: Path) -> Image.Image:
 
 
 class Resolver(trimesh.resolvers.FilePathResolver):
-    """Lookup of file names for trimesh that also finds images in another folder, its argument `images`."""
+    """Resolver of file names for trimesh. It also finds images in the folder `images`."""
 
     def __init__(self, path: Path, images: Path) -> None:
         super().__init__(str(path))

@@ -103,8 +103,8 @@ def load(
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass of
             the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
-        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3. The share of the interior that they
-            fill is an argument of `rigid`. If False, the body has no contents.
+        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3. The argument `fill` of `rigid`
+            is the share of the interior that is filled. If False, the body has no contents.
         strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
             image of an OBJ file. If False, these defects are repaired with a warning. The contents of such a mesh then
             fill its convex hull, and missing materials and images are left out.
@@ -144,8 +144,8 @@ def load(
     number = sum(len(piece.faces) for piece in pieces)
     if faces is None and number > FACE_CLASSES[-1]:
         raise ValueError(
-            f"{path}: the mesh has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: decimate it with "
-            "the argument faces, the largest number of faces"
+            f"{path}: the mesh has {number:,} faces, but at most {FACE_CLASSES[-1]:,} can be drawn: pass "
+            f"faces={FACE_CLASSES[-1]} to decimate it"
         )
     corners = np.concatenate([_corners(path, piece) for piece in pieces]) @ turn.T
     if not np.isfinite(corners).all():
@@ -200,8 +200,8 @@ def _attitude(
     if isinstance(up, str):
         if up not in AXES or front is not None:
             raise ValueError(
-                f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z' without front, or a "
-                "direction of three numbers with or without front"
+                f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z', or a direction of three "
+                "numbers. Omit front unless up is a direction"
             )
         return rotation(*AXES[up])
     try:
@@ -304,7 +304,7 @@ def _body(
     if max(len(faces), len(vertices)) > FACE_CLASSES[-1]:
         raise ValueError(
             f"{path}: the mesh has {len(faces):,} faces and {len(vertices):,} vertices, but at most "
-            f"{FACE_CLASSES[-1]:,} of each are allowed: decimate it with the argument faces, which limits both"
+            f"{FACE_CLASSES[-1]:,} of each are allowed: pass faces={FACE_CLASSES[-1]} to limit both by decimation"
         )
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     closed = is_closed(faces)

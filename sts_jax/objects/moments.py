@@ -16,8 +16,9 @@ def solid_moments(
     """Compute the moments of the signed tetrahedra between a reference point and each triangle.
 
     The moments of a solid are the sum over all triangles of its closed surface. Let a tetrahedron have the corners 0,
-    a, b, c relative to the reference, and s = a + b + c. Its volume is v = a . (b x c) / 6, its first moments are
-    int r = v s / 4, and its second moments are int r r^T = v (s s^T + a a^T + b b^T + c c^T) / 20.
+    a, b, c relative to the reference, and s = a + b + c. Its volume is v = a . (b x c) / 6. Its first moments
+    (integral of the position r) are v s / 4. Its second moments (integral of r r^T) are
+    v (s s^T + a a^T + b b^T + c c^T) / 20.
 
     Args:
         triangles: Corners of the triangles (m).
@@ -39,8 +40,8 @@ def solid_moments(
 def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
     """Compute the area moments of triangles, for shells with a mass per area.
 
-    Let a triangle have the corners r_i, the sum of corners s and the area A. Its first moments are int r = A s / 3, and
-    its second moments are int r r^T = A (s s^T + sum_i r_i r_i^T) / 12.
+    Let a triangle have the corners r_i, the sum of corners s and the area A. Its first moments (integral of the
+    position r) are A s / 3. Its second moments (integral of r r^T) are A (s s^T + sum_i r_i r_i^T) / 12.
 
     Args:
         triangles: Corners of the triangles (m).

@@ -66,7 +66,7 @@ def convex_parts(
 
 
 def decompose(body: Body) -> Body:
-    """Replace the convex hull of a body by several convex parts for collisions, such as for scissors or a bowl.
+    """Replace the collision hull of a body by several convex parts, which fit scissors or a bowl more closely.
 
     Args:
         body: One body.
@@ -119,8 +119,8 @@ def surface_gaps(
 
     Returns:
         Largest distance (m) by which the surface lies outside all parts, and largest distance (m) by which the parts
-        lie outside the surface. The visible surface can sink into the pad by the first distance. The object collides up
-        to the second distance away from its visible surface, as in the hollow of a bowl.
+        lie outside the surface. The visible surface can sink into the pad by the first distance. A contact can lie
+        outside the visible surface by up to the second distance, such as in the hollow of a bowl.
     """
     points = np.concatenate([np.unique(vertices[faces].reshape(-1, 3), axis=0), _points(vertices[faces], 10_000)])
     shapes = [ConvexHull(hull) for hull in hulls]

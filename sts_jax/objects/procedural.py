@@ -28,8 +28,8 @@ class Family:
             lacks the name.
         seed: Whole number >= 0 that is combined with the key of `make`. Families with different seeds receive different
             random numbers for the same key.
-        parts: Function that receives a generator of NumPy, draws the dimensions and colours of an object from it, and
-            returns the parts of the object in millimetres. +z is up as the object usually stands or lies. Equal
+        parts: Function that receives a `numpy.random.Generator`, draws the dimensions and colours of an object from it,
+            and returns the parts of the object in millimetres. +z points up in the usual pose of the object. Equal
             generators must lead to equal parts. The object collides as the convex hull of all parts.
 
     Raises:
@@ -107,8 +107,8 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
             a `Family`.
 
     Returns:
-        A body with +z up as the object usually stands or lies. A body of one of CATEGORIES has a longest side of 50 to
-        130 mm. The arrays of its vertices and faces have 1,024 rows, including padding.
+        A body whose +z axis points up in its usual pose. A body of one of CATEGORIES has a longest side of 50 to 130
+        mm. The arrays of its vertices and faces have 1,024 rows, including padding.
 
     Raises:
         TypeError: `key` is not a JAX key.
@@ -155,7 +155,7 @@ def _check(family: Family, parts: list[Part]) -> None:
     if max(len(points), faces) > FACE_CLASSES[-1]:
         raise ValueError(
             f"family {family.name}: the parts of one object have {faces:,} faces and {len(points):,} vertices in "
-            f"total, but at most {FACE_CLASSES[-1]:,} of each are allowed: give outlines and paths fewer points"
+            f"total, but at most {FACE_CLASSES[-1]:,} of each are allowed: use fewer points in outlines and paths"
         )
     if not np.isfinite(points).all():
         raise ValueError(f"family {family.name}: all vertices must be finite, got {points[~np.isfinite(points)][0]}")

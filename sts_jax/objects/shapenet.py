@@ -55,8 +55,7 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
         root: Folder that contains ShapeNetSem's table metadata.csv.
 
     Returns:
-        The mesh file and the settings for loading of each model that can be used, and (name, reason) of each skipped
-        model.
+        Mesh file and loading settings of each usable model, and (name, reason) of each skipped model.
 
     Raises:
         ValueError: The table lacks columns or cannot be read.
@@ -86,7 +85,7 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             if len(labels) > 1:
                 raise ValueError(
                     f"the row of the model in metadata.csv has categories of several classes "
-                    f"({', '.join(sorted(labels))}): delete all but one of them in the file"
+                    f"({', '.join(sorted(labels))}): keep only the categories of one class"
                 )
             path = next((place / f"{name}.obj" for place in meshes if (place / f"{name}.obj").is_file()), None)
             if path is None:

@@ -117,7 +117,7 @@ def loft(
     density: Number = WALL,
     interior: bool = False,
 ) -> Part:
-    """Connect rings to a surface, whose faces are counter-clockwise seen from outside.
+    """Build a surface by connecting rings. Its faces are counter-clockwise seen from outside.
 
     Args:
         rings: k rings of n points each, (k, n, 3) (mm). A band of the surface connects each ring to the next one.
@@ -180,7 +180,7 @@ def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int 
 
 
 def box(size: Sequence[Number], centre: Sequence[Number], color: Color) -> Part:
-    """Return a box of one colour, along the axes.
+    """Return a box of one colour, with edges parallel to the axes.
 
     Args:
         size: Size along x, y and z (mm).
@@ -203,7 +203,7 @@ def decal(
         color: Colour (3,) in linear light.
         shift: Shift along x, y and z (mm).
         axis: Direction to which the mark's z axis is turned before the shift: "x", "y", "z", "-x", "-y" or "-z".
-        spin: Rotation about z before this turn (rad).
+        spin: Rotation about z (rad), applied before `axis`.
     """
     n = len(outline)
     points = np.column_stack([np.vstack([outline, outline.mean(axis=0)]), np.full(n + 1, PAINT)])
@@ -237,7 +237,7 @@ def move(part: Part, shift: Sequence[Number] = (0, 0, 0), *, axis: str = "z", sp
         part: Part to move.
         shift: Shift along x, y and z (mm).
         axis: Direction to which the part's z axis is turned before the shift: "x", "y", "z", "-x", "-y" or "-z".
-        spin: Rotation about z before this turn (rad).
+        spin: Rotation about z (rad), applied before `axis`.
     """
     return part._replace(vertices=part.vertices @ (_TURNS[axis] @ rotation_about_z(spin)).T + np.asarray(shift, float))
 

@@ -57,9 +57,10 @@ def object_window(
     """Compute a window around an object, as in the paper (supplement, "Training Details").
 
     A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
-    largest one with the aspect ratio of the image. The points are projected to this face, and their bounding box is
-    clipped to the full window. The result is the smallest window of this aspect ratio within the full window that
-    contains the box. If the box is outside the full window, the result is the full window.
+    largest one with the aspect ratio of the image. The points are projected to the gel's outer face, and their
+    bounding box is clipped to the full window. The result is the smallest window that contains the box, has the aspect
+    ratio of the image and lies within the full window. If the box is outside the full window, the result is the full
+    window.
 
     Args:
         camera: The camera.
@@ -92,8 +93,8 @@ def to_pixels(
 
     Args:
         camera: The camera.
-        window: Part of the gel's outer face (z = 0, on which objects lie) in the image: x of the left edge, y of the
-            top edge (the smallest y), width, height (m), in the sensor frame.
+        window: Rectangle that the image shows on the gel's outer face (z = 0, on which objects lie): x of the left
+            edge, y of the top edge (the smallest y), width, height (m), in the sensor frame.
         shape: Height and width of the image (pixels).
         points: Points in the sensor frame (m).
 
@@ -115,7 +116,7 @@ def rays(
 
     Args:
         camera: The camera.
-        window: Part of the gel's outer face in the image: left, top, width, height (m).
+        window: Rectangle that the image shows on the gel's outer face: left, top, width, height (m).
         shape: Height and width of the image (pixels).
 
     Returns:

@@ -21,9 +21,10 @@ Scalar = float | Array
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Room:
-    """External light on the object, and its path to the camera through the gel and its skin, a translucent paint.
+    """Constants of the external light on the object, and of the gel and skin through which the camera sees the object.
 
-    Colours are linear RGB, unless stated otherwise. Values without a source are our choice.
+    The skin is a translucent paint. Colours are linear RGB, unless stated otherwise. Values without a source are our
+    choice.
     """
 
     # Light that reaches a surface from all sides, including the light that leaks through and under the object.
@@ -122,8 +123,9 @@ def hidden_sky(
         hidden = max_z Y_z slice_z X_z^T
 
     Y_z slice_z X_z^T is a product of matrices, and the maximum over the slices is taken in each cell. slice_z is the
-    share of each cell that the slice covers. Element (i, j) of X_z is the share that a strip as wide as column j of the
-    grid hides from the centre of column i. Y_z is the matrix for rows. Quadratic splines interpolate between the cells.
+    share of each cell that the slice covers. A strip over column j of the grid, at the height z, hides the share
+    X_z[i, j] of the sky from the centre of column i. Y_z is the matrix for rows. Quadratic splines interpolate between
+    the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns

@@ -35,8 +35,8 @@ def check_bodies(bodies: Sequence[Any]) -> None:
 
     Raises:
         TypeError: An item is not a `Body`.
-        BodyError: `hulls` has a shape that the simulation does not support or a value that is not finite, `shell_mass`
-            is not > 0 and finite, or `Body.check` finds an error.
+        BodyError: `hulls` has a shape that the simulation does not support, or a value that is not finite. `shell_mass`
+            is 0, negative or not finite. `Body.check` finds an error.
     """
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):
@@ -58,8 +58,8 @@ def check_bodies(bodies: Sequence[Any]) -> None:
         if not (np.isfinite(body.shell_mass) and body.shell_mass > 0):
             raise BodyError(
                 i,
-                f"shell_mass is {body.shell_mass} kg, but it must be > 0 and finite: give objects.load the argument "
-                "mass (kg)",
+                f"shell_mass is {body.shell_mass} kg, but it must be > 0 and finite: pass the mass (kg) to "
+                "objects.load",
             )
         try:
             body.check()

@@ -45,7 +45,7 @@ class Hull(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """k contact points in the sensor frame. The fields have the meaning of those of MuJoCo's `mjContact`."""
+    """k contact points in the sensor frame. The fields have the same meaning as in MuJoCo's `mjContact`."""
 
     dist: Float[Array, "k"]  # m, negative for penetration, 1 where there is no contact
     pos: Float[Array, "k 3"]  # m, halfway between the two surfaces
@@ -239,9 +239,9 @@ def collide(
 
     A point can become a contact if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`). The first
     contact is the deepest point. The second is the deepest of the points that are more than 1 mm (`APART`) away from
-    the first one. The other contacts belong to `num` - 2 evenly spaced directions. Each is the point with the largest
-    sum of its coordinate along the direction and 5 times (`STEEP`) its depth. Distances and directions are measured in
-    `plane`.
+    the first one. For each of `num` - 2 evenly spaced directions, the point with the largest score is a contact. The
+    score of a point is its coordinate along the direction plus 5 times (`STEEP`) its depth. Distances and directions
+    are measured in `plane`.
 
     Args:
         body: Convex parts of the object.

@@ -65,7 +65,7 @@ def gravity_at(
 
     Args:
         condition: Condition of each trajectory, (n, c), as described by `Scenario.quantities`.
-        time: Time at which each of the s steps of each of the f frames begins, (f, s) (s).
+        time: Start time of each step (s), as an array (f, s) for f frames of s steps.
         scenario: Scenario whose `gravity` is called.
 
     Returns:

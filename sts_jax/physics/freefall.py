@@ -50,9 +50,9 @@ class Freefall(Scenario):
         lasts, needed = (self.frames - 1) / self.rate, math.sqrt(2 * self.height / G) + SLOW_TIME
         if lasts < needed:
             raise ValueError(
-                f"scenario.frames is {self.frames}, which last {lasts:.3g} s, but an object released {self.height:g} m "
-                f"above the pad needs at least {needed:.3g} s to fall and come to rest: give at least "
-                f"{math.ceil(needed * self.rate) + 1} frames or a smaller height"
+                f"scenario.frames is {self.frames}, so a trajectory lasts {lasts:.3g} s, but an object released "
+                f"{self.height:g} m above the pad needs at least {needed:.3g} s to fall and come to rest: give at "
+                f"least {math.ceil(needed * self.rate) + 1} frames or a smaller height"
             )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:

@@ -21,8 +21,8 @@ def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], forc
     the depth of the object's lowest point, and h is the height of the object's underside above this point. The moment
     follows from the pressures of all cells. Given the same pose and this wrench, `sense` finds the same balance.
 
-    A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The object then stops just above this depth,
-    and the returned force is smaller than `force`.
+    A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The object then stops just before this
+    depth, and the returned force is smaller than `force`.
 
     Args:
         gel: Gel of the sensor.

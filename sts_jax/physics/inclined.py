@@ -40,8 +40,8 @@ class Inclined(Scenario):
     lie. The weight alone reveals little.
 
     In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie. A
-    start at rest therefore has one of `tries` random poses, the one in which the contents matter most for whether the
-    object tips.
+    start at rest therefore has the best of `tries` random poses. In this pose, the contents have the largest influence
+    on tipping.
 
     Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
     section "Data Collection".
