@@ -115,9 +115,9 @@ class Predictor:
 
         Args:
             folder: New or empty folder.
-            compact: If True, round the weights, which reduces their size on disk to a third. A weight changes by at
-                most 1/256 of the root mean square of all weights of the same output channel. Predictions change
-                slightly.
+            compact: If True, round the weights, which reduces their size on disk to a third. Each weight of an
+                output channel changes by at most r / 256, where r is the root mean square of the channel's weights.
+                Predictions change slightly.
 
         Raises:
             FileExistsError: The folder is not empty, or is a file.
@@ -353,9 +353,9 @@ class Predictor:
             raise ValueError("condition has NaN or infinite values: give finite numbers for every item.")
         if (np.abs(condition) > _LARGEST_CONDITION * scale).any():
             raise ValueError(
-                f"condition has magnitudes up to {np.abs(condition).reshape(-1, width).max(0).tolist()}, but at most "
-                f"{(_LARGEST_CONDITION * scale).tolist()} is allowed, {_LARGEST_CONDITION:g} times the "
-                "typical magnitudes of the model's scenario: give the condition in SI units."
+                f"condition has magnitudes up to {np.abs(condition).reshape(-1, width).max(0).tolist()}, but the "
+                f"limits are {(_LARGEST_CONDITION * scale).tolist()} ({_LARGEST_CONDITION:g} times the typical "
+                "magnitudes in the model's scenario): give the condition in SI units."
             )
         return condition, None
 

@@ -131,8 +131,8 @@ def predict_samples(
     """Predict with a state-space model, from samples of the final pose and of the images.
 
     The predicted images are means over `num_samples` samples, or over 16 samples if `num_samples` is 0. The predicted
-    position is the geometric median of at least 256 sampled positions. The predicted orientation is that of the sample
-    with the smallest mean distance from the other samples in position and angle.
+    position is the geometric median of at least 256 sampled positions. The predicted orientation is taken from one
+    sample: the sample whose mean distance (in position and angle) from the other samples is smallest.
 
     Args:
         graphdef: Definition of the model.

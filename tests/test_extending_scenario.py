@@ -157,7 +157,7 @@ def test_a_scenario_that_is_no_frozen_dataclass_is_refused(page):
 def test_a_variant_needs_the_fields_that_it_changes(page):
     scenario = page["Rolled"]()
     assert physics.variant(scenario, "wide-friction") == dataclasses.replace(scenario, friction=(0.3, 0.9))
-    with pytest.raises(ValueError, match="has no field fill, shell_scale, tilt to change"):
+    with pytest.raises(ValueError, match="declare fill, shell_scale, tilt in the scenario's dataclass"):
         physics.variant(scenario, "off")
 
 

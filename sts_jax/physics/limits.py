@@ -53,7 +53,12 @@ def check_range(name: str, values: tuple[float, float], *, positive: bool = True
 
 
 def check_length(name: str, value: float) -> None:
-    """Raise a ValueError unless a length (m), the field `name` of a scenario, is finite and >= 0."""
+    """Raise a ValueError unless a length in a scenario is finite and >= 0.
+
+    Args:
+        name: Name of the scenario's field, for the message.
+        value: The length (m).
+    """
     if not (math.isfinite(value) and value >= 0):
         raise ValueError(f"scenario.{name} is {value} m, but it must be finite and >= 0")
 

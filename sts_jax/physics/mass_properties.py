@@ -32,7 +32,7 @@ def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) 
 
     Args:
         bodies: All bodies.
-        which: Index of the body to which each of n sets of hidden properties applies, (n,), in ascending order.
+        which: Index of one body for each set of hidden properties, (n,), in ascending order.
         hidden: n sets of hidden properties: arrays of shape (n,), and `up` of shape (n, 3).
 
     Returns:

@@ -99,7 +99,7 @@ class Perturbed(Scenario):
         """Return gravity minus the acceleration of the pad (m/s^2, sensor frame).
 
         `Scenario.gravity` describes the arguments. If the jerk ends within the time step, the acceleration is
-        multiplied by the share of the step before the end.
+        multiplied by the jerk's share of the step.
         """
         acceleration, duration = jerk(condition)
         step = self.contact.timestep
@@ -107,13 +107,13 @@ class Perturbed(Scenario):
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return the velocity relative to the pad that an object without friction would have after the jerk.
+        """Return the velocity that an object without friction would have after the jerk, relative to the pad.
 
         Args:
             condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (3,).
 
         Returns:
-            Velocity along x and y, (2,) (m/s), which is minus the acceleration times the duration.
+            Velocity along x and y, (2,) (m/s). It is minus the acceleration times the duration.
         """
         acceleration, duration = jerk(condition)
         return jnp.asarray(-acceleration * duration)

@@ -101,10 +101,10 @@ class Released(Scenario):
         """Draw one held pose and the share of the weight on the pad. `Scenario.start` describes the arguments.
 
         The object stands on a stable face and is tilted over an edge of this face. Edges at which the object balances
-        at a tilt of 15 to 45 degrees are preferred. At such an edge, the object stands on the narrower of the two
-        faces. An object that returns to its face then usually turns by less than 45 degrees, and one that topples turns
-        by more. `outcome` uses this difference. If none of `tries` random edges meets the condition, for example for a
-        cylinder on its side, the object is tilted over another edge.
+        at a tilt of 15 to 45 degrees are preferred. Two faces meet at such an edge, and the object stands on
+        the narrower face. In most cases, it turns by less than 45 degrees to return to this face, and by more to
+        topple. `outcome` uses this difference. If `tries` random edges include no such edge, for example for a cylinder
+        on its side, the object is tilted over another edge.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)

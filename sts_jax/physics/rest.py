@@ -31,7 +31,7 @@ class StableFaces(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """The pose of a body at rest on the pad and the wrench that carries it. Both are arguments of `sense`."""
+    """Pose of a body at rest on the pad, and wrench of the pad on the body. Both are arguments of `sense`."""
 
     pose: Float[Array, "7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
     wrench: Float[Array, "6"]  # Force (N) and moment about the sensor's origin (N m) of the pad on the body.
@@ -129,14 +129,14 @@ def place(
     """Place a body at rest on the level pad, on one of its stable faces and under its own weight.
 
     The body penetrates the pad by 0.01 mm, the depth of objects at rest in the simulation. In a simulation from this
-    pose, the body therefore stays at rest. `sense` computes the much larger depth in the soft gel from the wrench. The
-    function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
+    pose, the body therefore stays at rest. In the soft gel, the body sinks much deeper. `sense` computes this depth
+    from the wrench. The function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
 
     Args:
         body: One body.
         sensor: Sensor whose `gel.size` is the size of the pad.
-        face: Index of a face in `stable_faces` with the same `fill`, `shell_scale` and `up`, where 0 is the most likely
-            face. "upright" is the face on which the body's +z points up.
+        face: Index of a face in the result of `stable_faces` for the same `fill`, `shell_scale` and `up`. Face 0 is the
+            most likely one. "upright" is the face on which the body's +z points up.
         yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
             If the body stands upright or upside down, its -y axis points there instead.
         position: x and y of the centre of the body's extent (m).

@@ -21,7 +21,7 @@ GONE_DEPTH = 0.01  # m, an object entirely this far below the gel's face has lef
 
 
 class State(NamedTuple):
-    """State of one trajectory, which each time step receives from the step before."""
+    """State of one trajectory. Each time step computes a new state from the previous one."""
 
     qpos: Float[Array, "7"]  # pose: position (m), quaternion
     qvel: Float[Array, "6"]  # m/s in the sensor frame, rad/s in the mesh frame (MuJoCo's free joint)
@@ -112,7 +112,8 @@ def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Fl
     """Advance a state by one time step.
 
     The new state contains the wrench of the pad on the object: the sum over all contacts with the pad, with the moment
-    about the sensor's origin. The scene also has a wall that stops the object. Its contacts are not part of the wrench.
+    about the sensor's origin. The scene also has a wall that stops the object. Contacts with the wall are not
+    part of the wrench.
 
     Args:
         model: Model of the scene in MJX. Its gravity is replaced.

@@ -363,8 +363,8 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
         raise ValueError(
-            f"name is {name!r}, a variant that changes hidden properties, but the scenario {scenario} has no field "
-            f"{', '.join(lacking)} to change: declare each of them as a field of the scenario's dataclass"
+            f"name is {name!r}, but the scenario {scenario} lacks fields that this variant changes: "
+            f"declare {', '.join(lacking)} in the scenario's dataclass"
         )
     return dataclasses.replace(scenario, **changes[name])
 

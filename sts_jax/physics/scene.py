@@ -216,7 +216,10 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Return the fields of a model that `set_rigid` changes, by their names in `mjx.Model`, in the dtypes of `like`."""
+    """Return the fields that `set_rigid` changes in a model.
+
+    The keys are the names of the fields in `mjx.Model`. The arrays have the dtypes of the fields of `like`.
+    """
     fields = {name: np.array(getattr(model, name), getattr(like, name).dtype) for name in DRAWN}
     return fields | {"stat.meaninertia": np.array(model.stat.meaninertia, np.float32)}
 

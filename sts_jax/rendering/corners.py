@@ -42,7 +42,7 @@ def weights(
 def weighted(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """Values at the three corners of the nearest face, times the weights of the corners, at each pixel.
+    """Multiply the values at the three corners of the nearest face by the weights of these corners, at each pixel.
 
     The sum of the three products is the interpolated value. The arguments are those of `weights`.
     """

@@ -136,8 +136,8 @@ class FinalPose(NamedTuple):
 
     For each outcome of the scenario, such as resting or falling off, the density is a mixture of k Gaussians over 21
     numbers. The first 12 numbers are the final pose code (position and rotation matrix, see `statespace.poses`). The
-    other 9 are the matrix of the rotation from the first to the final pose, row by row. All numbers refer to the sensor
-    frame rotated about its z axis, so that its x axis is the direction `heading`.
+    other 9 are the matrix of the rotation from the first to the final pose, row by row. All numbers refer to a frame
+    with the origin and the z axis of the sensor frame. The x axis of this frame points along `heading`.
     """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
@@ -375,9 +375,9 @@ class Decoder(nnx.Module):
     """Renders an object in a given pose, from its state code and its appearance code.
 
     The network renders the object on a canvas: a square that is parallel to the pad and aligned with the object's
-    heading, a direction in the plane of the pad that turns with the object. The centre of the canvas is below the mesh
-    origin, at the height of the object's lowest point, because the camera sees the object from below. The canvas is
-    then projected into the view of the camera. `compose` adds the images of the empty sensor.
+    heading. The heading is a direction parallel to the pad, and it turns with the object. The centre of the canvas is
+    below the mesh origin, at the height of the object's lowest point, because the camera sees the object from below.
+    The canvas is then projected into the view of the camera. `compose` adds the images of the empty sensor.
     """
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
@@ -443,8 +443,8 @@ def compose(
         layers: Rendered images of n objects, from the decoder.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the size of the rendered images.
         level: Threshold of each object for sharp outlines, from 0 to 1. A pixel shows the object if the probability
-            `layers.covered` is above the threshold, and the empty sensor otherwise. With uniformly random thresholds,
-            the frequency of the object in a pixel is this probability. With None, each pixel has the expected colour.
+            `layers.covered` is above the threshold, and the empty sensor otherwise. If the threshold is drawn
+            uniformly, a pixel shows the object with this probability. With None, each pixel has the expected colour.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].
