@@ -67,8 +67,8 @@ def simulate(
         num: Number of trajectories of each body.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
             by body. With n trajectories in total, its field `up` has the shape (n, 3), and the other fields have the
-            shape (n,). Each trajectory has the same start as without this argument, unless it fails in a
-            different number of draws.
+            shape (n,). Each trajectory has the same start as without this argument, unless its number of failures
+            (`Trajectory.resampled`) differs.
         progress: True shows a progress bar on standard error. A function is called after each chunk with the number of
             trajectories done so far. With MJX, tens of seconds of compilation precede the first chunk.
         chunk: Largest number of trajectories that are simulated at once. With MJX, each new value causes a compilation
