@@ -45,7 +45,7 @@ class Board:
     right, y points downwards, and z points into the paper.
 
     Raises:
-        ValueError: A field of the board is out of range.
+        ValueError: An argument is out of range.
     """
 
     columns: int = 9  # number of squares in a row, at least 4
@@ -232,8 +232,8 @@ def calibrate(
 
     The calibration fits the parameters of the lens and the pose of the board in each image. For each corner, it
     compares the pixel at which the corner was found with the pixel to which the fitted lens projects the corner. The
-    distance between these two pixels is the reprojection error. The fit minimises a soft L1 loss of their differences
-    in column and row. A weak prior keeps the coefficients `Lens.k` small.
+    distance between these two pixels is the reprojection error. The fit minimises a soft L1 loss of the differences
+    in column and row between these pixels. A weak prior keeps the coefficients `Lens.k` small.
 
     Args:
         images: Raw images of one camera, all of the same size, shape (height, width, 3) for RGB or (height, width) for
@@ -246,9 +246,10 @@ def calibrate(
         The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or the board on the pad is not found, or its plane or its
-            edges are rotated by more than 30 degrees against those of the image. Or the board has nearly the same tilt
-            in all images. Or the reprojection error of an image is larger than `largest_error`.
+        CalibrationError: Too few images show the board. Or the board on the pad is not found. Or the plane of this
+            board is tilted by more than 30 degrees against the image plane. Or the edges of this board are rotated by
+            more than 30 degrees against the edges of the image. Or the board has nearly the same tilt in all images.
+            Or the reprojection error of an image is larger than `largest_error`.
         ValueError: The images have different sizes or are not uint8, or `on_pad` is not the index of an image.
     """
     height, width = _common_size(images)
@@ -277,9 +278,10 @@ def fit_lens(
         The lens with the camera's pose relative to the pad, and the reprojection error of each image.
 
     Raises:
-        CalibrationError: Too few images show the board. Or the board on the pad is not found, or its plane or its
-            edges are rotated by more than 30 degrees against those of the image. Or the board has nearly the same tilt
-            in all images. Or the reprojection error of an image is larger than `largest_error`.
+        CalibrationError: Too few images show the board. Or the board on the pad is not found. Or the plane of this
+            board is tilted by more than 30 degrees against the image plane. Or the edges of this board are rotated by
+            more than 30 degrees against the edges of the image. Or the board has nearly the same tilt in all images.
+            Or the reprojection error of an image is larger than `largest_error`.
         ValueError: `on_pad` is not the index of an image.
     """
     width, height = size
@@ -385,9 +387,9 @@ def _first_estimate(views: _Views, width: int, height: int) -> _Fit:
                 best = fit
     if best is None:
         raise CalibrationError(
-            "the pose of the board cannot be computed from the corners that were found in the images. Check that the "
-            "numbers of squares and the dictionary of `board` are those of the printed board. Take images that show "
-            "more of the board."
+            "the pose of the board cannot be computed from the corners that were found in the images. Check that "
+            "`board` and the printed board have the same numbers of squares and the same dictionary. Take images that "
+            "show more of the board."
         )
     return best
 
@@ -406,7 +408,7 @@ def _common_size(images: Sequence[NDArray[np.uint8]]) -> tuple[int, int]:
     """Height and width of the images, or an error if they have different sizes or another type."""
     if not images:
         raise CalibrationError(
-            f"images is empty. Take at least {FEWEST_IMAGES} images of the board in different poses."
+            f"`images` is empty. Take at least {FEWEST_IMAGES} images of the board in different poses."
         )
     for i, image in enumerate(images):
         if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
@@ -457,9 +459,9 @@ def _check_errors(errors: list[float | None], largest: float) -> None:
     if bad:
         raise CalibrationError(
             f"the reprojection error is larger than {largest:g} pixels in {_listed(bad)}. If only a few images are "
-            "listed, leave them out, because the board moved or the image is blurred. If most images are listed, check "
-            "that the board is flat, that its squares have the size `Board.square`, and that focus and image size were "
-            "the same for all images."
+            "listed, leave them out: they may be blurred, or the board may have moved. If most images are listed, "
+            "check that the board is flat, that its squares have the size `Board.square`, and that focus and image "
+            "size were the same for all images."
         )
 
 
@@ -469,9 +471,10 @@ def _check_tilts(poses: NDArray[np.float64]) -> None:
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if spread < LEAST_TILT:
         raise CalibrationError(
-            f"the tilts of the board in the images differ by at most {math.degrees(spread):.0f} degrees, but at least "
-            f"{math.degrees(LEAST_TILT):.0f} degrees between two images are needed to compute the focal length. Hold "
-            "the board with tilts of 20 to 40 degrees to different sides in some images."
+            f"the tilts of the board in the images differ by at most {math.degrees(spread):.0f} degrees. To "
+            "compute the focal length, two of the images must have tilts that differ by at least "
+            f"{math.degrees(LEAST_TILT):.0f} degrees. Hold the board with tilts of 20 to 40 degrees to different sides "
+            "in some images."
         )
 
 

@@ -27,8 +27,8 @@ class Camera:
     ```
 
     A background thread fetches the frames continuously, so that no old frames collect in the driver. If a device or
-    stream is lost, this thread opens it again under the same path or URL. The `epoch` of a frame is the number of its
-    connection, so it increases at each reconnection.
+    stream is lost, this thread opens it again under the same path or URL. The `epoch` of a frame counts the
+    reconnections before this frame.
 
     Several threads may use one camera. `async_read` then returns each frame to only one of them.
     """
@@ -168,7 +168,7 @@ class Camera:
         if self.config.kind != "device":
             remedy = "set it at the server of the stream" if self.config.kind == "stream" else "use a device"
             raise CameraError(
-                f"{self.config.name} is a {self.config.kind}, but only the exposure of a device can be set: {remedy}."
+                f"{self.config.name} is a {self.config.kind}, but the exposure can be set only for a device: {remedy}."
             )
         return self._connected().set_exposure(exposure, self.config.timeout_s)
 
@@ -176,7 +176,8 @@ class Camera:
         """Return a frame that was exposed after the call.
 
         The first `CameraConfig.in_flight` frames that arrive after the call are discarded, because they may have been
-        exposed before it. From a video file, the oldest frame that has not been returned yet is read instead.
+        exposed before it. If the source is a video file, the method returns the oldest frame that has not been
+        returned yet.
 
         Args:
             timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera is lost when the call begins,

@@ -56,8 +56,8 @@ class CameraConfig:
                 raise ValueError(f"{name} must be > 0 and finite, got {value}")
         if self.in_flight < 0:
             raise ValueError(
-                f"in_flight must be >= 0, got {self.in_flight}: give the number of frames that may be in exposure or "
-                "transfer at once"
+                f"in_flight must be >= 0, got {self.in_flight}: give the number of frames that can be "
+                "exposed or transferred at the same time"
             )
         if self.fourcc is not None and len(self.fourcc) != 4:
             raise ValueError(f"fourcc must have four characters, such as 'MJPG', got {self.fourcc!r}")

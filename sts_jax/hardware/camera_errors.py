@@ -34,7 +34,7 @@ class CameraLostError(CameraError):
 
 
 class FrameSizeError(CameraError):
-    """The camera's frames have another size than the configuration requests, or than the earlier frames."""
+    """The size of the camera's frames differs from the configured size, or from the size of earlier frames."""
 
 
 class FrozenCameraError(CameraError):

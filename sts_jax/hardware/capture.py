@@ -89,7 +89,7 @@ class Capture:
 
     @property
     def frame_count(self) -> int | None:
-        """Number of frames that the header of a video file states, or None if it states none."""
+        """Number of frames according to the header of a video file, or None if the header lacks this number."""
         count = self.properties.get(cv2.CAP_PROP_FRAME_COUNT)
         return round(count) if count > 0 else None
 
@@ -100,9 +100,10 @@ class Capture:
         return rate if rate > 0 and np.isfinite(rate) else None
 
     def stamp(self) -> float | None:
-        """Return the time of the last frame on the clock of the device's driver (s), or None if it is unknown.
+        """Return the time of the last frame (s), or None if this time is unknown.
 
-        This time has no jitter, unlike the time at which the frame reaches this process. It exists only for devices.
+        The time is on the clock of the device's driver. It has no jitter, unlike the time at which the frame reaches
+        this process. It exists only for devices.
         """
         time_ms = self.properties.get(cv2.CAP_PROP_POS_MSEC) if self._config.kind == "device" else 0.0
         return time_ms / 1000 if time_ms > 0 else None

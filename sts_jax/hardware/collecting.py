@@ -26,7 +26,8 @@ _PASSING = (
 class Action(enum.Enum):
     """An action of the person who collects trajectories with `collect`.
 
-    A trajectory consists of two pairs of images: one of a held object, and one of the same object after its release.
+    A trajectory consists of two pairs of images. The first pair shows a held object. The second pair shows the same
+    object after its release.
     """
 
     CONFIRM = "confirm"  # confirm the current stage: the pad is empty, the object is released, the trajectory is good
@@ -63,7 +64,7 @@ class PairReader(Protocol):
 class Person(Protocol):
     """The interface between `collect` and the person who moves the objects, such as a web page or a terminal.
 
-    All methods must return at once, because `collect` reads no images while it waits for them.
+    Each method must return immediately, because `collect` reads no images until the method returns.
     """
 
     def show(self, view: View) -> None:
@@ -106,9 +107,10 @@ def collect(
 ) -> int:
     """Collect trajectories until the person stops, or until the session has enough of them.
 
-    A trajectory consists of two pairs of images: one of an object that a person holds on the pad, and one of the same
-    object at rest after its release. The guide, a state machine that evaluates the images, chooses the instruction for
-    the person and decides when each pair is saved. At the end of each trajectory, the person confirms or discards it.
+    A trajectory consists of two pairs of images. The first pair shows an object that a person holds on the pad. The
+    second pair shows the same object at rest after its release. The guide is a state machine that evaluates the
+    images. The guide chooses the instruction for the person, and decides when each pair is saved. At the end of each
+    trajectory, the person confirms or discards it.
 
     Args:
         sensor: Connected sensor.
@@ -118,8 +120,8 @@ def collect(
         empty: Appearance of the empty pad, from `known_pad`. None: the empty pad is measured at the beginning.
         trusted: True if the pad is certainly empty at the beginning. If False and `empty` is None, the person has to
             confirm that the pad is empty.
-        count: Number of confirmed trajectories in the session at which collecting ends. Trajectories of earlier calls
-            count too. None: no limit.
+        count: Largest number of confirmed trajectories in the session, including those of earlier calls. Collecting
+            ends when the session has this number. None: no limit.
         note: Text that is stored with each trajectory.
         patience_s: Longest time without images (s). During this time, the person sees the error, and `collect`
             continues if a lost camera or LED controller is found again.

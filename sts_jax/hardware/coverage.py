@@ -53,9 +53,9 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
     if largest_angle is not None and needed > largest_angle + _EXTRAPOLATION:
         raise CalibrationError(
             f"the corners of the sensor's view are {math.degrees(needed):.1f} degrees from the optical axis, but the "
-            f"calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees, and the view may "
-            f"exceed this angle by at most {math.degrees(_EXTRAPOLATION):.0f} degrees. Take more images with the board "
-            "in the corners of the image, and calibrate again."
+            f"calibration images show the board only up to {math.degrees(largest_angle):.1f} degrees. The difference "
+            f"must be at most {math.degrees(_EXTRAPOLATION):.0f} degrees. Take more images with the board in the "
+            "corners of the image, and calibrate again."
         )
     try:
         pixels = rectification(lens, pinhole, _RESOLUTION)
@@ -74,10 +74,10 @@ def check_view(lens: Lens, pinhole: Pinhole, largest_angle: float | None = None)
 
 
 def covered(found: Sequence[FoundCorners], size: tuple[int, int]) -> tuple[str, ...]:
-    """Return the parts of the raw image in which corners of a board were found, in any of the calibration images.
+    """Return the parts of the raw image in which a corner of the board was found at least once.
 
-    The image is divided into 3 rows and 3 columns. The top and bottom rows each have 20 % of the image's height, and
-    the left and right columns each have 20 % of the image's width.
+    A corner in any of the calibration images counts. The image is divided into 3 rows and 3 columns. The top and bottom
+    rows each have 20 % of the image's height, and the left and right columns each have 20 % of the image's width.
 
     Args:
         found: Corners of the board in each image, from `find_board`.

@@ -102,8 +102,8 @@ class Pace:
             time_s: Time of the frame (s).
 
         Returns:
-            Estimated number of lost frames. It is 0 for the first frame, while the period is unknown, and if `time_s`
-            is not later than the time of the frame before.
+            Estimated number of lost frames. The number is 0 if this is the first frame, if the period is unknown,
+            or if `time_s` is not later than the time of the frame before.
         """
         last, self._last = self._last, time_s
         if last is None or time_s <= last:

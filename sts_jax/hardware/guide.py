@@ -91,12 +91,11 @@ class Observation(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EmptyPad:
-    """The mean colours of the blocks of a visual and a tactile image of the empty pad, and the noise of these means.
+    """The appearance of the empty pad in a visual and a tactile image, and the noise of this appearance.
 
-    The noise is the standard deviation of a mean over several images, or 0 if it is unknown. All values have the scale
-    of the images, 0 to 255.
     Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
-    mean is the mean colour of one block.
+    mean is the mean colour of one block. The noise of a block is the standard deviation of its mean colour between
+    images, or 0 if the noise is unknown. All values have the scale of the images, 0 to 255.
     """
 
     visual: Blocks  # block means of the visual image
@@ -150,7 +149,8 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
 
     An observation contains the mean colours of blocks of the images, see `observe`. The noise of a block is the
     standard deviation of its mean colour over the observations. A few observations can underestimate the noise.
-    The noise of each block is therefore raised to at least the median noise of all blocks of this size in its image.
+    A noise below the median is therefore raised to the median. The median is taken over all blocks that have the same
+    size and belong to the same image.
 
     Args:
         observations: At least two observations of the empty pad without movement.
@@ -176,10 +176,10 @@ def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "r
 
 
 def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
-    """Make an `EmptyPad` from the images of the empty pad in a sensor file, which `Device.background` reads.
+    """Make an `EmptyPad` from the images of the empty pad in a sensor file.
 
-    The noise in the result is 0, because it cannot be measured from one image. `has_contact` then estimates it from the
-    image to test, and `step` measures it before each trajectory.
+    `Device.background` reads these images. The noise in the result is 0, because it cannot be measured from one image.
+    `has_contact` then estimates it from the image to test, and `step` measures it before each trajectory.
 
     Args:
         visual: Raw image of the empty pad without light, RGB.
@@ -255,9 +255,9 @@ def _clear(config: GuideConfig, state: State) -> State:
 def confirm(state: State) -> State:
     """Advance the guide after the person has confirmed the current stage of recording a trajectory.
 
-    The meaning of a confirmation depends on the stage (`Stage`). In `CLEAR`, the person confirms that the pad is empty,
-    in `RELEASE` that the object is released, and in `REVIEW` that the trajectory is good. In all other stages, the
-    state is returned unchanged.
+    The meaning of a confirmation depends on the stage (`Stage`). In `CLEAR`, a confirmation means that the pad is
+    empty. In `RELEASE`, it means that the object is released. In `REVIEW`, it means that the trajectory is good. In all
+    other stages, the state is returned unchanged.
 
     Args:
         state: Current state of the guide.
@@ -305,9 +305,9 @@ def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) 
 
     A tactile image shows a contact if at least `config.contact_blocks` of its 48 x 64 small blocks differ from the
     empty pad by more than a threshold. The median difference over all blocks is subtracted first, so that a change in
-    the brightness of the whole image is not a contact. The threshold is `config.deviations` times the noise, limited to
-    the range from `config.smallest_change` to `config.largest_threshold`. This noise is the larger one of two
-    estimates: `sqrt(1 + 1 / config.pairs)` times the noise in `empty`, and 1.4826 times the median absolute difference.
+    the brightness of the whole image is not a contact. The threshold is `config.deviations` times the noise, but at
+    least `config.smallest_change` and at most `config.largest_threshold`. The noise is the larger one of two estimates:
+    `sqrt(1 + 1 / config.pairs)` times the noise in `empty`, and 1.4826 times the median absolute difference.
 
     Args:
         config: Thresholds.

@@ -53,8 +53,8 @@ class Leds:
 
     Several threads may use one `Leds`. The controller has a watchdog, which turns the lights off if no request arrives
     for the time `watchdog_ms` (an argument of `connect`). A background thread therefore sends a request whenever a
-    third of this time has passed without one, so the lights stay on while this process runs. If the process ends or
-    hangs, the watchdog turns the lights off.
+    third of this time has passed without any request, so the lights stay on while this process runs. If the
+    process ends or hangs, the watchdog turns the lights off.
 
     A request is repeated with the same sequence number every 0.1 s until its answer arrives. The controller executes it
     only once. Damaged lines and answers to other requests are ignored.
@@ -241,9 +241,9 @@ class Leds:
     def reconnect(self, *, limit_s: float = 30.0) -> None:
         """Search for the controller after its port has vanished, connect to it again, and turn its lights off.
 
-        The controller is recognised by its serial number. The port of the same name is tried first, then the ports of
-        USB devices of the same vendor and product. The wait between attempts begins at 0.1 s and doubles up to 5 s.
-        Requests of other threads raise `DisconnectedError` meanwhile.
+        The controller is recognised by its serial number. The previous port is tried first, then all other ports
+        whose USB device has the controller's vendor and product. The wait between attempts begins at 0.1 s and doubles
+        up to 5 s. Requests of other threads raise `DisconnectedError` meanwhile.
 
         Args:
             limit_s: Time after which no further attempt begins (s). For each port, an attempt takes at most the

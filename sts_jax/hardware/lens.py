@@ -94,8 +94,8 @@ class Lens:
             raise ValueError(
                 f"rotation {self.rotation} and translation {self.translation} place the camera at "
                 f"{tuple(round(float(c), 4) for c in self.center)} m in the sensor frame, but the camera must lie "
-                "inside the sensor, where z is negative. Check that both describe the transformation from the sensor "
-                "frame to the camera frame."
+                "inside the sensor, where z is negative. Check that rotation and translation describe the "
+                "transformation from the sensor frame to the camera frame."
             )
 
     @classmethod
@@ -215,8 +215,8 @@ def directions(lens: Lens, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         pixels: Pixel coordinates (column, row) in the raw image of the camera, shape (..., 2).
 
     Returns:
-        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels that no ray within
-        `Lens.largest_angle` of the optical axis meets.
+        Unit vectors in the camera frame, shape (..., 3). They are NaN for pixels beyond the range of the lens model,
+        which ends at the angle `Lens.largest_angle` from the optical axis.
     """
     pixels = np.asarray(pixels, np.float64)
     x, y = (pixels[..., 0] - lens.cx) / lens.fx, (pixels[..., 1] - lens.cy) / lens.fy
@@ -282,8 +282,8 @@ def rectified(lens: Lens, pinhole: Pinhole, image: NDArray[np.uint8], resolution
         does not see are black.
 
     Raises:
-        ValueError: The image is not uint8, or its size is not that of `lens`. Or the view contains rays at larger
-            angles than `Lens.largest_angle`. Or `resolution` or `pinhole` is out of range.
+        ValueError: The image is not uint8, or its size is not `lens.height` x `lens.width`. Or the view contains rays
+            at larger angles than `Lens.largest_angle`. Or `resolution` or `pinhole` is out of range.
     """
     _check_image(image)
     if image.shape[:2] != (lens.height, lens.width):
@@ -311,9 +311,9 @@ def distortion(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> NDA
 
     Returns:
         Rectified pixel coordinates (column, row) of each raw pixel, shape (lens.height, lens.width, 2). They lie
-        outside of the rectified image for raw pixels outside of the view. They are NaN for a raw pixel whose ray does
-        not meet the plane of the gel's outer face, and for a raw pixel that no ray within `Lens.largest_angle` of the
-        optical axis meets.
+        outside of the rectified image for raw pixels outside of the view. They are NaN for raw pixels whose ray does
+        not meet the plane of the gel's outer face. They are also NaN for raw pixels beyond the range of the lens model,
+        which ends at the angle `Lens.largest_angle` from the optical axis.
 
     Raises:
         ValueError: `resolution` or `pinhole` is out of range.
