@@ -1,4 +1,4 @@
-"""`ProvenFrames`: switches the lights, and selects frames that are proven to show the lights of one stream."""
+"""`ProvenFrames`: switches the lights, and selects frames for which the state of the lights is proven."""
 
 import contextlib
 import time
@@ -33,7 +33,7 @@ _GRACE_S = 0.2  # s by which the wait for a frame may exceed the deadline, so th
 
 
 class ProvenFrames:
-    """Switches the lights of a connected sensor, and selects frames that are proven to show the lights of one stream.
+    """Switches the lights of a connected sensor, and selects frames for which the state of the lights is proven.
 
     The lights are off in the visual stream and on in the tactile stream. The class stores the controller's
     answer to the last switch of the lights, the last frame before this switch, and the number of frames that show the
@@ -79,7 +79,10 @@ class ProvenFrames:
         self.discarded = 0  # frames that `shot` did not return
 
     def stop(self) -> None:
-        """Make `shot` or `pair` in another thread end soon with an error. Call `resume` before the next image."""
+        """Interrupt `shot` or `pair` in another thread.
+
+        The interrupted method soon raises an error. Call `resume` before the next image.
+        """
         self._stopping = True
 
     def resume(self) -> None:
@@ -100,7 +103,8 @@ class ProvenFrames:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image was still changing at the end of a collection of frames, in each of three attempts.
+            LightError: The image was still changing when the last frames after a switch arrived, in each of three
+                attempts.
         """
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(LightError):
@@ -134,7 +138,7 @@ class ProvenFrames:
     def see_both(self, settling: Settling) -> None:
         """Use known settling times from now on, and take one image of each stream.
 
-        Later frames are compared with these images to recognise which lights they show.
+        Later frames are compared with these images to find out whether the lights are off or on.
 
         Args:
             settling: Times for which frames are discarded after a switch of the lights.
@@ -163,8 +167,8 @@ class ProvenFrames:
         The first image is of the stream for which the lights are already set, so a pair needs only one switch.
 
         Args:
-            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the time
-                of the reconnection is added.
+            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the
+                duration of the reconnection is added.
 
         Returns:
             The two images.
@@ -191,8 +195,8 @@ class ProvenFrames:
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).
-            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the time
-                of the reconnection is added.
+            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the
+                duration of the reconnection is added.
             after_s: Earliest arrival time of the frame on the same clock (s).
             then: Stream for which the lights are set after the frame. None: the lights do not change.
 

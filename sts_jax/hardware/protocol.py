@@ -152,7 +152,7 @@ def encode(text: str) -> bytes:
         The line, at most 64 bytes (`LONGEST_LINE`).
 
     Raises:
-        ProtocolError: The text is empty, contains `*` or other characters than printable ASCII, or is too long.
+        ProtocolError: The text is empty, contains `*` or a character that is not printable ASCII, or is too long.
     """
     if not re.fullmatch(r"[ -)+-~]+", text):
         raise ProtocolError(f"a message must consist of printable ASCII without '*', got {text!r}", Code.ARGUMENTS)
@@ -165,7 +165,7 @@ def encode(text: str) -> bytes:
 
 
 def decode(line: bytes) -> str:
-    """Check the checksum of a line and return the text before it.
+    """Check the checksum of a line, and return the text before the checksum.
 
     Args:
         line: The whole line, with its newline.
@@ -240,8 +240,8 @@ def decode_request(line: bytes) -> Request:
         case ["HELLO" | "SET" | "PING" | "WATCH", *_]:
             raise ProtocolError(
                 f"arguments are missing, too many or out of range in the line {line!r}: HELLO needs a version in "
-                f"0..65535, SET {CHANNELS} levels in 0..255, PING nothing, and WATCH a period in "
-                f"{SHORTEST_WATCH_MS}..{LONGEST_WATCH_MS} ms",
+                f"0..65535, SET needs {CHANNELS} levels in 0..255, PING needs no arguments, and WATCH needs a period "
+                f"in {SHORTEST_WATCH_MS}..{LONGEST_WATCH_MS} ms",
                 Code.ARGUMENTS,
                 sequence,
             )

@@ -49,7 +49,7 @@ Image = UInt8[np.ndarray, "height width 3"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecordedTrajectory:
-    """A recorded trajectory that its user has confirmed: the raw images at its beginning and at its end."""
+    """A recorded trajectory that the user has confirmed: the raw images at its beginning and at its end."""
 
     number: int  # number of the trajectory in its session
     initial: Pair  # images of the held object
@@ -80,7 +80,7 @@ class Images(NamedTuple):
 
 
 class Recordings:
-    """The confirmed trajectories of a session, a sequence of `RecordedTrajectory`.
+    """The confirmed trajectories of a session, as a sequence of `RecordedTrajectory` objects.
 
     ```python
     for trajectory in hardware.load_recordings("runs/real/dataset"):
@@ -108,7 +108,7 @@ class Recordings:
 
     @property
     def identity(self) -> str:
-        """SHA-256 checksum of the confirmed trajectories. It changes if one is added, discarded or replaced."""
+        """SHA-256 checksum of the confirmed trajectories. Adding, discarding or replacing a trajectory changes it."""
         files = {number: trajectory_folder(self.folder, number) / CONFIRMED for number in self.numbers}
         return _files.digest({str(number): _files.sha256(file) for number, file in files.items()})
 
@@ -128,7 +128,7 @@ class Recordings:
     def images(self, convert: Callable[[Image], Image] = lambda image: image) -> Images:
         """Read the images of all trajectories into arrays.
 
-        The raw images of 500 trajectories of 1640 x 1232 pixels need 12 GB of memory. Use `convert` to make them
+        The raw images (1640 x 1232 pixels) of 500 trajectories need 12 GB of memory. Use `convert` to make the images
         smaller.
 
         Args:
@@ -195,7 +195,7 @@ def read_session(folder: Path) -> dict[str, Any]:
 
 
 def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") -> None:
-    """Confirm a trajectory after collecting, so that `load_recordings` includes it.
+    """Confirm a trajectory, so that `load_recordings` includes it. The session must not be open.
 
     Args:
         folder: Folder of the session.
@@ -370,7 +370,7 @@ def encoded(image: Image) -> bytes:
 
 
 def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
-    """Confirm a trajectory, so that `load_recordings` includes it, by writing its file `confirmed.json`.
+    """Write the file `confirmed.json` of a trajectory, so that `load_recordings` includes the trajectory.
 
     The caller must have locked the session, as `confirm_recording` and `Session.open` do.
 
@@ -380,8 +380,7 @@ def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
         note: Text that is stored with the trajectory.
 
     Raises:
-        FileNotFoundError: The trajectory does not exist, or lacks its initial or final pair of a visual and a tactile
-            image.
+        FileNotFoundError: The trajectory does not exist, or its initial or final pair of images is missing.
         OSError: The file cannot be written.
     """
     path = trajectory_folder(folder, number)

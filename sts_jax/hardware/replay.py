@@ -34,9 +34,9 @@ class Replay:
     misses images, as with a sensor, and `skipped` counts them. With `speed=None`, the replay waits for the program
     instead and returns every image.
 
-    The times of a `Shot` are those of the replay, not of the recording, on the clock `time.monotonic`. The time between
-    two images is the recorded time divided by the speed. A replay cannot switch lights, so it returns the images of
-    both streams in the order of the recording. Only one thread at a time may use a replay.
+    The times of a `Shot` are times of the replay on the clock `time.monotonic`, not the recorded times. The time
+    between two images is the recorded time divided by the speed. A replay cannot switch lights, so it returns the
+    images of both streams in the order of the recording. Only one thread at a time may use a replay.
 
     Attributes:
         skipped: Number of images since `connect` that were not returned because the program read too slowly.
@@ -118,8 +118,9 @@ class Replay:
             DamagedFileError: A file of the recording is damaged or truncated.
             CameraError: A video cannot be read.
             ValueError: `warmup_s` is negative or not finite, or the recording is empty or has another version of the
-                format. Two videos are refused if their lengths differ by more than one frame, if the constructor
-                argument `fps` is not positive and finite, or if a path is that of a device or a stream.
+                format. A replay of two video files also raises this error if the lengths of the videos differ by more
+                than one frame, if the constructor argument `fps` is not positive and finite, or if a path belongs to a
+                device or a stream.
         """
         if not 0 <= warmup_s < math.inf:
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -271,8 +272,8 @@ class Replay:
             The image at the end of the first `window_s` seconds without movement.
 
         Raises:
-            NotStillError: No period of `window_s` without movement has ended within `timeout_s`.
-            EndOfVideoError: The recording ends before such a period has ended.
+            NotStillError: There was no period of `window_s` without movement within `timeout_s`.
+            EndOfVideoError: The recording ends before such a period is complete.
             CameraNotConnectedError: The replay is not connected.
             CameraError: The recording has no visual images.
         """

@@ -182,7 +182,7 @@ class Device:
             A copy of this device that refers to the written background images.
 
         Raises:
-            SensorFileError: The file of a background that is kept is missing or damaged.
+            SensorFileError: The file of a kept background is missing or damaged.
             ValueError: An image is not uint8 or does not have the shape (height, width, 3) of this device's lens, or
                 `constants` are not the constants of a simulated sensor.
             OSError: A file cannot be written.

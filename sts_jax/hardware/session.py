@@ -88,12 +88,14 @@ class Session:
         session.flush()  # optional, `close` does it too
     ```
 
-    A background thread writes the files, so `save` and `confirm` return at once. The trajectories that `confirmed`
-    counts are on disk and survive a loss of power. If writing fails, for example because the disk is full, the thread
-    tries again every second, and `problem` describes the error. Changes (pairs of images, confirmations and discards)
-    that are not on disk yet wait in memory. At most 6 changes can wait, which are the changes of two trajectories. If 6
-    changes wait, `save` and `confirm` raise a `SessionError`. To avoid this error, call `check_ready` before each
-    trajectory. It raises a `SessionError` unless the session can accept all changes of the trajectory.
+    A background thread writes the files, so `save` and `confirm` return at once. The property `confirmed` counts
+    only trajectories that are on disk. These trajectories survive a loss of power. If writing fails, for example
+    because the disk is full, the thread tries again every second, and `problem` describes the error.
+
+    Changes (pairs of images, confirmations and discards) wait in memory until they are on disk. At most 6 changes, as
+    many as for two trajectories, can wait. If 6 changes wait, `save` and `confirm` raise a `SessionError`. To avoid
+    this error, call `check_ready` before each trajectory. It raises a `SessionError` unless the session can accept all
+    changes of the trajectory.
     """
 
     def __init__(self, folder: Path, lock: contextlib.ExitStack, settling: Settling | None):
@@ -123,8 +125,8 @@ class Session:
             settling: Settling times of the sensor's lights, which are stored with each pair. None: not stored.
 
         Returns:
-            The open session. Its first new trajectory has the largest number of all earlier trajectories plus 1, where
-            discarded trajectories count too. If there are none, the number is 0.
+            The open session. Its next trajectory gets the largest existing number plus 1, or 0 if there are no
+            trajectories. The numbers of discarded trajectories count as existing.
 
         Raises:
             LockedError: Another process is using the folder.
@@ -270,8 +272,8 @@ class Session:
             names = ", ".join(job.name for job in self._jobs)
             cause = self._error or "the disk is too slow. Pass a longer timeout_s."
         raise SessionError(
-            f"these changes were not on disk after {timeout_s:g} s, and are lost if the session closes before they "
-            f"are: {names}. Cause: {cause}"
+            f"these changes were not on disk after {timeout_s:g} s: {names}. They are lost if the session closes "
+            f"before they are written. Cause: {cause}"
         )
 
     def close(self, timeout_s: float = 30.0) -> None:

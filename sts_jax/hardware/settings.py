@@ -64,13 +64,13 @@ def lock(
     Args:
         capture: Open device.
         values: Values to set, by field name of `CameraConfig` (`exposure`, `gain`, `white_balance`, `focus`).
-        current: True to lock also exposure, white balance and focus at their current values if `values` does not
-            contain them.
+        current: If True, the settings that `values` does not contain are locked at their current values. This applies
+            to exposure, white balance and focus.
 
     Returns:
         The values that the device has now, by field name, and a list of the properties that the driver did not set.
-        A property that the driver lacks is in the list only if `values` requires it, or if it turns automatic exposure
-        or automatic white balance on and off.
+        A property that the driver lacks is in the list only in two cases. Either `values` requires the property, or
+        the property turns automatic exposure or automatic white balance on and off.
     """
     held: dict[str, float] = {}
     refused: list[Refusal] = []

@@ -55,7 +55,8 @@ def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
         image: RGB image, 0 to 255.
 
     Returns:
-        The mean colours of 24 rows of 32 blocks of the image, shape (24, 32, 3), 0 to 255.
+        The mean colour of each block, shape (24, 32, 3), 0 to 255. The image is divided into 24 rows and 32 columns of
+        blocks.
     """
     return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
 
@@ -99,11 +100,11 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 
 
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
-    """Return how much of the effect of a switch of the lights an image shows.
+    """Return the progress of a switch of the lights in an image: 0 with the former lights, 1 with the new lights.
 
-    The result is the median of `(look - before) / change` over the values that the switch changes clearly. Such a
-    change is at least 0.5 of 255, and at least a quarter of the median of all changes of 0.5 or more. An object that
-    moves in less than half of the view therefore has no influence.
+    The result is the median of `(look - before) / change` over the values that the switch changes clearly. A change
+    is visible if its size is at least 0.5 (of 255). A visible change is clear if its size is at least a quarter of the
+    median size of the visible changes. An object that moves in less than half of the view therefore has no influence.
 
     Args:
         look: Thumbnail of the image.
@@ -150,9 +151,10 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 
 
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
-    """Return the delay of the last frame that is not settled (s), or 0 if there is none. The result is at least 0.
+    """Return the time from the acknowledgement of a switch to the arrival of the last frame that is not settled (s).
 
-    A frame is settled if its `light_share` differs by at most 0.02 from that of the last frame after the switch.
+    A frame is settled if its `light_share` differs by at most 0.02 from that of the last frame after the switch. If
+    all frames are settled, the result is 0. The result is never negative.
 
     Args:
         switch: The frames after a switch of the lights.

@@ -12,7 +12,7 @@ Stream = Literal["visual", "tactile"]
 
 
 class LightError(RuntimeError):
-    """No image with the lights of the requested stream could be taken in time."""
+    """No image of the requested stream could be taken in time with the lights in the right state."""
 
 
 class NotStillError(TimeoutError):

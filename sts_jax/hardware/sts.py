@@ -49,8 +49,8 @@ class STS:
         pair = sensor.read()  # pair.visual.image and pair.tactile.image
     ```
 
-    The lights are off in the visual stream and on in the tactile stream. An image is returned only if it is proven that
-    the lights were in the state of its stream during the whole exposure. A frame of the camera must meet all of these
+    The lights are off in the visual stream and on in the tactile stream. For each returned image, it is proven that the
+    lights were in the state of its stream during the whole exposure. A frame of the camera must meet all of these
     conditions:
 
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
@@ -276,9 +276,9 @@ class STS:
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take one image of each stream.
 
-        Both frames arrive after the call. The first one may have been exposed before the call, but not earlier than one
-        settling time before its arrival. The first image belongs to the stream for which the lights are already set, so
-        each pair needs only one switch of the lights.
+        Both frames arrive after the call. The first one may have been exposed before the call. The time from exposure
+        to arrival is at most one settling time. The first image belongs to the stream for which the lights are already
+        set, so each pair needs only one switch of the lights.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
@@ -370,8 +370,9 @@ class STS:
         """Wait until nothing moves in the visual stream.
 
         Each image is divided into 32 x 24 blocks, and the mean colours of the blocks (0 to 255) are compared. The view
-        is still if no block differs by more than 6 from the first image of the last `window_s` seconds. For noisy
-        images, the limit is 8 times the median difference over all blocks, if this is larger than 6.
+        counts as still if, for `window_s` seconds, no block differs by more than 6 from the same block at the beginning
+        of this period. For noisy images, the limit is 8 times the median difference over all blocks, if this is larger
+        than 6.
 
         Args:
             timeout_s: Longest time from the first image to the returned one (s).
@@ -381,7 +382,7 @@ class STS:
             The last image of the period in which the view was still.
 
         Raises:
-            NotStillError: The view was not still for `window_s` within `timeout_s`.
+            NotStillError: There was no period of `window_s` without movement within `timeout_s`.
             LightError, LedError, CameraError: The causes are those of `read`.
         """
         self._stop_background()
@@ -390,9 +391,9 @@ class STS:
     def measure_settling(self, switches: int = _SWITCHES, *, watch_s: float = 1.0) -> Settling:
         """Measure the settling times, and use them from now on. The scene must be at rest.
 
-        The settling time is the longest time from the controller's acknowledgement of a switch to the arrival of a
-        frame that does not show the new lights completely, plus the time between two frames. The lights are switched
-        several times in each direction, and the frames after each switch are compared.
+        The lights are switched several times in each direction, and the frames after each switch are compared. The
+        first frames may still show the former lights, fully or partly. The settling time is the longest time from the
+        controller's acknowledgement of a switch to the arrival of such a frame, plus the time between two frames.
 
         Args:
             switches: Number of switches of the lights in each direction, off to on and on to off.
@@ -493,7 +494,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: The view was not still for `window_s` within `timeout_s`, or there are no more images.
+        NotStillError: There was no period of `window_s` without movement within `timeout_s`, or there are no more
+            images.
     """
     started_s: float | None = None
     first, look, change, allowed = None, None, 0.0, _STILL
@@ -509,9 +511,9 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"the view was not still for {window_s:g} s within {timeout_s:g} s. The last image and an image before it "
-        f"differ by up to {change:.0f} of 255 in one block (allowed: at most {allowed:.0f}). Keep the scene at rest, "
-        "raise timeout_s, or check whether the light of the room changes."
+        f"there was no period of {window_s:g} s without movement within {timeout_s:g} s. The last image and an image "
+        f"before it differ by up to {change:.0f} of 255 in one block (allowed: at most {allowed:.0f}). Keep the scene "
+        "at rest, raise timeout_s, or check whether the light of the room changes."
     )
 
 
@@ -519,7 +521,7 @@ def checked_levels(levels: Sequence[int]) -> protocol.Levels:
     """Check the levels of the lights in the tactile stream, and return them as a tuple of four integers.
 
     Raises:
-        ValueError: There are not four levels in 0 to 255, or all are 0.
+        ValueError: The number of levels is not four, a level is not an integer from 0 to 255, or all levels are 0.
     """
     values = tuple(int(level) for level in levels)
     allowed = values == tuple(levels) and all(0 <= value <= 255 for value in values) and any(values)
