@@ -108,7 +108,14 @@ class Recordings:
 
     @property
     def identity(self) -> str:
-        """SHA-256 checksum of the confirmed trajectories. Adding, discarding or replacing a trajectory changes it."""
+        """SHA-256 checksum of these trajectories.
+
+        If a trajectory is added, discarded or replaced, the recordings that `load_recordings` returns afterwards have
+        another checksum.
+
+        Raises:
+            FileNotFoundError: A trajectory was discarded after these recordings were loaded.
+        """
         files = {number: trajectory_folder(self.folder, number) / CONFIRMED for number in self.numbers}
         return _files.digest({str(number): _files.sha256(file) for number, file in files.items()})
 
@@ -203,7 +210,7 @@ def confirm_recording(folder: str | os.PathLike, number: int, note: str = "") ->
         note: Text that is stored with the trajectory.
 
     Raises:
-        LockedError: Another process is using the folder.
+        LockedError: Another process or an open session is using the folder.
         FileNotFoundError: There is no such session or trajectory, or the trajectory lacks its initial or final images.
         DamagedFileError: `session.json` is damaged.
         ValueError: The session has another version of the format.
@@ -222,7 +229,7 @@ def discard_recording(folder: str | os.PathLike, number: int) -> None:
         number: Number of the trajectory.
 
     Raises:
-        LockedError: Another process is using the folder.
+        LockedError: Another process or an open session is using the folder.
         FileNotFoundError: There is no such session or trajectory.
         FileExistsError: There is a discarded trajectory of the same number.
         DamagedFileError: `session.json` is damaged.
@@ -240,7 +247,7 @@ def restore_recording(folder: str | os.PathLike, number: int) -> None:
         number: Number of the trajectory.
 
     Raises:
-        LockedError: Another process is using the folder.
+        LockedError: Another process or an open session is using the folder.
         FileNotFoundError: There is no such session or discarded trajectory.
         FileExistsError: There is another trajectory of the same number.
         DamagedFileError: `session.json` is damaged.

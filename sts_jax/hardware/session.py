@@ -129,7 +129,7 @@ class Session:
             trajectories. The numbers of discarded trajectories count as existing.
 
         Raises:
-            LockedError: Another process is using the folder.
+            LockedError: Another process or another open session is using the folder.
             ValueError: The existing session has another origin. The message contains the differing values.
             DamagedFileError: `session.json` is damaged.
             OSError: The folder cannot be written to.
