@@ -162,7 +162,7 @@ def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeyp
     (tmp_path / "dataset" / "collection.json").write_text("{}")
     stages.main(freefall.SMOKE, tmp_path, only="train")
     assert ran == ["collect", "train"]
-    with pytest.raises(FileNotFoundError, match="statespace is not a trained model: run with --only train first"):
+    with pytest.raises(FileNotFoundError, match="statespace is not a trained model: first run with --only train"):
         stages.main(freefall.SMOKE, tmp_path, only="evaluate")
     (tmp_path / "models" / "statespace").mkdir(parents=True)
     (tmp_path / "models" / "statespace" / "config.json").write_text("{}")

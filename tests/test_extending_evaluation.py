@@ -99,8 +99,8 @@ def test_a_summary_without_the_metric_is_refused(items):
     ("make", "message"),
     [
         (lambda: evaluation.Metric("", height_error), "name of a metric is empty: give the name"),
-        (lambda: evaluation.Metric("height"), "'height' has neither errors nor statistic: give a function"),
-        (lambda: evaluation.Metric("height", height_error, digits=-1), "digits must be a whole number >= 0, got -1"),
+        (lambda: evaluation.Metric("height"), "'height' has neither `errors` nor `statistic`: give a function"),
+        (lambda: evaluation.Metric("height", height_error, digits=-1), "`digits` must be a whole number >= 0, got -1"),
         (
             lambda: evaluation.Metric("height", height_error, compared="up"),
             "must be 'higher', 'lower' or None, got 'up'",
@@ -117,7 +117,7 @@ def test_a_metric_needs_a_name_of_its_own_and_one_number_per_item(items):
     with pytest.raises(ValueError, match="metrics has more than one metric named 'position': give each metric its own"):
         evaluation.summarise({}, test, metrics=(*evaluation.METRICS, dataclasses.replace(HEIGHT, name="position")))
     wrong = dataclasses.replace(HEIGHT, errors=lambda predicted, test: predicted.pose)
-    with pytest.raises(ValueError, match=r"'height_error': the function errors .* \(6, 7\), but .* \(6,\): reduce"):
+    with pytest.raises(ValueError, match=r"'height_error': its function `errors` .* \(6, 7\), but .* \(6,\): reduce"):
         evaluation.scorer(physics.Freefall(), train, metrics=(wrong,))(predicted, test)
 
 

@@ -328,8 +328,8 @@ def test_a_state_space_model_memorises_four_samples(tmp_path):
         ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "targets has samples of"),
         ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "inputs has samples of"),
         ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"empty has .* of shape \(16, 16, 3\)"),
-        ({"present": {"tactile": np.ones(4, bool)}}, r"^present has masks for \['tactile'\]"),
-        ({"target_present": {"tactile": np.ones(4, bool)}}, r"target_present has masks for \['tactile'\]"),
+        ({"present": {"tactile": np.ones(4, bool)}}, r"^`present` has masks for \['tactile'\]"),
+        ({"target_present": {"tactile": np.ones(4, bool)}}, r"`target_present` has masks for \['tactile'\]"),
         ({"condition": np.ones((4, 3), np.float32)}, "condition has width 3"),
     ],
 )

@@ -146,8 +146,8 @@ def check(config: Config) -> None:
         )
     if config.model == "statespace" and collection.crop:
         raise ValueError(
-            "collection.crop must be False for the state-space model, because it locates the object in the whole "
-            "image, got True: give --collection.no-crop, or --model paper"
+            "collection.crop is True, but it must be False for the state-space model, which locates the object in the "
+            "whole image: give --collection.no-crop, or --model paper"
         )
     allowed = image_sizes(config)
     if not allowed:

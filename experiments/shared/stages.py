@@ -91,7 +91,7 @@ def _check_trained(config: Config, workdir: Path, split: str) -> None:
     for name in MODELS[config.model]:
         folder = model_folder(workdir, name, config, split)
         if not (folder / "config.json").exists():
-            raise FileNotFoundError(f"{folder} is not a trained model: run with --only train first")
+            raise FileNotFoundError(f"{folder} is not a trained model: first run with --only train")
 
 
 def note(path: Path, lines: Sequence[str]) -> None:

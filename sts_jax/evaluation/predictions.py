@@ -116,7 +116,7 @@ class Forecaster(Protocol):
 
 
 def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tuple[str, ...]]:
-    """List all non-empty subsets of the inputs of a model, from which it can predict.
+    """List all non-empty subsets of a model's inputs. The model can predict from each of them.
 
     Args:
         modalities: The inputs of the model, `predictor.modalities`. If the model has no inputs, the result has only the

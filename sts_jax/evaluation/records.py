@@ -103,11 +103,15 @@ class Metric:
                 "name of a metric is empty: give the name that it has in summaries, such as 'height_error'"
             )
         if self.errors is None and self.statistic is None:
-            raise ValueError(f"metric {self.name!r} has neither errors nor statistic: give a function as one of them")
+            raise ValueError(
+                f"metric {self.name!r} has neither `errors` nor `statistic`: give a function as one of them"
+            )
         if type(self.digits) is not int or self.digits < 0:
-            raise ValueError(f"metric {self.name!r}: digits must be a whole number >= 0, got {self.digits!r}")
+            raise ValueError(f"metric {self.name!r}: `digits` must be a whole number >= 0, got {self.digits!r}")
         if self.compared not in ("higher", "lower", None):
-            raise ValueError(f"metric {self.name!r}: compared must be 'higher', 'lower' or None, got {self.compared!r}")
+            raise ValueError(
+                f"metric {self.name!r}: `compared` must be 'higher', 'lower' or None, got {self.compared!r}"
+            )
 
     @property
     def title(self) -> str:

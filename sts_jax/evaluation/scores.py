@@ -140,7 +140,7 @@ def _further(predicted: Predicted, test: Pairs, metrics: Sequence[Metric]) -> di
         found[metric.name] = np.asarray(values, np.float64)
         if found[metric.name].shape != (len(test.object),):
             raise ValueError(
-                f"metric {metric.name!r}: the function errors returned the shape {found[metric.name].shape}, but it "
+                f"metric {metric.name!r}: its function `errors` returned the shape {found[metric.name].shape}, but it "
                 f"must return one number per item, shape {(len(test.object),)}: reduce the other axes, for instance by "
                 "a mean"
             )

@@ -30,8 +30,8 @@ def summarise(
         scores: Scores of the predictors by name, including those of `evaluation.baselines`. A predictor may have scores
             of the first items only. Its metrics are then computed from these items.
         test: The held-out trajectories (items) that were scored.
-        metrics: The metrics to compute. `score` must have received the same metrics, because a metric can have a
-            function `errors`, and `score` calls this function.
+        metrics: The metrics to compute. Pass the same metrics to `evaluation.score`, which computes the errors of each
+            item.
         outcomes: The outcomes of the scenario, `scenario.outcomes`. The summary contains their names.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.

@@ -107,7 +107,7 @@ class FoundCorners:
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """A calibrated lens and measures of its quality."""
+    """A calibrated lens, and measures of the quality of the calibration."""
 
     lens: Lens
     errors: tuple[float | None, ...]  # root mean square of each image's reprojection errors (pixels), None: not used

@@ -379,7 +379,7 @@ def encoded(image: Image) -> bytes:
 def confirm_trajectory(folder: Path, number: int, note: str = "") -> None:
     """Write the file `confirmed.json` of a trajectory, so that `load_recordings` includes the trajectory.
 
-    The caller must have locked the session, as `confirm_recording` and `Session.open` do.
+    This function does not lock the folder of the session. The caller must hold the lock.
 
     Args:
         folder: Folder of the session.

@@ -33,10 +33,11 @@ SKIN = 0.001  # m, points up to this height above the deepest one can be contact
 
 
 class Hull(NamedTuple):
-    """The p convex parts of an object in the mesh frame, each with h vertices, e edges and f triangular faces.
+    """The p convex parts of an object in the mesh frame, as arrays of h vertices, e edges and f triangular faces.
 
-    Parts with fewer vertices, edges or faces repeat the last one, so that all parts have arrays of the same size. The
-    axis of coordinates is before the axis of points, because XLA vectorises along the last axis.
+    If a part has fewer vertices, its last vertex is repeated, so that all parts have arrays of the same size. The same
+    holds for edges and faces. The axis of coordinates is before the axis of points, because XLA vectorises
+    along the last axis.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m

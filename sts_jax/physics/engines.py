@@ -115,8 +115,8 @@ def drawn_fields(
 ) -> dict[str, np.ndarray]:
     """Compute the fields of MJX's model that depend on mass properties and friction.
 
-    The fields are computed for each of n draws of hidden properties. They are copies of the fields of a model of C
-    MuJoCo (`scene.set_rigid`).
+    The fields are computed for each of n draws of hidden properties. `scene.set_rigid` sets the fields of a model
+    of C MuJoCo, and the fields are copied from this model.
 
     Args:
         bodies: All bodies.

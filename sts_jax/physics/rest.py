@@ -128,9 +128,10 @@ def place(
 ) -> Placement:
     """Place a body at rest on the level pad, on one of its stable faces and under its own weight.
 
-    The body penetrates the pad by 0.01 mm, the depth of objects at rest in the simulation. In a simulation from this
-    pose, the body therefore stays at rest. In the soft gel, the body sinks much deeper. `sense` computes this depth
-    from the wrench. The function runs on the host and cannot be called under `jit`, `vmap` or `grad`.
+    The simulation treats the pad as almost rigid: an object at rest penetrates it by 0.01 mm. The body is placed at
+    this depth, so it stays at rest in a simulation from this pose. The larger depth in the soft gel of the sensor is
+    computed by `sense`, from the wrench. The function runs on the host and cannot be called under
+    `jit`, `vmap` or `grad`.
 
     Args:
         body: One body.

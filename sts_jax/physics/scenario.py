@@ -207,7 +207,7 @@ class Scenario(abc.ABC):
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) in the condition (`quantities`). They come first, before the scalars."""
+        """Number of vectors (x, y) in the condition. The vectors come first, before the scalars."""
         return sum(quantity.vector for quantity in self.quantities)
 
     @property

@@ -105,9 +105,9 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
     """Raise a ValueError if a training set does not fit a state-space model."""
     if arrays.target_present or not set(arrays.present) <= set(model.inputs):
         raise ValueError(
-            f"present has masks for {sorted(arrays.present)}, target_present has masks for "
-            f"{sorted(arrays.target_present)}, but a state-space model allows masks only in `present`, for its "
-            f"inputs {list(model.inputs)}: remove all other masks"
+            f"`present` has masks for {sorted(arrays.present)}, `target_present` has masks for "
+            f"{sorted(arrays.target_present)}, but a state-space model allows masks only in `present`, for the "
+            f"model's inputs {list(model.inputs)}: remove all other masks"
         )
     size, small = (model.input_size,) * 2, (model.image_size,) * 2
     codes, images = {"state": (statespace.STATE_CODE,), "pose": (statespace.POSE_CODE,)}, statespace.IMAGES

@@ -85,7 +85,7 @@ def predictions(
 
 
 def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
-    """Draw how often the likeliest outcome is the true one, over its predicted probability.
+    """Draw how often the likeliest outcome is the true one, as a function of its predicted probability.
 
     The frequencies of a calibrated predictor equal the probabilities. A second plot below shows the number of held-out
     trajectories in each bin of the probability.
