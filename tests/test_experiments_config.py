@@ -57,7 +57,7 @@ def test_image_sizes_divide_the_resolution_and_suit_the_networks(model, side, si
         ({"collection": {"resolution": (8, 8)}}, r"collection\.resolution must be a size .* got 8 x 8: give"),
         (
             {"collection": {"crop": True}},
-            r"collection\.crop must be False .* got True: give --collection\.no-crop, or --model paper",
+            r"collection\.crop is True, but it must be False .*: give --collection\.no-crop, or --model paper",
         ),
         ({"model": "paper", "steps": (5,)}, r"steps must have 4 numbers, one for each of mvae, .* got \(5,\)"),
         ({"splits": ("frame",)}, r"splits must be one or more of object, trajectory, got \('frame',\)"),
