@@ -68,8 +68,8 @@ def predict(
         state: Parameters and running batch statistics of the model.
         preprocessing: Preprocessing with which the model was trained.
         blank: Tactile image of the untouched sensor in [0, 1].
-        inputs: Inputs by the name of the modality: images "visual" and "tactile" in [0, 1], (*n, height, width, 3),
-            and "pose", (*n, 7), position (m) and unit quaternion. Any of these may be missing.
+        inputs: Inputs by the name of the modality. "visual" and "tactile" are images in [0, 1], (*n, height, width, 3).
+            "pose" is a position (m) and a unit quaternion, (*n, 7). Any of these may be missing.
         present: Masks (*n,) by the name of the modality, False for items of the batch that are ignored. A modality
             without a mask is used for all items. Tactile images without contact are always ignored, unless the model
             was trained with blank tactile images as inputs.

@@ -82,7 +82,7 @@ def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | N
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
-        The mean, or NaN without pixels.
+        The mean, or NaN if the weighted number of pixels is 0.
     """
     w = np.ones(len(values)) if weight is None else weight
     total = float((w * count).sum())
@@ -283,7 +283,8 @@ def reliability(
         bins: Number of bins of the probability, of equal width in [0, 1] (default: 10).
 
     Returns:
-        The mean probability, the share and the number of items of each bin.
+        The mean probability, the share of items whose likeliest outcome is the true one, and the number of items, for
+        each bin.
     """
     w = np.ones(len(right)) if weight is None else weight
     place = np.minimum((confidence * bins).astype(int), bins - 1)

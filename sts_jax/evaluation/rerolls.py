@@ -51,15 +51,16 @@ def ceiling(
     Args:
         collection: The description of the dataset that contains the items.
         sensor: The sensor that renders the last frames.
-        test: The items. The predicted images have the resolution of their images.
+        test: The items. The predicted images have the resolution of the items' images.
         times: Number of re-rolls per item, >= 1.
         key: The random key of the re-rolls.
         progress: Function that is called with the number of re-rolls simulated so far, over all items.
 
     Returns:
-        A prediction with the re-rolls as samples (images in `uint8`). Its images are their means, and its pose is their
-        central pose (`metrics.centre`). Its outcome probabilities are the shares of the outcomes among the re-rolls and
-        one additional sample, which is spread evenly over all outcomes (`shares`).
+        A prediction with the re-rolls as samples (images in `uint8`). The predicted images are the means of the
+        samples' images. The predicted pose is the central pose of the samples (`metrics.centre`). The outcome
+        probabilities are the shares of the outcomes among the re-rolls and one additional sample, which is spread
+        evenly over all outcomes (`shares`).
 
     Raises:
         ValueError: `times` is below 1.

@@ -10,7 +10,7 @@ class CameraNotFoundError(CameraError):
 
 
 class CameraPermissionError(CameraError):
-    """The user may not open the device or the file."""
+    """The user is not allowed to open the device or the file."""
 
 
 class CameraBusyError(CameraError):

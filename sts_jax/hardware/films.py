@@ -58,7 +58,7 @@ class Film(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Close the video files, after which `image` cannot be called. A second call has no effect."""
+        """Close the video files. Afterwards, `image` cannot be called. Closing twice is allowed."""
 
 
 class _Place(NamedTuple):
@@ -153,7 +153,7 @@ class RecordedFilm(Film):
         return np.asarray(image)
 
     def close(self) -> None:
-        """Close the video files, after which `image` cannot be called. A second call has no effect."""
+        """Close the video files. Afterwards, `image` cannot be called. Closing twice is allowed."""
         while self._files:
             self._files.popitem()[1].close()
 
@@ -256,7 +256,7 @@ class VideoFilm(Film):
         return self._videos[still.stream].frame(still.sequence)
 
     def close(self) -> None:
-        """Close the video files, after which `image` cannot be called. A second call has no effect."""
+        """Close the video files. Afterwards, `image` cannot be called. Closing twice is allowed."""
         while self._videos:
             self._videos.popitem()[1].capture.release()
 

@@ -41,7 +41,8 @@ class _Problem:
 class Grabber:
     """The thread that fetches the frames of a camera, from `Camera.connect` to `Camera.disconnect`.
 
-    Only this thread opens, reads and closes the source, and locks the camera against use by others.
+    Only this thread opens, reads and closes the source, which is a device, a stream or a video file. While the thread
+    runs, no other `Camera` can use the device or the stream.
     """
 
     def __init__(self, config: CameraConfig):
@@ -123,7 +124,7 @@ class Grabber:
             return list(self.refused)
 
     def set_exposure(self, value: float, timeout_s: float) -> float | None:
-        """Set the exposure between two frames.
+        """Set the exposure when the next frame has arrived.
 
         Args:
             value: Exposure in the driver's unit (V4L2: 0.1 ms).
@@ -177,8 +178,7 @@ class Grabber:
             The frame.
 
         Raises:
-            CameraError: No frame has arrived in time, the camera was lost or disconnected, or there is another reason
-                that `Camera.read` lists.
+            CameraError: There is no frame. `Camera.read` lists the subclasses.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -211,7 +211,7 @@ class Grabber:
         """Return the newest frame. After the end of a video file, this is its last frame.
 
         Raises:
-            CameraError: There are no frames at present, for the reasons that `Camera.read` lists.
+            CameraError: There are no frames at present. `Camera.read` lists the subclasses.
         """
         with self._changed:
             ended = self._problem is not None and self._problem.error is EndOfVideoError

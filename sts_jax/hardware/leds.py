@@ -106,7 +106,7 @@ class Leds:
         Raises:
             ValueError: `timeout_s`, `answer_s` or `watchdog_ms` is out of range.
             PortNotFoundError: There is no such port.
-            PortPermissionError: The user may not open the port.
+            PortPermissionError: The user is not allowed to open the port.
             PortInUseError: Another process has opened the port.
             NotALedControllerError: Another device is on the port, or the baud rate is wrong.
             WrongVersionError: The controller uses another version of the protocol.
@@ -128,8 +128,8 @@ class Leds:
         """Search the USB ports for the controller with a given serial number, and connect to it.
 
         The controller reports its serial number only through an open port. The USB ports are therefore opened one after
-        the other until the controller is found. Ports whose USB device has the same serial number come first. Opening a
-        port restarts most boards.
+        the other until the controller is found. Ports that have `serial_number` in their USB descriptor come first.
+        Opening a port restarts most boards.
 
         Args:
             serial_number: Serial number of the controller, as `Leds.serial_number` returns it.

@@ -20,7 +20,7 @@ class LedError(OSError):
 
 
 class PortNotFoundError(LedError):
-    """Raised if a serial port does not exist, or if none has the wanted controller. The message lists other ports."""
+    """Raised if a port does not exist, or if no port has the wanted controller. The message lists other ports."""
 
 
 class PortPermissionError(LedError):
@@ -28,7 +28,7 @@ class PortPermissionError(LedError):
 
 
 class PortInUseError(LedError):
-    """Raised if the serial port is open already. The message names the process that has opened it, if it is known."""
+    """Raised if a process has opened the serial port already. The message names that process if it is known."""
 
 
 class NotALedControllerError(LedError):

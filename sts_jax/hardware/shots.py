@@ -24,7 +24,8 @@ class Shot:
     """An image of one stream, with the times between which the lights did not change.
 
     The lights did not change from `before.acknowledged_s` to `until_s`, and the frame arrived between these times. It
-    also arrived at least one settling time after `before.acknowledged_s`, so it does not show the former lights.
+    also arrived at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the
+    lights.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only

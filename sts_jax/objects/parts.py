@@ -109,8 +109,9 @@ def surface_gaps(
     """Compute the largest distances between a visible surface and its collision parts.
 
     Each distance is a maximum over points of one surface: all of its corners, and 10,000 other points. The distance of
-    each point from the other surface is exact. The true maximum can lie between the points. The error is then about
-    half the distance between neighbouring points. For a single hull, the first distance is exact.
+    each point from the other surface is exact. The true maximum can lie between the points. The returned value is then
+    too small by about half the distance between neighbouring points. For a single hull, the first returned value is
+    exact.
 
     Args:
         vertices: Vertices of the visible surface (m).

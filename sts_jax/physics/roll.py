@@ -111,9 +111,9 @@ def _depth(points: Float[Array, "3 h"], model: mjx.Model) -> Float[Array, ""]:
 def step(model: mjx.Model, data: mjx.Data, hull: Hull, state: State, gravity: Float[Array, "3"]) -> State:
     """Advance a state by one time step.
 
-    The new state contains the wrench of the pad on the object: the sum over all contacts with the pad, with the moment
-    about the sensor's origin. The scene also has a wall that stops the object. Contacts with the wall are not
-    part of the wrench.
+    The new state contains the wrench of the pad on the object, summed over all contacts with the pad. The moment is
+    about the sensor's origin. The scene also has a wall that stops the object. Contacts with the wall are not part of
+    the wrench.
 
     Args:
         model: Model of the scene in MJX. Its gravity is replaced.

@@ -140,9 +140,9 @@ def touch_of_noisy_images(
     at least 3/255 and at most 24/255.
 
     The standard deviation is estimated as 1.4826 times the median absolute difference between the block means of the
-    images and of the blank image. The median difference of each image and channel is subtracted first, so a change of
-    all light does not count. Contacts on less than half of the pad hardly change the estimate. An uneven change of the
-    light since the blank image increases the estimate.
+    images and of the blank image. The median difference of each image and channel is subtracted first, so a uniform
+    change of the light does not count. Contacts on less than half of the pad hardly change the estimate. An uneven
+    change of the light since the blank image increases the estimate.
 
     Args:
         preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.
@@ -223,7 +223,9 @@ def load_blank(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     path = folder / "blank.npz"
     if not path.exists():
-        raise FileNotFoundError(f"{path} is missing: start the training again, or write it with training.save_blank.")
+        raise FileNotFoundError(
+            f"{path} is missing: start the training again, or write the file with training.save_blank."
+        )
     try:
         with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as arrays:
             images = arrays["visual"], arrays["tactile"]

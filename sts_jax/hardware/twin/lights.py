@@ -104,7 +104,7 @@ class LightHistory:
         The last change at or before this time is kept, because it determines the brightness after this time.
 
         Args:
-            before_s: The time (s), on the clock of `set`.
+            before_s: The time (s), on the same clock as the argument `time_s` of `set`.
         """
         keep = bisect.bisect_right(self._changes, before_s, key=lambda change: change.time_s) - 1
         del self._changes[:keep]
