@@ -172,9 +172,10 @@ def pose_from_matrix(matrix: Float[Array, "*n 4 4"]) -> Float[Array, "*n 7"]:
 
 
 def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """Composition of two poses: `b` is applied first, then `a`. Its matrix is the matrix of `a` times that of `b`.
+    """Composition of two poses: `b` is applied first, then `a`.
 
-    A pose is a position (m) and a unit quaternion [w, x, y, z].
+    The matrix of the composition is the matrix of `a` times the matrix of `b`. A pose is a position (m) and a unit
+    quaternion [w, x, y, z].
     """
     a, b = _checked("a", a, 7), _checked("b", b, 7)
     quat = quat_multiply(a[..., 3:], b[..., 3:])
@@ -183,7 +184,7 @@ def pose_multiply(a: Float[Array, "*n 7"], b: Float[Array, "*n 7"]) -> Float[Arr
 
 
 def pose_inverse(pose: Float[Array, "*n 7"]) -> Float[Array, "*n 7"]:
-    """Inverse of a pose: it maps points of the sensor frame to the mesh frame.
+    """Inverse of a pose. The inverse maps points of the sensor frame to the mesh frame.
 
     A pose is a position (m) and a unit quaternion [w, x, y, z].
     """

@@ -205,8 +205,8 @@ def test_a_condition_reaches_the_decoders():
     ("options", "message"),
     [
         ({"absent": ("sound",)}, "sound"),
-        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "present or target_present has the names"),
-        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "present or target_present has the names"),
+        ({"present": {"sound": jnp.ones(BATCH, bool)}}, "`present` or `target_present` has the names"),
+        ({"target_present": {"sound": jnp.ones(BATCH, bool)}}, "`present` or `target_present` has the names"),
         ({"condition": jnp.ones((BATCH, 2))}, "width 2"),
     ],
 )
@@ -226,5 +226,5 @@ def test_no_input_and_unknown_names_are_errors():
         gradient(VECTORS, batch(VECTORS), {})
     with pytest.raises(ValueError, match="sound"):
         gradient(VECTORS, batch(VECTORS) | {"sound": jnp.ones((BATCH, 3))}, batch(VECTORS))
-    with pytest.raises(ValueError, match="present has the names"):
+    with pytest.raises(ValueError, match="`present` has the names"):
         mvae.infer(graphdef, state, batch(VECTORS), present={"sound": jnp.ones(BATCH, bool)})

@@ -73,11 +73,12 @@ def collect(
     Raises:
         ValueError: A constant of the sensor or a field of the collection is out of range, the pad is not square but the
             symmetries of the collection need a square pad, or no object of a shard can be simulated. The error is also
-            raised if the folder contains a dataset of another collection, sensor or format. The message names the
-            constant, the field or the file.
+            raised if `collection.json`, `sensor.json` or `split.json` in the folder is from another collection, sensor
+            or format. The message names the constant, the field or the file.
         ImportError: `collection.parts` or a mesh file needs a package that is not installed.
         LockedError: Another process collects into the folder.
-        DamagedFileError: A file in the folder is damaged, or belongs to another dataset or shard. The message names it.
+        DamagedFileError: A file in the folder is damaged, or a file of a shard belongs to another dataset or shard. The
+            message names the file.
         OSError: The disk is full, or the folder cannot be written to.
     """
     sensor.check()

@@ -16,11 +16,11 @@ def named(outcome: int, outcomes: Sequence[enum.IntEnum] = OUTCOMES) -> str:
     """Return the name of an outcome, such as `fell_off`.
 
     Args:
-        outcome: Value of the outcome, which is a member of an `IntEnum`.
+        outcome: Value of a member of `outcomes`.
         outcomes: The outcomes of the scenario, `scenario.outcomes` (default: all members of `physics.Outcome`).
 
     Raises:
-        KeyError: None of `outcomes` has this number.
+        KeyError: No member of `outcomes` has this value.
     """
     return {int(one): one.name.lower() for one in outcomes}[outcome]
 

@@ -56,7 +56,7 @@ class Lens:
 
     Raises:
         ValueError: A field is out of range. Or the pad is not in front of the camera. Or the camera is outside of the
-            sensor, which means that its z coordinate in the sensor frame is not negative.
+            sensor: the z coordinate of the camera in the sensor frame is not negative.
     """
 
     width: int  # width of the raw images (pixels)
@@ -258,7 +258,7 @@ def rectification(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int]) -> 
         raise ValueError(
             f"the model of the lens is valid up to {math.degrees(lens.largest_angle):.1f} degrees from the optical "
             f"axis, but {np.isnan(pixels[..., 0]).sum()} of {rows * columns} points of the sensor's view lie at larger "
-            "angles. Calibrate the lens again, with images of the board in the corners of the view."
+            "angles. Calibrate the lens again, with images of the calibration board in the corners of the view."
         )
     return pixels
 
@@ -338,9 +338,9 @@ def distorted(
     Args:
         lens: The lens and the pose of the real camera.
         pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
-        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. If its
-            aspect ratio is that of the view, it must show the whole view, as an image of `sts_jax.sense` does.
-            Otherwise, it must show the view cropped around its centre.
+        image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. If the
+            image and the view have the same aspect ratio, the image must show the whole view, as an image of
+            `sts_jax.sense` does. Otherwise, the image must show the view cropped around the centre of the view.
         outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
         samples: Number of samples per raw pixel in each direction. Fewer samples are faster. None: as many samples as
             needed to avoid aliasing.

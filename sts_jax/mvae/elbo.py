@@ -182,9 +182,9 @@ def infer(
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
     if unknown or not inputs:
         raise ValueError(
-            f"inputs has the names {list(inputs)} and present has the names {list(present or {})}, but both may only "
-            f"have names of the model's modalities {list(model.config.names)}: use these names, and give at least one "
-            "input"
+            f"`inputs` has the names {list(inputs)} and `present` has the names {list(present or {})}, but both may "
+            f"only have names of the model's modalities {list(model.config.names)}: use these names, and give at least "
+            "one input"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
@@ -254,13 +254,13 @@ def _check(
     config: Config, asked: str, absent: tuple[str, ...], targets: dict[str, Array], given: dict[str, Array]
 ) -> None:
     if asked not in ("all", "own"):
-        raise ValueError(f"asked is {asked!r}, but it must be 'all' or 'own'")
+        raise ValueError(f"`asked` is {asked!r}, but it must be 'all' or 'own'")
     if set(absent) - set(config.names):
-        raise ValueError(f"absent is {absent}, but the model has only the modalities {config.names}: use these names")
+        raise ValueError(f"`absent` is {absent}, but the model has only the modalities {config.names}: use these names")
     unknown = sorted(set(given) - set(config.names))
     if unknown:
         raise ValueError(
-            f"inputs, present or target_present has the names {unknown}, but the model has only the modalities "
+            f"`inputs`, `present` or `target_present` has the names {unknown}, but the model has only the modalities "
             f"{config.names}: use these names"
         )
     if set(targets) != set(config.names):

@@ -31,8 +31,9 @@ class Body:
     """A rigid object in its own mesh frame, as a pytree whose leaves are all arrays.
 
     The object is a shell, whose interior can be filled with contents such as water. `rigid` computes mass, centre of
-    mass and inertia from both. The origin lies inside the convex hull. The object usually stands or lies with +z up.
-    The albedo at a point is the texture's value times the interpolated corner colour (as in glTF), in linear light.
+    mass and inertia of the shell with its contents. The origin lies inside the convex hull. The object usually stands
+    or lies with +z up. The albedo at a point is the texture's value times the interpolated corner colour (as in glTF),
+    in linear light.
     """
 
     vertices: Float[Array, "*n v 3"]  # Vertices of the visible surface (m).
@@ -109,7 +110,8 @@ def size_class(count: int, classes: tuple[int, ...]) -> int:
 
     Args:
         count: Number of rows of the array.
-        classes: Allowed numbers of rows in ascending order, such as FACE_CLASSES. The last one is at least `count`.
+        classes: Allowed numbers of rows in ascending order, such as `FACE_CLASSES`. The last number is at least
+            `count`.
 
     Returns:
         The smallest of the allowed numbers that is at least `count`.
@@ -147,8 +149,8 @@ def stack(bodies: Sequence[Body]) -> Body:
 
     Args:
         bodies: At least one body. The arrays of all bodies must have the same shapes. Many bodies fulfil this, because
-            arrays are padded to the lengths in FACE_CLASSES, PART_CLASSES and HULL_CLASSES, and textures are resized to
-            the sides in TEXTURE_CLASSES.
+            arrays are padded to the lengths in `FACE_CLASSES`, `PART_CLASSES` and `HULL_CLASSES`, and textures are
+            resized to the side lengths in `TEXTURE_CLASSES`.
 
     Returns:
         A body whose arrays are stacked along a new first axis.

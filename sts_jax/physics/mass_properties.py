@@ -33,7 +33,8 @@ def rigids(bodies: Sequence[Body], which: Int[np.ndarray, "n"], hidden: Hidden) 
     Args:
         bodies: All bodies.
         which: Index of one body for each set of hidden properties, (n,), in ascending order.
-        hidden: n sets of hidden properties: arrays of shape (n,), and `up` of shape (n, 3).
+        hidden: The n sets of hidden properties. The field `up` has the shape (n, 3), and all other fields have the
+            shape (n,).
 
     Returns:
         Arrays with a leading axis of n, in the order of `which`.

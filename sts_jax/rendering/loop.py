@@ -22,7 +22,7 @@ Flat = Callable[..., list[Array]]
 
 
 def looped(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function for which `jax.vmap` is a loop over the items on a CPU, and a batch on other devices.
+    """Return a function that `jax.vmap` runs item by item on a CPU, and for all items at once on other devices.
 
     Args:
         function: Function from pytrees of arrays to a pytree of arrays. It must receive all traced values as

@@ -48,8 +48,8 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
     """The certainty of each object's rotation: 0 if the rotation is unknown, 0.8 to 1 if the rotation is known exactly.
 
     The columns of a rotation matrix are the mesh axes, which have a length of 1. If the rotation is uncertain, the
-    columns of the mean matrix are shorter. The certainty is the length of the longest projection of a column onto the
-    plane of the pad.
+    mean of its possible matrices has shorter columns. The certainty is the length of the longest projection of a column
+    onto the plane of the pad.
 
     Args:
         code: Means of pose codes (position and rotation matrix) under the density of an uncertain pose.
@@ -90,7 +90,7 @@ def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[A
 
 
 def turn_back(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
-    """Rotate vectors (x, y) by the negative angles. This is the inverse of `turn`."""
+    """Rotate vectors (x, y) by the angles with the opposite sign. This is the inverse of `turn`."""
     return turn(angle * jnp.array([1.0, -1.0]), vector)
 
 
@@ -112,7 +112,7 @@ def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Flo
 
 
 def turn_code_back(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Compute pose codes after a rotation by the negative angles. This is the inverse of `turn_code`."""
+    """Compute pose codes after a rotation by the angles with the opposite sign. This is the inverse of `turn_code`."""
     return turn_code(angle * jnp.array([1.0, -1.0]), code)
 
 

@@ -21,7 +21,7 @@ class Arrays:
     [0, 1].
 
     Raises:
-        ValueError: These arrays have different numbers of samples, or no samples.
+        ValueError: The arrays whose first axis is the sample have different lengths, or the length 0.
     """
 
     inputs: dict[str, np.ndarray]  # inputs of the model, from first frames
@@ -62,7 +62,7 @@ class Arrays:
                 A field for which no indices are given is left out of the batch.
 
         Returns:
-            The selected arrays by name of the field, and the whole field `empty`.
+            The selected arrays by name of the field. The field named `empty` is included as a whole.
         """
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}

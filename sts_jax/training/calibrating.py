@@ -15,7 +15,7 @@ from sts_jax.training.model import Model, load
 def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     """Fit the calibration of a trained state-space model, and write it to `calibration.json` in its folder.
 
-    The calibration widens the predicted density of the final pose, which is too narrow for new objects, see
+    For new objects, the predicted density of the final pose is too narrow. The calibration widens this density, see
     `statespace.fit_calibration`. If the model was calibrated on the same arrays before, nothing is fitted or written.
 
     Args:

@@ -111,7 +111,7 @@ def verify(folder: Path, manifest: Manifest) -> None:
         if found != digest:
             again = " or delete this file and start the training again" if name == "blank.npz" else ""
             raise _files.DamagedFileError(
-                f"{path} is not the file that {NAME} lists (its SHA-256 differs) because it was edited, exchanged or "
+                f"{path} is not the file that {NAME} lists: its SHA-256 differs. The file was edited, exchanged or "
                 f"damaged: {remedy}{again}."
             )
 

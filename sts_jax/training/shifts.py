@@ -32,15 +32,15 @@ def shifted(
     size = images.shape[2:4]
     if empty.shape != images.shape[2:] or shifts.shape != (len(images), 2):
         raise ValueError(
-            f"images has shape {images.shape}, empty has shape {empty.shape} and shifts has shape {shifts.shape}, but "
-            "images must have shape (n, 2, h, w, 3), empty must have shape (h, w, 3), and shifts must have shape "
-            "(n, 2), with the same n, h and w"
+            f"`images` has shape {images.shape}, `empty` has shape {empty.shape} and `shifts` has shape "
+            f"{shifts.shape}, but `images` must have shape (n, 2, h, w, 3), `empty` must have shape (h, w, 3), and "
+            "`shifts` must have shape (n, 2), with the same n, h and w"
         )
     if (np.abs(shifts) >= size).any():
         rows, columns = np.abs(shifts).max(0).tolist()
         raise ValueError(
-            f"shifts contains shifts of up to {rows} rows and {columns} columns, but they must be below the image size "
-            f"of {size[0]} rows and {size[1]} columns: give smaller shifts"
+            f"`shifts` contains shifts of up to {rows} rows and {columns} columns, but they must be below the image "
+            f"size of {size[0]} rows and {size[1]} columns: give smaller shifts"
         )
     moved = np.empty_like(images)
     for out, pair, shift in zip(moved, images, shifts, strict=True):
