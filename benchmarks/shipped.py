@@ -85,7 +85,7 @@ def main(args: Args) -> str:
     """
     if args.objects < 5:
         raise ValueError(
-            f"--objects must be at least 5, so that a fifth of them can be for the baselines, got {args.objects}"
+            f"--objects must be at least 5, because a fifth of the objects is for the baselines, got {args.objects}"
         )
     sts.enable_compilation_cache()
     folder = args.workdir or Path("runs") / f"shipped-{args.model}"

@@ -474,7 +474,7 @@ def test_rigid_finds_the_nearest_rotation():
     [
         ({"inputs": ("pose",)}, "at least one input must be an image: add 'visual' or 'tactile'"),
         ({"inputs": ("pose", "visual")}, "in this order"),
-        ({"inputs": ()}, "at least one of"),
+        ({"inputs": ()}, "one or more of"),
         ({"window": 12}, "window is 12 pixels, but it must be a multiple of 8"),
         ({"input_size": 24}, "input_size is 24 pixels, but it must be a multiple of 16, the image_size"),
         ({"encoder": (4, 4)}, "encoder has 2 widths and decoder has 3, but each must have 3"),

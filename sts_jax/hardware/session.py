@@ -92,8 +92,8 @@ class Session:
     only trajectories that are on disk. These trajectories survive a loss of power. If writing fails, for example
     because the disk is full, the thread tries again every second, and `problem` describes the error.
 
-    Changes (pairs of images, confirmations and discards) wait in memory until they are on disk. At most 6 changes, as
-    many as for two trajectories, can wait. If 6 changes wait, `save` and `confirm` raise a `SessionError`. To avoid
+    Changes (pairs of images, confirmations and discards) wait in memory until they are on disk. At most 6 changes can
+    wait, which is enough for two trajectories. If 6 changes wait, `save` and `confirm` raise a `SessionError`. To avoid
     this error, call `check_ready` before each trajectory. It raises a `SessionError` unless the session can accept all
     changes of the trajectory.
     """

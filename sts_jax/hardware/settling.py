@@ -77,8 +77,8 @@ def check_contrast(contrast: float) -> None:
     """
     if contrast < _LEAST_CONTRAST:
         raise NoContrastError(
-            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, but at least "
-            f"{_LEAST_CONTRAST:g} are needed: check the LEDs' wiring and levels, and lock the camera's exposure."
+            f"the image changes by {contrast:.2f} of 255 on average between lights off and on, but it must change by "
+            f"at least {_LEAST_CONTRAST:g}: check the LEDs' wiring and levels, and lock the camera's exposure."
         )
 
 
@@ -102,9 +102,10 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
     """Return the progress of a switch of the lights in an image: 0 with the former lights, 1 with the new lights.
 
-    The result is the median of `(look - before) / change` over the values that the switch changes clearly. A change
-    is visible if its size is at least 0.5 (of 255). A visible change is clear if its size is at least a quarter of the
-    median size of the visible changes. An object that moves in less than half of the view therefore has no influence.
+    The result is the median of `(look - before) / change` over the values that the switch changes clearly. Because of
+    the median, an object that moves in less than half of the view has no influence. A change is visible if its size is
+    at least 0.5 (of 255). A visible change is clear if its size is at least a quarter of the median size of the visible
+    changes.
 
     Args:
         look: Thumbnail of the image.

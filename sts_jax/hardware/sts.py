@@ -50,8 +50,7 @@ class STS:
     ```
 
     The lights are off in the visual stream and on in the tactile stream. For each returned image, it is proven that the
-    lights were in the state of its stream during the whole exposure. A frame of the camera must meet all of these
-    conditions:
+    lights were in the right state during the whole exposure. A frame of the camera must meet all of these conditions:
 
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
       lights. Earlier frames may show the former lights.
@@ -276,9 +275,9 @@ class STS:
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take one image of each stream.
 
-        Both frames arrive after the call. The first one may have been exposed before the call. The time from exposure
-        to arrival is at most one settling time. The first image belongs to the stream for which the lights are already
-        set, so each pair needs only one switch of the lights.
+        Both frames arrive after the start of the call. The first frame may have been exposed earlier. The time from
+        exposure to arrival is at most one settling time. The first image belongs to the stream for which the lights are
+        already set, so each pair needs only one switch of the lights.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
@@ -352,8 +351,8 @@ class STS:
 
         Args:
             duty: Share of tactile images, 0 to 1.
-            dwell: Number of successive images of one stream, >= 1. A larger number needs fewer switches of the lights,
-                each of which costs the settling time.
+            dwell: Number of successive images of one stream, >= 1. With a larger number, the lights switch less often.
+                Each switch costs the settling time.
 
         Returns:
             The iterator. Each step waits for one image, for at most the sensor's `timeout_s`.
@@ -370,9 +369,9 @@ class STS:
         """Wait until nothing moves in the visual stream.
 
         Each image is divided into 32 x 24 blocks, and the mean colours of the blocks (0 to 255) are compared. The view
-        counts as still if, for `window_s` seconds, no block differs by more than 6 from the same block at the beginning
-        of this period. For noisy images, the limit is 8 times the median difference over all blocks, if this is larger
-        than 6.
+        counts as still if, for `window_s` seconds, no block differs by more than a limit from the same block at the
+        beginning of this period. The limit is the larger of two values: 6, and 8 times the median difference over all
+        blocks. For noisy images, the second value is larger.
 
         Args:
             timeout_s: Longest time from the first image to the returned one (s).
@@ -406,7 +405,7 @@ class STS:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image was still changing `watch_s` after a switch, in each of three attempts.
+            LightError: The image was still changing `watch_s` seconds after a switch, in each of three attempts.
             LedError: The controller does not answer.
             CameraError: The sensor is not connected, or the camera sends no usable frames.
         """

@@ -39,7 +39,7 @@ def assemble(
     Args:
         vertices: Vertices of the surface (m), with +z up, at most 131,072.
         faces: Vertex indices of each face, counter-clockwise seen from outside, at most 131,072 faces.
-        colors: Colour of each corner of each face, in linear light, [0, 1]. `texture` is multiplied by it.
+        colors: Colour of each corner of each face, in linear light, [0, 1]. `texture` is multiplied by this colour.
         density: Mass per area of each face (kg/m^2).
         interior: Vertices and faces of a closed mesh around the contents, such as the water in a bottle, in the frame
             of `vertices`. None for an object without contents.

@@ -118,10 +118,10 @@ def rest_poses(
         com: Centre of mass (m), in the same frame.
 
     Returns:
-        A unit vector and a share for each of the k faces on which the hull can rest. The unit vector, in the frame of
-        `points`, points up when the hull rests on the face. The share is the solid angle of the face, seen from the
-        centre of mass, divided by the sum of the solid angles of these k faces. A larger share means that the object is
-        more likely to land on the face. Both arrays are empty if there is no such face.
+        A unit vector and a share for each of the k faces on which the hull can rest. The unit vector is in the
+        frame of `points`. It points up when the hull rests on the face. The share is the solid angle of the face, seen
+        from the centre of mass, divided by the sum of the solid angles of these k faces. A larger share means that the
+        object is more likely to land on the face. Both arrays are empty if there is no such face.
     """
     hull = ConvexHull(points)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]

@@ -86,8 +86,8 @@ def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -
 
     Args:
         angle: Cosine and sine of the rotation angle of each object.
-        variance: Variances of the k coefficients, for c functions of each of n objects. k is `number(degree)`, and the
-            order is that of `basis`. The coefficients are assumed to be independent.
+        variance: Variances of the k coefficients, for c functions of each of n objects. The harmonics are those of
+            `basis`, in the same order. The coefficients are assumed to be independent.
 
     Returns:
         Variances of the coefficients of the rotated functions. Covariances, which the rotation causes, are left out.

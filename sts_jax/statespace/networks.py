@@ -83,7 +83,7 @@ class Config:
 
     def __post_init__(self) -> None:
         if not self.inputs or [name for name in INPUTS if name in self.inputs] != list(self.inputs):
-            raise ValueError(f"inputs is {self.inputs}, but it must have at least one of {INPUTS}, in this order")
+            raise ValueError(f"inputs is {self.inputs}, but it must be one or more of {INPUTS}, in this order")
         if not set(self.inputs) & set(IMAGES):
             raise ValueError(
                 f"inputs is {self.inputs}, but at least one input must be an image: add 'visual' or 'tactile'"
@@ -118,8 +118,8 @@ class Config:
     def to_json(self) -> dict[str, Any]:
         """The fields by name, in values that `json.dumps` accepts.
 
-        The field `vectors` is left out if it has its default value 1. Models of older versions were saved without this
-        field, and a resumed training compares the fields with those of the saved model.
+        The field `vectors` is left out if it has its default value 1. Older versions did not save this field, and the
+        fields of a resumed training must equal those of the saved model.
         """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
@@ -137,7 +137,7 @@ class FinalPose(NamedTuple):
     For each outcome of the scenario, such as resting or falling off, the density is a mixture of k Gaussians over 21
     numbers. The first 12 numbers are the final pose code (position and rotation matrix, see `statespace.poses`). The
     other 9 are the matrix of the rotation from the first to the final pose, row by row. All numbers refer to a frame
-    with the origin and the z axis of the sensor frame. The x axis of this frame points along `heading`.
+    that has the origin and the z axis of the sensor frame, and an x axis along `heading`.
     """
 
     outcome: Float[Array, "n outcomes"]  # log probability of each outcome
@@ -185,8 +185,8 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
     rotate with the object.
 
     Args:
-        config: Configuration of the model. It has `config.traits` traits, `config.own` functions of a direction in the
-            mesh frame, and `config.shown` functions of a direction in the sensor frame.
+        config: Configuration of the model. An appearance code consists of `config.traits` traits, `config.own`
+            functions of a direction in the mesh frame, and `config.shown` functions of a direction in the sensor frame.
         look: Appearance codes of n items.
 
     Returns:
@@ -442,9 +442,9 @@ def compose(
     Args:
         layers: Rendered images of n objects, from the decoder.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the size of the rendered images.
-        level: Threshold of each object for sharp outlines, from 0 to 1. A pixel shows the object if the probability
-            `layers.covered` is above the threshold, and the empty sensor otherwise. If the threshold is drawn
-            uniformly, a pixel shows the object with this probability. With None, each pixel has the expected colour.
+        level: Threshold of each object for sharp outlines, from 0 to 1. A pixel shows the object if its probability p
+            from `layers.covered` is above the threshold, and the empty sensor otherwise. If the threshold is drawn
+            uniformly, a pixel shows the object with the probability p. With None, each pixel has the expected colour.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].
@@ -501,8 +501,8 @@ def init(key: PRNGKeyArray, config: Config) -> tuple[nnx.GraphDef[Model], nnx.St
         config: Configuration of the model.
 
     Returns:
-        The definition `graphdef`, the parameters `params`, and an empty state `stats`, because the model has no running
-        batch statistics.
+        The definition `graphdef`, the parameters `params`, and the state `stats`. This state is empty, because the
+        model has no running batch statistics.
     """
 
     @jax.jit

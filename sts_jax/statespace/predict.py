@@ -14,7 +14,10 @@ from sts_jax.statespace.objective import reduced
 
 
 class Samples(NamedTuple):
-    """Samples of the last frame: k final poses for each of n items, and images of the first `drawn` of these poses."""
+    """Samples of the last frame: k final poses for each of n items, and images of some of these poses.
+
+    The images show the first poses of each item. The argument `drawn` of `sample` is the number of these poses.
+    """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
     outcome: Float[Array, "n outcomes"]  # probability of each outcome

@@ -13,10 +13,10 @@ def optimiser(config: TrainConfig, total: int) -> optax.GradientTransformation:
 
     Args:
         config: Options of the training.
-        total: Number of steps of the whole training, after which a cosine schedule reaches 0.
+        total: Number of steps of the whole training. A cosine schedule reaches 0 after these steps.
 
     Returns:
-        The optimiser, with the learning rate schedule and the clipping of `config`.
+        The optimiser, with the learning rate schedule and the gradient clipping that `config` sets.
     """
     rate: float | optax.Schedule = config.learning_rate
     if config.schedule == "cosine":

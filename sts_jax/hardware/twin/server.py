@@ -24,8 +24,9 @@ class Served:
         input("Press Enter to stop.")
     ```
 
-    The server runs in threads of this process: one each for the serial port, the camera, the rendering, the random
-    holds and releases (argument `release_every` of `Twin`), and each HTTP connection. `close` stops all of them.
+    The server runs in threads of this process. There is one thread each for the serial port, for the camera, for the
+    rendering, and for holding and releasing the object at random times (argument `release_every` of `Twin`). Each
+    HTTP connection has another thread. `close` stops all threads.
     """
 
     def __init__(
