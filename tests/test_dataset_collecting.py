@@ -67,7 +67,7 @@ def test_trajectories_do_not_depend_on_the_number_of_rendered_ones(folder, spars
         np.testing.assert_array_equal(data.members(part, rendered=False), whole.members(part))
     for one, other in zip(data.pairs(np.array([4])), whole.pairs(np.array([4])), strict=True):
         np.testing.assert_array_equal(one, other)
-    with pytest.raises(ValueError, match=r"trajectories contains 3, which has no images \(num_rendered=1\): use"):
+    with pytest.raises(ValueError, match=r"`trajectories` contains 3, which has no images \(num_rendered=1\): use"):
         data.pairs(np.array([2, 3]))
     rows = evaluation.rows_of(data, "trajectory")
     np.testing.assert_array_equal(np.sort(np.concatenate([rows["train"], rows["test"]])), data.rendered())
@@ -299,7 +299,7 @@ def test_an_older_dataset_must_be_collected_again(copied, older):
 
 @pytest.mark.parametrize("given", [[99], [-1], [0.5], [True, False], 0, "a"])
 def test_trajectories_that_do_not_exist_are_named(folder, given):
-    with pytest.raises(ValueError, match=r"trajectories (has the type|contains)"):
+    with pytest.raises(ValueError, match=r"`trajectories` (has the type|contains)"):
         inspect.unwrap(type(dataset.load(folder)).pairs)(dataset.load(folder), given)
 
 

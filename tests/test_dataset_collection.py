@@ -52,7 +52,7 @@ def test_classes_follow_the_categories():
         ({"resolution": (64, 0)}, r"resolution must be two whole numbers .* got \(64, 0\)"),
         ({"categories": ()}, r"categories is empty, but it must name at least one class"),
         ({"categories": ("bottle", "cup")}, r"category is 'cup', but it must be one of bottle, camera"),
-        ({"shares": (0.5, 0.5, 0.5)}, r"shares is \(0\.5, 0\.5, 0\.5\), but .* sum 1"),
+        ({"shares": (0.5, 0.5, 0.5)}, r"shares=\(0\.5, 0\.5, 0\.5\), but .* sum 1"),
     ],
 )
 def test_fields_out_of_range_are_refused_before_anything_is_written(tmp_path, changes, message):

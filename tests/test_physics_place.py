@@ -121,7 +121,7 @@ def test_more_shell_or_contents_weigh_more(bodies):
         ({"yaw": float("inf")}, "yaw is inf, but it must be one finite number"),
         ({"fill": 1.5}, "fill is 1.5, .* from 0 to 1"),
         ({"shell_scale": 0.0}, "shell_scale is 0.0, but it must be > 0"),
-        ({"up": (0.0, 0.0, 2.0)}, r"up is .* unit vector"),
+        ({"up": (0.0, 0.0, 2.0)}, r"`up` is .* unit vector"),
     ],
 )
 def test_errors_name_arguments_of_place_that_are_out_of_range(bodies, changes, message):
@@ -151,5 +151,5 @@ def test_errors_name_arguments_of_place_of_another_type(bodies):
     ):
         with pytest.raises(TypeError, match=message):
             place(*given)
-    with pytest.raises(TypeError, match=r"body, .* is traced.* outside jit"):
+    with pytest.raises(TypeError, match=r"`body`, .* is traced.* outside jit"):
         jax.eval_shape(lambda body: inspect.unwrap(physics.rest.stable_faces)(body), bodies[0])

@@ -147,10 +147,10 @@ def test_beta_warms_up_over_its_share_of_the_steps():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"absent": ("b",)}, r"absent contains 'b', but present\['b'\] marks"),
-        ({"absent": ("c",)}, r"absent contains 'c', but the model has only the modalities \['a', 'b'\]"),
-        ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "inputs has"),
-        ({"present": {"sound": np.ones(20, bool)}}, "present has masks"),
+        ({"absent": ("b",)}, r"`absent` contains 'b', but `present\['b'\]` marks"),
+        ({"absent": ("c",)}, r"`absent` contains 'c', but the model has only the modalities \['a', 'b'\]"),
+        ({"inputs": {"a": np.zeros((20, 3), np.float32)}}, "`inputs` has"),
+        ({"present": {"sound": np.ones(20, bool)}}, "`present` has masks"),
         ({"targets": {"a": np.zeros((20, 3), np.float32), "b": np.zeros((20, 5), np.float32)}}, "samples have"),
     ],
 )
@@ -265,10 +265,10 @@ def test_a_killed_run_of_a_state_space_model_ends_with_the_same_bits(tmp_path):
 @pytest.mark.parametrize(
     ("name", "key", "change", "message"),
     [
-        ("views", "visual", lambda x: x[:, :8], "views has"),
+        ("views", "visual", lambda x: x[:, :8], "`views` has"),
         ("views", "state", lambda x: x[:2], "same number of samples"),
-        ("falls", "pose", lambda x: x[:, :7], "falls has"),
-        ("falls", "outcome", lambda x: x + 2, "outcome is int32 from 2 to 3"),
+        ("falls", "pose", lambda x: x[:, :7], "`falls` has"),
+        ("falls", "outcome", lambda x: x + 2, "`outcome` has the type int32 and values from 2 to 3"),
     ],
 )
 def test_views_and_falls_that_do_not_fit_are_refused(tmp_path, name, key, change, message):
@@ -323,14 +323,14 @@ def test_a_state_space_model_memorises_four_samples(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"targets": {"outcome": np.full(4, 2, np.int32)}}, "outcome is int32 from 2 to 2, but the model needs"),
-        ({"targets": {"outcome": np.ones(4, np.float32)}}, "outcome is float32"),
-        ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "targets has samples of"),
-        ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "inputs has samples of"),
-        ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"empty has .* of shape \(16, 16, 3\)"),
+        ({"targets": {"outcome": np.full(4, 2, np.int32)}}, "int32 and values from 2 to 2, but the model needs"),
+        ({"targets": {"outcome": np.ones(4, np.float32)}}, "`outcome` has the type float32"),
+        ({"targets": {"pose": np.zeros((4, 7), np.float32)}}, "`targets` has samples of"),
+        ({"inputs": {"visual": np.zeros((4, 32, 32, 3), np.uint8)}}, "`inputs` has samples of"),
+        ({"empty": {"visual": np.zeros((8, 8, 3), np.uint8)}}, r"`empty` has .* of shape \(16, 16, 3\)"),
         ({"present": {"tactile": np.ones(4, bool)}}, r"^`present` has masks for \['tactile'\]"),
         ({"target_present": {"tactile": np.ones(4, bool)}}, r"`target_present` has masks for \['tactile'\]"),
-        ({"condition": np.ones((4, 3), np.float32)}, "condition has width 3"),
+        ({"condition": np.ones((4, 3), np.float32)}, "`condition` has width 3"),
     ],
 )
 def test_arrays_that_do_not_fit_a_state_space_model_are_named(tmp_path, change, message):

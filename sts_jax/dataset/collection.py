@@ -76,11 +76,13 @@ class Collection:
             )
         if min(self.shares) < 0 or not math.isclose(sum(self.shares), 1):
             raise ValueError(
-                f"shares is {self.shares}, but the shares of training, validation and test must be >= 0 and have sum 1"
+                f"shares={self.shares}, but the shares of training, validation and test must be >= 0 and have sum 1"
             )
         if self.meshes is not None and self.num_objects != len(self.meshes.names):
             count = len(self.meshes.names)
-            raise ValueError(f"num_objects={self.num_objects}, but meshes has {count} objects: set num_objects={count}")
+            raise ValueError(
+                f"num_objects={self.num_objects}, but `meshes` has {count} objects: set num_objects={count}"
+            )
         if self.meshes is None and not self.categories:
             raise ValueError("categories is empty, but it must name at least one class, such as 'bottle'")
         for category in self.categories if self.meshes is None else ():

@@ -74,8 +74,8 @@ def reduced(pairs: Pairs, size: int) -> Pairs:
     height, width = pairs.visual.shape[2:4]
     if height != width or size < 1 or height % size:
         raise ValueError(
-            f"size is {size}, but the images are {height} x {width} pixels: they must be square, with a side length "
-            "that is a multiple of size"
+            f"size is {size}, but the images are {height} x {width} pixels: the images must be square, with a side "
+            "length that is a multiple of `size`"
         )
     return pairs._replace(
         visual=_means(pairs.visual, size),
@@ -253,12 +253,14 @@ class Dataset:
         trajectories, count = np.asarray(trajectories), len(self.trajectory["outcome"])
         if trajectories.ndim != 1 or (trajectories.size and trajectories.dtype.kind not in "iu"):
             raise ValueError(
-                f"trajectories has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
+                f"`trajectories` has the type {trajectories.dtype} and the shape {trajectories.shape}, but it must be "
                 "a list of whole numbers: convert a Boolean mask to indices with np.flatnonzero(mask)."
             )
         outside = trajectories[(trajectories < 0) | (trajectories >= count)]
         if outside.size:
-            raise ValueError(f"trajectories contains {outside[0]}, but the dataset has trajectories 0 to {count - 1}.")
+            raise ValueError(
+                f"`trajectories` contains {outside[0]}, but the dataset has trajectories 0 to {count - 1}."
+            )
         return trajectories.astype(np.int64)
 
     def pairs(self, trajectories: np.ndarray, *, symmetries: bool = False) -> Pairs:
@@ -278,7 +280,7 @@ class Dataset:
         without = trajectories[~np.isin(trajectories, self.rendered())]
         if without.size:
             raise ValueError(
-                f"trajectories contains {without[0]}, which has no images (num_rendered="
+                f"`trajectories` contains {without[0]}, which has no images (num_rendered="
                 f"{self.collection['num_rendered']}): use `ends`, or take indices from `members` or `rendered`."
             )
         last = self.trajectory["pose"].shape[1] - 1

@@ -83,7 +83,7 @@ def image_summary(
     """
     missing = [name for name in (CONSTANT, COPY) if name not in predictions]
     if missing:
-        raise ValueError(f"predictions lacks {', '.join(missing)}: add the results of evaluation.image_baselines")
+        raise ValueError(f"`predictions` lacks {', '.join(missing)}: add the results of evaluation.image_baselines")
     return {stream: _of_stream(predictions, test, stream, num, seed) for stream in STREAMS}
 
 

@@ -17,15 +17,15 @@ CEILINGS = (CEILING, ONE_REROLL)
 def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str, Predicted]:
     """Predict the last frame without a trained model, in four ways.
 
-    - The constant is the mean last frame of the training trajectories. Its outcome is the most frequent one, and its
-      outcome probabilities are the frequencies.
+    - The constant is the mean last frame of the training trajectories. Its outcome is the most frequent outcome of
+      these trajectories, and its outcome probabilities are the frequencies of the outcomes.
     - The copy predicts that the last frame equals the first one.
     - The nearest neighbour is the last frame of the most similar training trajectory. Two trajectories are compared by
       the squared distance between their first visual images. In scenarios with a condition (an input such as an
       acceleration of the pad), the squared distance between the conditions is added. Both distances are then divided by
       their variances in the training set, so that they have the same weight.
-    - The rule "rests below its start" keeps x, y and the orientation of the first pose. Its height is the median height
-      of the training objects that stay on the pad. It predicts no images.
+    - The rule "rests below its start" keeps x, y and the orientation of the first pose. The predicted height is the
+      median last height of the training objects that stay on the pad. The rule predicts no images.
 
     Args:
         scenario: The scenario of the trajectories.

@@ -15,15 +15,15 @@ def solid_moments(
 ) -> Float[np.ndarray, "f 10"]:
     """Compute the moments of the signed tetrahedra between a reference point and each triangle.
 
-    The moments of a solid are the sum over all triangles of its closed surface. Let a tetrahedron have the corners 0,
-    a, b, c relative to the reference, and s = a + b + c. Its volume is v = a . (b x c) / 6. Its first moments
-    (integral of the position r) are v s / 4. Its second moments (integral of r r^T) are
-    v (s s^T + a a^T + b b^T + c c^T) / 20.
+    The moments of a solid are the sum of these moments over all triangles of its closed surface. Let a tetrahedron
+    have the corners 0, a, b, c relative to the reference, and let s = a + b + c. The volume of the tetrahedron is
+    v = a . (b x c) / 6. Its first moments (integral of the position r) are v s / 4. Its second moments (integral of
+    r r^T) are v (s s^T + a a^T + b b^T + c c^T) / 20.
 
     Args:
         triangles: Corners of the triangles (m).
         reference: Reference point (m), by default the origin. For a solid that is clipped by a plane, give a point on
-            the plane. The tetrahedra over the cut face, which has no triangles, then have no volume.
+            the plane. The cut face needs no triangles, because all its tetrahedra then have no volume.
 
     Returns:
         Integrals of 1, x, y, z, xx, yy, zz, xy, xz and yz over the tetrahedron of each triangle. Coordinates are

@@ -23,7 +23,7 @@ _transform = jax.jit(geometry.transform)
 
 
 class StableFaces(NamedTuple):
-    """The faces of a body's convex hull on which it can rest, the most likely first."""
+    """The faces of a body's convex hull on which the body can rest, the most likely first."""
 
     up: Float[np.ndarray, "k 3"]  # Unit vector in the mesh frame that points up while the body rests on each face.
     # Solid angle of each face, seen from the centre of mass, as a share of the sum over all stable faces.
@@ -53,7 +53,7 @@ def stable_faces(
         body: One body.
         fill: Share of the interior's volume that is filled, 0 to 1.
         shell_scale: Factor on the shell's mass.
-        up: Unit vector in the mesh frame that pointed up when the contents settled.
+        up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
 
     Returns:
         The stable faces, the most likely first. If the body cannot rest on any face, both fields are empty arrays.
@@ -65,8 +65,8 @@ def stable_faces(
     _check_body(body)
     if is_traced((body, fill, shell_scale, up)):
         raise TypeError(
-            "body, fill, shell_scale or up is traced, but stable faces are computed on the host: call stable_faces "
-            "outside jit, vmap and grad"
+            "`body`, `fill`, `shell_scale` or `up` is traced, but stable faces are computed on the host: call "
+            "`stable_faces` outside jit, vmap and grad"
         )
     body.check()
     com = np.asarray(_rigid(body, fill, shell_scale, np.asarray(up, np.float32))[1], np.float64)
@@ -96,10 +96,10 @@ def weight(
 
     Args:
         body: One body.
-        pose: Mesh frame in the sensor frame, (7,): position (m), quaternion (w, x, y, z).
+        pose: Pose of the mesh frame in the sensor frame, (7,): position (m), quaternion (w, x, y, z).
         fill: Share of the interior's volume that is filled, 0 to 1.
         shell_scale: Factor on the shell's mass.
-        up: Unit vector in the mesh frame that pointed up when the contents settled.
+        up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
 
     Returns:
         Force (N) and moment about the sensor's origin (N m), (6,).
@@ -143,8 +143,8 @@ def place(
         position: x and y of the centre of the body's extent (m).
         fill: Share of the interior's volume that is filled, 0 to 1.
         shell_scale: Factor on the shell's mass, > 0.
-        up: Unit vector in the mesh frame that pointed up when the contents settled. Placing the body does not move the
-            contents.
+        up: Direction that was up when the contents settled, as a unit vector in the mesh frame. Placing the body
+            does not move the contents.
 
     Returns:
         Pose of the body, and wrench of the pad on the body.
@@ -231,5 +231,5 @@ def _check_numbers(
     length = float(np.linalg.norm(np.asarray(up, float)))
     if abs(length - 1) > 1e-3:
         raise ValueError(
-            f"up is {up!r} with length {length:.3g}, but it must be a unit vector: divide the vector by its length"
+            f"`up` is {up!r} with length {length:.3g}, but it must be a unit vector: divide the vector by its length"
         )

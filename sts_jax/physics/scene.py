@@ -241,7 +241,7 @@ def step(model: mjx.Model, data: mjx.Data, contacts: Contacts) -> mjx.Data:
 
 
 def push(data: mjx.Data, contacts: slice) -> Float[Array, "6"]:
-    """Return the force and the moment of some contacts on the object, summed over the contacts.
+    """Return the total force and the total moment that some contacts exert on the object.
 
     Args:
         data: Data of MJX after `step`.

@@ -67,13 +67,13 @@ def simulate(
         num: Number of trajectories of each body.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
             by body. With n trajectories in total, its field `up` has the shape (n, 3), and the other fields have the
-            shape (n,). Each trajectory has the same start as without this argument, unless its number of failures
-            (`Trajectory.resampled`) differs.
+            shape (n,). The start of a trajectory is the same with and without `hidden`, unless the number of failures
+            of the trajectory (`Trajectory.resampled`) differs.
         progress: True shows a progress bar on standard error. A function is called after each chunk with the number of
             trajectories done so far. With MJX, tens of seconds of compilation precede the first chunk.
         chunk: Largest number of trajectories that are simulated at once. With MJX, each new value causes a compilation
-            and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, the number applies to
-            each thread, and the results do not depend on it.
+            and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, `chunk` is the largest
+            number for each thread, and the results do not depend on `chunk`.
         engine: "mujoco" is C MuJoCo on all CPU cores. It compiles nothing and is several times as fast as MJX on a CPU.
             "mjx" runs on JAX's default device. None selects the faster one: "mujoco" if `jax.default_backend()` is
             "cpu", else "mjx". Both engines draw the same starts and hidden properties from a key.

@@ -119,13 +119,13 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         found = {name: x.shape[1:] for name, x in values.items()}
         if found != expected[kind]:
             raise ValueError(
-                f"{kind} has samples of the shapes {found}, but the model needs samples of the shapes "
+                f"`{kind}` has samples of the shapes {found}, but the model needs samples of the shapes "
                 f"{expected[kind]}: make the arrays with training.state_arrays"
             )
     if {name: x.shape for name, x in arrays.empty.items()} != {name: (*size, 3) for name in statespace.IMAGES}:
         raise ValueError(
-            f"empty has the shapes { {name: x.shape for name, x in arrays.empty.items()} }, but it must have `visual` "
-            f"and `tactile` images of shape {(*size, 3)}: make them with dataset.empty_frame"
+            f"`empty` has the shapes { {name: x.shape for name, x in arrays.empty.items()} }, but it must have "
+            f"`visual` and `tactile` images of shape {(*size, 3)}: make them with dataset.empty_frame"
         )
     further = {
         "views": {"visual": (*size, 3), "state": (statespace.STATE_CODE,)},
@@ -136,15 +136,15 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         if values and (found != further[kind] or len({len(x) for x in values.values()}) > 1):
             shapes = {name: x.shape for name, x in values.items()}
             raise ValueError(
-                f"{kind} has arrays of the shapes {shapes}, but all arrays must have the same number of samples (first "
-                f"axis), and the samples must have the shapes {further[kind]}: make the arrays with "
+                f"`{kind}` has arrays of the shapes {shapes}, but all arrays must have the same number of samples "
+                f"(first axis), and the samples must have the shapes {further[kind]}: make the arrays with "
                 "training.state_arrays"
             )
     for outcome in (own["outcome"] for own in (arrays.targets, arrays.falls) if own):
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
             raise ValueError(
-                f"outcome is {outcome.dtype} from {outcome.min()} to {outcome.max()}, but the model needs integers "
-                f"from 0 to {model.outcomes - 1}: give such indices, or a model with more outcomes"
+                f"`outcome` has the type {outcome.dtype} and values from {outcome.min()} to {outcome.max()}, but the "
+                f"model needs integers from 0 to {model.outcomes - 1}: give such indices, or a model with more outcomes"
             )
     _check_condition(model.condition, arrays)
 
@@ -154,8 +154,8 @@ def _check_condition(expected: int, arrays: Arrays) -> None:
     width = 0 if arrays.condition is None else arrays.condition.shape[1]
     if width != expected:
         raise ValueError(
-            f"condition has width {width}, but the model needs width {expected}: give a condition of this width (None "
-            f"for width 0), or a model with condition={width}"
+            f"`condition` has width {width}, but the model needs width {expected}: give a condition of this width "
+            f"(None for width 0), or a model with condition={width}"
         )
 
 
@@ -164,25 +164,25 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
     for name in absent:
         if name not in model.names:
             raise ValueError(
-                f"absent contains {name!r}, but the model has only the modalities {sorted(model.names)}: remove "
+                f"`absent` contains {name!r}, but the model has only the modalities {sorted(model.names)}: remove "
                 "this name"
             )
         if np.any(arrays.present.get(name, False)):
             raise ValueError(
-                f"absent contains {name!r}, but present[{name!r}] marks {int(np.sum(arrays.present[name]))} samples "
-                "that have it: remove the name from `absent`"
+                f"`absent` contains {name!r}, but `present[{name!r}]` marks {int(np.sum(arrays.present[name]))} "
+                "samples that have this modality: remove the name from `absent`"
             )
     for kind, values in (("inputs", arrays.inputs), ("targets", arrays.targets)):
         needed = set(model.names) - (set(absent) if kind == "inputs" else set())
         if not needed <= set(values) <= set(model.names):
             raise ValueError(
-                f"{kind} has the modalities {sorted(values)}, but the model needs {sorted(needed)} and allows only "
+                f"`{kind}` has the modalities {sorted(values)}, but the model needs {sorted(needed)} and allows only "
                 f"{sorted(model.names)}: add or remove arrays, or add the names of missing inputs to `absent`"
             )
     for kind, masks in (("present", arrays.present), ("target_present", arrays.target_present)):
         if not set(masks) <= set(model.names):
             raise ValueError(
-                f"{kind} has masks for {sorted(masks)}, but the model has only the modalities {sorted(model.names)}: "
+                f"`{kind}` has masks for {sorted(masks)}, but the model has only the modalities {sorted(model.names)}: "
                 "remove all other masks"
             )
     for modality in model.modalities:

@@ -10,7 +10,7 @@ from sts_jax._files import write_whole
 
 
 def show(axis: Axes, image: np.ndarray) -> None:
-    """Draw an image in [0, 1], without ticks."""
+    """Draw an image with values in [0, 1], without ticks on the axes."""
     axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
     axis.set_xticks([])
     axis.set_yticks([])

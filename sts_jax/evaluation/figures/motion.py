@@ -45,8 +45,8 @@ def strip(
         visual: Images of the visual stream, in [0, 1], `(frames, height, width, 3)`.
         tactile: Images of the tactile stream, in [0, 1], `(frames, height, width, 3)`.
         wrench: Force (N) and moment about the sensor's origin (N m) in each frame, `(frames, 6)`.
-        num: Number of frames whose images are drawn. They range from the first to the last frame and are denser at the
-            beginning. A short trajectory has fewer, because each frame is drawn only once.
+        num: Number of frames whose images are drawn. These frames range from the first to the last one and are denser
+            at the beginning. Fewer frames are drawn for a short trajectory, because no frame is drawn twice.
         title: Title of the figure.
     """
     last = len(time) - 1

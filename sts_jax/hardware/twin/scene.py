@@ -60,8 +60,8 @@ class Scene(abc.ABC):
         """Return the state of the scene at a time.
 
         Args:
-            time_s: Time on the twin's clock (s). A frame is made after its exposure, so a few commands may have changed
-                the scene since this time.
+            time_s: Time on the twin's clock (s). The twin computes a frame after its exposure, so a few commands may
+                have changed the scene between `time_s` and this call.
         """
 
     @abc.abstractmethod
@@ -108,7 +108,8 @@ class Scene(abc.ABC):
     def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
         """Start a thread that renders images before they are needed.
 
-        `Served` calls this method. A twin on its virtual clock does not need the thread.
+        `Served` calls this method, because a served twin runs on the real clock. A twin on its virtual clock does not
+        need the thread.
 
         Args:
             blender: Blender of the twin, which converts the rendered images.
@@ -209,7 +210,7 @@ class ObjectScene(Scene):
             ValueError: `first`, `motion_rate` or a field of the scenario is out of range.
         """
         if first < 0:
-            raise ValueError(f"first is the number of a trajectory and must be >= 0, got {first}")
+            raise ValueError(f"`first` must be the number of a trajectory, >= 0, got {first}")
         if motion_rate is None:
             motion_rate = max(1.0, MOTION_RATE * min(1.0, _MOTION_PIXELS / math.prod(resolution)))
         if not 0 < motion_rate < float("inf"):
