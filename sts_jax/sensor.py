@@ -51,8 +51,8 @@ class Sensor:
     def check(self) -> None:
         """Raise an error if a constant is out of range. For constants that `jit` traces, use `guard`.
 
-        Every field must have the shape of its default value, be finite, and lie in the range that its class declares.
-        The arrays of internal lights (`lights`) and external lights (`room`) may have any number of rows, one for each
+        Every field must have the shape of its default value, be finite, and lie in its declared range. The
+        arrays of internal lights (`lights`) and external lights (`room`) may have any number of rows, one for each
         light. There are further conditions:
 
         - The distance from the pinhole to the gel's inner face is at least `camera.near`, the smallest depth at which
@@ -131,7 +131,7 @@ class Sensor:
 
         Raises:
             FileNotFoundError: The file does not exist.
-            OSError: The file cannot be read or is not valid JSON. The error has the type `DamagedFileError`.
+            DamagedFileError: The file cannot be read or is not valid JSON. DamagedFileError is an OSError.
             ValueError: A field is missing, unknown, of another shape or out of range (see `check`).
         """
         values = read_json(Path(path), "write it again with Sensor.save")

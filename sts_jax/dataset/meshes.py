@@ -70,8 +70,8 @@ def survey_meshes(
     unknown = sorted(set(classes) - set(library.classes))
     if unknown:
         raise ValueError(
-            f"classes contains {', '.join(unknown)}, but {folder} has only the classes {', '.join(library.classes)}: "
-            "choose among these"
+            f"the argument classes contains {', '.join(unknown)}, but {folder} has only the classes "
+            f"{', '.join(library.classes)}: choose among these"
         )
     items = tuple(item for item in library.items if not classes or item.label in classes)
     library, listing = objects.survey(dataclasses.replace(library, items=items), progress=progress)

@@ -73,8 +73,8 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
     _check(real, simulated, group, group)
     if real.shape != simulated.shape:
         raise ValueError(
-            f"real and simulated must have equal shapes, got {real.shape} and {simulated.shape}: give one simulated "
-            "image of the same resolution for each real image"
+            f"the arrays real and simulated must have equal shapes, got {real.shape} and {simulated.shape}: give one "
+            "simulated image of the same resolution for each real image"
         )
     each = np.array([_differences(a, b) for a, b in zip(real, simulated, strict=True)])
 
@@ -94,8 +94,8 @@ def features(images: np.ndarray) -> np.ndarray:
 
     A cell has two kinds of features. The colours are the means of the three channels. The gradients are the mean
     absolute differences of neighbouring pixels of the grey image, in four directions (horizontal, vertical and both
-    diagonals) and at three scales. Brightness, vignetting and colour change the colours. Noise, blur, edges and texture
-    change the gradients.
+    diagonals) and at three scales. Brightness, vignetting and tint affect the colours. Noise, blur, edges and texture
+    affect the gradients.
 
     Args:
         images: Images, uint8 `(n, height, width, 3)`, at least 64 pixels high and wide.
@@ -296,9 +296,9 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            f"real_group and simulated_group have {len(common)} trajectories in common. They must have either no "
-            "common trajectory, or the same trajectories and equally many images, "
-            f"got {len(real)} and {len(simulated)} images: "
+            f"real_group and simulated_group have {len(common)} trajectories in common, for "
+            f"{len(real)} real and {len(simulated)} simulated images. The two groups must have either no common "
+            "trajectory, or the same trajectories and equally many images: "
             "keep only the common trajectories, or give the simulated images other trajectory numbers"
         )
     return True

@@ -20,7 +20,7 @@ class Predicted(NamedTuple):
     """The predicted last frames of n trajectories. Quantities that are not predicted are None.
 
     A prediction is a single frame, or a distribution that is given by k samples. In the second case, `visual` and
-    `tactile` are the means of the samples, and `pose` is a central pose.
+    `tactile` are the means of the samples, and `pose` is a pose at the centre of the distribution.
     """
 
     visual: np.ndarray | None = None  # visual images, (n, height, width, 3), float in [0, 1] or uint8
@@ -107,7 +107,7 @@ class Forecaster(Protocol):
 
         Args:
             shape: Leading axes of the prediction.
-            condition: Known quantities of the scenario, such as an acceleration of the pad, as c numbers in SI units,
+            condition: The c known quantities of the scenario in SI units, such as an acceleration of the pad,
                 `(*shape, c)`. None for scenarios without such quantities.
 
         Returns:
@@ -116,11 +116,13 @@ class Forecaster(Protocol):
 
 
 def subsets(modalities: Sequence[str], *, state: bool = False) -> dict[str, tuple[str, ...]]:
-    """List all non-empty subsets of a model's inputs. The model can predict from each of them.
+    """List the subsets of a model's inputs from which the model can predict.
+
+    The result has all subsets except the empty one. For a model without inputs, the result has only the empty
+    subset.
 
     Args:
-        modalities: The inputs of the model, `predictor.modalities`. If the model has no inputs, the result has only the
-            empty subset.
+        modalities: The inputs of the model, `predictor.modalities`.
         state: True to add the subset ("visual", "state"), if the visual image is an input. Here, "state" is the true
             pose, shape and mass, which state-space models accept as an input.
 
@@ -158,7 +160,7 @@ def predict(
 
     If the model predicts no pose, the outcome comes from the predicted visual image. It is `FELL_OFF` if the image
     shows no object, and the other outcome if it shows one. This requires a scenario with two outcomes, and the
-    arguments `validation` and `blank`. Without them, the outcome is None.
+    arguments `validation` and `blank`. If one of these is missing, the outcome is None.
 
     Args:
         predictor: The model.
@@ -179,11 +181,12 @@ def predict(
     names = tuple(inputs)
     if len(test.object) == 0:
         raise ValueError(
-            "test has 0 trajectories, but at least one is needed: choose a split with held-out trajectories"
+            "the argument test has 0 trajectories, but at least one is needed: choose a split with held-out "
+            "trajectories"
         )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
-        """Predict the trajectories in parts of equal size, which limits the memory.
+        """Predict the trajectories in parts of equal size, to limit the memory.
 
         The last part is filled with copies of the last trajectory, and their predictions are removed.
         """

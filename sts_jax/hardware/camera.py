@@ -176,7 +176,7 @@ class Camera:
         """Return a frame that was exposed after the call.
 
         The first `CameraConfig.in_flight` frames that arrive after the call are discarded, because they may have been
-        exposed before it. If the source is a video file, the method returns the oldest frame that has not been
+        exposed before the call. If the source is a video file, the method returns the oldest frame that has not been
         returned yet.
 
         Args:

@@ -85,7 +85,7 @@ class AutomaticPerson:
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store the stage of the view, on which the result of `action` depends."""
+        """Store the stage of the view. The result of `action` depends on this stage."""
         self._stage = view.stage
 
     def action(self) -> Action | None:
@@ -108,8 +108,8 @@ def collect(
     """Collect trajectories until the person stops, or until the session has enough of them.
 
     A trajectory consists of two pairs of images. The first pair shows an object that a person holds on the pad. The
-    second pair shows the same object at rest after its release. The guide is a state machine that evaluates the
-    images. The guide chooses the instruction for the person, and decides when each pair is saved. At the end of each
+    second pair shows the same object at rest after its release. A state machine, the guide, evaluates the images.
+    The guide chooses the instruction for the person, and decides when each pair is saved. At the end of each
     trajectory, the person confirms or discards it.
 
     Args:

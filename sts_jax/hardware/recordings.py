@@ -59,9 +59,9 @@ class RecordedTrajectory:
 
 
 class Entry(NamedTuple):
-    """A trajectory in the result of `list_recordings`: its number, state (`standing`), time and note.
+    """A trajectory in the result of `list_recordings`: its number, state, time and note.
 
-    The state is "confirmed", "unconfirmed", "incomplete" or "discarded".
+    The state, `standing`, is "confirmed", "unconfirmed", "incomplete" or "discarded".
     """
 
     number: int  # number of the trajectory in its session

@@ -50,8 +50,8 @@ def library(
 
     If the folder or one of its direct sub-folders contains ShapeNetSem's table metadata.csv, the table lists the
     objects. Its column `unit` defines the size of an object, and the columns `up` and `front` define its orientation.
-    The column `category` defines its class, which is one of CATEGORIES, such as "bottle". The mesh of the object
-    with the id ID is expected at models-OBJ/models/ID.obj, and its images in models-textures/textures.
+    The column `category` defines its class, which is one of CATEGORIES, such as "bottle". The mesh of an object is
+    expected at models-OBJ/models/ID.obj with the object's id as ID, and its images in models-textures/textures.
 
     In any other folder, every mesh file is an object. Its class is the name of the first sub-folder of its path. The
     class of a file directly in the folder is the name of the folder.
@@ -202,8 +202,8 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
         progress: Function that is called after each item with the text line that describes the item. None for no calls.
 
     Returns:
-        The library, in which the items that cannot be loaded are moved to `skipped`, and the listing. The listing is a
-        text with the number of objects of each class, a line for each object and a line for each skipped item.
+        The library and the listing. In the library, the items that cannot be loaded are moved to `skipped`. The listing
+        is a text with the number of objects of each class, a line for each object and a line for each skipped item.
 
     Raises:
         ImportError: A package for the decimation or the decomposition of a mesh is needed and not installed.
@@ -247,8 +247,8 @@ def facts(body: Body, apart: tuple[float, float]) -> list[str]:
 
     Args:
         body: One body.
-        apart: Largest distances by which the surface lies outside the collision parts and the parts lie outside the
-            surface (m), as `gaps` returns them.
+        apart: The two distances (m) from `gaps`. The first is the largest distance by which the surface lies outside
+            the collision parts. The second is the largest distance by which the parts lie outside the surface.
 
     Returns:
         Size along x, y and z (mm), number of faces, number of vertices of the collision parts, and both distances (mm).

@@ -12,7 +12,7 @@ from sts_jax.physics.scenario import Hidden, Outcome
 
 
 class Trajectory(NamedTuple):
-    """n trajectories of one body each, with f frames each. All trajectories of the first body come first, and so on."""
+    """n trajectories with f frames each, ordered body by body. Each trajectory has one body."""
 
     time: Float[Array, "n f"]  # Time (s), 0 at frame 0.
     pose: Float[Array, "n f 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.

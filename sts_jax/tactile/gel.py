@@ -52,7 +52,7 @@ class Gel:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """Equilibrium of a rigid object that is placed on the gel in some pose: motion from this pose, and pressure."""
+    """Equilibrium of a rigid object on the gel. The motion begins at the pose in which the object is placed."""
 
     # Motion along -z (m), which follows the rotation.
     sink: Float[Array, "*n"]
@@ -99,8 +99,8 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
     """Find the equilibrium of an object: the depth and tilts at which the gel balances Fz, Mx and My of the wrench.
 
     The gel is a grid of cells, and each cell is an independent spring. An object with heights h over the cells at x and
-    y sinks by d, and turns by the small angles a about x and b about y. With the stiffness k of the gel, its heights h'
-    and the pressure p are then
+    y sinks by d, and turns by the small angles a about x and b about y. Let k be the stiffness of the gel. The new
+    heights h' of the object and the pressure p are then
 
         h' = h - d + a y - b x,   p = k max(0, -h')
 
@@ -114,8 +114,8 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
 
     This energy is convex and piecewise quadratic. Projected Newton steps with a line search find the minimum. The first
     iterate is the pose at which the object's lowest point is at the depth `Gel.max_depth`. A hard bottom at this depth
-    limits the compression of the springs. The load that the bottom carries does not count as pressure. Derivatives are
-    those of the equilibrium, by the implicit function theorem.
+    limits the compression of the springs. The load that the bottom carries does not count as pressure. The derivatives
+    of the equilibrium follow from the implicit function theorem.
 
     Args:
         gel: Constants of the gel.
@@ -127,7 +127,8 @@ def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) ->
         The equilibrium. If `Fz <= 0`, there is no motion and no pressure, and `balanced` is True. If no equilibrium
         exists within the limits of depth and tilt, the result lies within these limits and `balanced` is False. This
         happens if the object's lowest point is more than `Gel.max_depth` above the gel, if the centre of pressure of
-        the wrench lies outside the object's footprint or outside the pad, or if a limit is reached.
+        the wrench lies outside the object's footprint or outside the pad, or if the load needs more depth or tilt
+        than the limits allow.
     """
     force = wrench[2]
     pressed = force > 0

@@ -19,8 +19,8 @@ _SPEED = termios.B115200  # baud rate of the protocol
 class LedPort:
     """The serial port of the twin's LED controller: a pseudo-terminal that answers requests in its own thread.
 
-    The host must open the port at 115200 baud. At another rate it receives unreadable bytes, and its requests are not
-    executed, as on a real serial line.
+    The host must open the port at 115200 baud. As on a real serial line, a host at another rate receives
+    unreadable bytes, and its requests are not executed.
     """
 
     def __init__(self, twin: Twin, link: str | os.PathLike | None = None):
@@ -69,7 +69,8 @@ class LedPort:
     def _open(self) -> None:
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
             raise FileExistsError(
-                f"link is {self._link}, but this file exists and is not a symbolic link: choose another path"
+                f"the argument link is {self._link}, but this file exists and is not a symbolic link: choose another "
+                "path"
             )
         # The slave stays open in this process, because reading the master fails while nobody has opened the slave.
         self._master, self._slave = os.openpty()

@@ -59,8 +59,8 @@ class CameraThread:
             index: Number of the frame that the client received last, or -1.
 
         Returns:
-            The newest frame after `index` whose time of delivery has come, else the first frame after `index`, else
-            None.
+            The newest frame after `index` whose time of delivery has come. If there is none, the first frame after
+            `index`, whose time of delivery is still to come. If there is no frame after `index`, None.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
@@ -102,7 +102,7 @@ class CameraThread:
 
 
 class WebServer(http.server.ThreadingHTTPServer):
-    """The HTTP server of a twin. It sends the camera stream and the state, and receives commands and faults."""
+    """The HTTP server of a twin. It sends the camera stream and the twin's state, and receives commands and faults."""
 
     daemon_threads = False  # `server_close` waits for the threads of all connections
     allow_reuse_address = True
