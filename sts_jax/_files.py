@@ -58,7 +58,7 @@ _IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENOTEMPTY)
 
 
 def remedy(error: Exception) -> str:
-    """Describe the remedy for a failed write. It depends on the attribute `errno` of the error, if there is one."""
+    """Describe the remedy for a failed write. The remedy depends on `errno` if the error has this attribute."""
     number = getattr(error, "errno", None)
     if number in _FULL:
         return "Free some disk space"
@@ -116,7 +116,7 @@ def claim(path: Path, content: dict) -> None:
 
     Raises:
         ValueError: The settings in the existing file differ. The message names all fields that differ, and the remedy.
-            For the first three of these fields, it contains both values.
+            For the first three of these fields, the message contains the old and the new value.
         DamagedFileError: The existing file cannot be read or is not JSON.
         OSError: The file cannot be written.
     """

@@ -322,7 +322,9 @@ class Predictor:
     def _checked_state(self, value: Any, lead: tuple[int, ...]) -> np.ndarray | Array:
         """Check the argument `state`, and return it as float32."""
         if isinstance(self.model.config, mvae.Config):
-            raise ValueError(f"{self.name} does not accept state: only state-space models do. Leave state= out.")
+            raise ValueError(
+                f"{self.name} does not accept the argument state: only state-space models do. Leave state= out."
+            )
         array = _arguments.checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
         if array.shape != (*lead, statespace.STATE_CODE):
             raise ValueError(f"state has shape {array.shape}, but it must have shape {(*lead, statespace.STATE_CODE)}.")

@@ -287,7 +287,7 @@ def test_restart_of_the_controller_turns_the_lights_off_and_counts():
 
 
 def test_twin_refuses_bad_input():
-    with pytest.raises(ValueError, match="lower rate or exposure_s"):
+    with pytest.raises(ValueError, match="give a smaller rate or exposure_s"):
         twin.Twin(picture(), rate=100.0)
     with pytest.raises(ValueError, match="kind must be one of"):
         twin.Fault("fire")

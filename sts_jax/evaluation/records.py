@@ -71,8 +71,8 @@ class Metric:
     which returns one number per item (held-out trajectory). Then `summarise` calls `statistic`, which returns a
     function of the weights of the items. The bootstrap over objects evaluates this function with many weights.
 
-    A metric needs at least one of the two functions. Without `statistic`, it is the weighted mean of `errors`. Without
-    `errors`, `statistic` uses the fields of `Scores`.
+    A metric needs `errors`, `statistic` or both. Without `statistic`, the metric is the weighted mean of `errors`.
+    Without `errors`, `statistic` uses the fields of `Scores`.
 
     Raises:
         ValueError: `name` is empty, the metric has neither `errors` nor `statistic`, `digits` is not a whole
@@ -104,7 +104,7 @@ class Metric:
             )
         if self.errors is None and self.statistic is None:
             raise ValueError(
-                f"metric {self.name!r} has neither `errors` nor `statistic`: give a function as one of them"
+                f"metric {self.name!r} has neither `errors` nor `statistic`: give a function for at least one"
             )
         if type(self.digits) is not int or self.digits < 0:
             raise ValueError(f"metric {self.name!r}: `digits` must be a whole number >= 0, got {self.digits!r}")

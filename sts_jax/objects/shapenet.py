@@ -34,7 +34,7 @@ _UP, _FRONT = (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)
 
 
 def find_root(folder: Path) -> Path | None:
-    """Find ShapeNetSem's table metadata.csv in a folder or its direct sub-folders.
+    """Find ShapeNetSem's table `metadata.csv` in a folder or its direct sub-folders.
 
     Returns:
         The folder that contains the table, or None if there is no table.
@@ -49,10 +49,10 @@ def find_root(folder: Path) -> Path | None:
 
 
 def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
-    """List the models of ShapeNetSem that have a category in CLASSES, such as bottles and cameras.
+    """List the models of ShapeNetSem that have a category in `CLASSES`, such as bottles and cameras.
 
     Args:
-        root: Folder that contains ShapeNetSem's table metadata.csv.
+        root: Folder that contains ShapeNetSem's table `metadata.csv`.
 
     Returns:
         Mesh file and loading settings of each usable model, and (name, reason) of each skipped model.
@@ -123,7 +123,7 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
     if not unit:
         raise ValueError(
             "the row of the model in metadata.csv has no unit, so the size of the mesh is unknown: write the "
-            "metres per unit of the mesh, such as 0.01, into the column unit"
+            "metres per unit of the mesh, such as 0.01, into the column `unit`"
         )
     try:
         scale = float(unit)

@@ -27,7 +27,7 @@ Engine = Literal["mjx", "mujoco"]
 
 
 class Setup(NamedTuple):
-    """Properties of n trajectories that are not random: their bodies, the scenario, the pad and the time steps."""
+    """Non-random properties of n trajectories: their bodies, the scenario, the pad and the time steps."""
 
     bodies: list[Body]
     which: Int[np.ndarray, "n"]  # index of the body of each trajectory

@@ -24,7 +24,7 @@ STANDING = 1.04e-5  # m, depth in the pad of an object that stands or lies at re
 
 
 class Outcome(enum.IntEnum):
-    """The outcome of a trajectory. Each scenario uses some of these. `str` returns words such as "fell off"."""
+    """The outcome of a trajectory. Each scenario uses some of the members. `str` returns words such as "fell off"."""
 
     RESTS = 0
     FELL_OFF = 1
@@ -54,7 +54,7 @@ class Hidden(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """Geometry of a body, from which a scenario draws random initial poses. Vectors are in the mesh frame."""
+    """Geometry of a body. A scenario needs it to draw random initial poses. Vectors are in the mesh frame."""
 
     points: Float[Array | np.ndarray, "*n h 3"]  # Vertices of the convex parts (m), padded by repetition.
     rests: Float[Array | np.ndarray, "*n k 3"]  # Unit vector that points up on each stable face, padded by repetition.
@@ -320,7 +320,7 @@ def _check_meanings(scenario: Scenario) -> None:
     if taken or len(set(numbers)) < len(numbers):
         raise ValueError(
             f"scenario.outcomes has the numbers {numbers}, but each outcome needs a unique number, and 0 "
-            f"to {max(Outcome)} are reserved for physics.Outcome: give other outcomes numbers from 100 on"
+            f"to {int(max(Outcome))} are reserved for physics.Outcome: number your own outcomes from 100 on"
         )
     kinds = [quantity.vector for quantity in scenario.quantities]
     if sorted(kinds, reverse=True) != kinds:

@@ -26,9 +26,9 @@ def with_moving_edges(
 
         d imprint = rate - v . grad imprint
 
-    v is the motion of the visible surface in the image (pixels), and `rate` is the change of its depth below the gel's
-    face (m). The second term is a sum over pairs of neighbouring pixels. For each pair, the difference of the two
-    imprints is multiplied by the v of the pixel at which the object is nearer to the camera. Each pixel of the pair
+    v is the motion of the visible surface in the image (pixels), and `rate` is the change of the surface's depth below
+    the gel's face (m). The second term is a sum over pairs of neighbouring pixels. For each pair, the difference of the
+    two imprints is multiplied by the v of the pixel at which the object is nearer to the camera. Each pixel of the pair
     receives half of this product. The pairs are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients".
     The derivative is accurate on average over a few pixels.
 

@@ -150,7 +150,10 @@ def excess(
 
 
 def reduced(images: Float[Array, "*n h w c"], size: int) -> Float[Array, "*n size size c"]:
-    """Reduce images to `size` x `size` pixels by averaging over blocks. `size` must divide their height and width."""
+    """Reduce images to `size` x `size` pixels by averaging over blocks.
+
+    `size` must divide the height and the width of the images.
+    """
     *lead, height, width, channels = images.shape
     blocks = images.reshape(*lead, size, height // size, size, width // size, channels)
     return jnp.mean(blocks, axis=(-4, -2))
@@ -217,8 +220,8 @@ def loss(
     Returns:
         The loss, and its terms by name without their weights. A term that depends on inputs is a mean over the items
         that have these inputs. The term `state` is a squared error of state codes, and all other terms are in nats.
-        The terms `state`, `doubt` and `first` are sums over the image inputs of the model. `covered` is a sum over the
-        first and the last frame.
+        For `state`, `doubt` and `first`, the means of the model's image inputs are added. For `covered`, the means of
+        the first and the last frame are added.
     """
     model = nnx.merge(graphdef, params)
     config = model.config

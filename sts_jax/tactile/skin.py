@@ -151,9 +151,10 @@ def shadows(
     along u. Elevations are angles above the gel's plane (rad), seen from x. The arctangent is the largest elevation of
     other skin. e is the elevation of the light's lower edge, and e + penumbra that of its upper edge.
 
-    A light in the gel's plane, as in the paper, has e = 0. Flat skin and the tops of pressed parts receive no light
-    from it, because its direction is perpendicular to their normals. Its shadows are visible only on slopes behind
-    other pressed parts. A shadow is partial where the elevation of these parts is below `penumbra`.
+    A light in the gel's plane, as in the paper, has e = 0. The direction of such a light is perpendicular to the
+    normals of flat skin and of the tops of pressed parts, so these receive none of the light. The shadows of such a
+    light are visible only on slopes behind other pressed parts. A shadow is partial where the elevation of these other
+    parts is below `penumbra`.
 
     Args:
         skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the depth at x with the

@@ -110,7 +110,7 @@ class Twin:
         if self.imperfections.exposure_s > 1 / rate:
             raise ValueError(
                 f"imperfections.exposure_s is {self.imperfections.exposure_s} s, but at {rate:g} frames/s it must be "
-                f"at most {1 / rate:.4f} s: lower rate or exposure_s"
+                f"at most {1 / rate:.4f} s: give a smaller rate or exposure_s"
             )
         if release_every is not None and not 0 < release_every < math.inf:
             raise ValueError(f"release_every must be None or a positive and finite time (s), got {release_every}")
@@ -177,7 +177,7 @@ class Twin:
         """Move the object in the scene.
 
         On the real clock, this method first renders the images that the command needs, which may take seconds. On the
-        virtual clock, `capture` renders each pose when it is needed for the first time.
+        virtual clock, `capture` renders each pose the first time that the pose is needed.
 
         Args:
             command: `hold` holds the object on the pad in the first pose of the next trajectory, `release` lets it go,
@@ -343,8 +343,8 @@ class Twin:
         """
         if self._clock is not None:
             raise RuntimeError(
-                "step, capture, set and ping need a twin on its virtual clock, but this twin is served on the real "
-                "clock: read its images through hardware.STS, or make a new Twin"
+                "`step`, `capture`, `set` and `ping` need a twin on its virtual clock, but this twin is served on the "
+                "real clock: read its images through hardware.STS, or make a new Twin"
             )
         if not 0 <= seconds < math.inf:
             raise ValueError(f"seconds must be >= 0 and finite, got {seconds}")
@@ -388,7 +388,7 @@ class Twin:
         return self._request(protocol.Set(self._next_sequence(), (first, second, third, fourth)))
 
     def ping(self) -> Lit:
-        """Ask the LED controller for its current levels, and advance the virtual clock by 4 ms (`ANSWER_S`).
+        """Ask the LED controller for the levels of its LEDs, and advance the virtual clock by 4 ms (`ANSWER_S`).
 
         The controller turns the lights off after 1 s without a request. Regular calls of this method keep them on.
 
