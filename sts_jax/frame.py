@@ -166,7 +166,7 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
     if not isinstance(frame, Frame):
-        raise TypeError(f"frame is a {type(frame).__name__}, but it must be the Frame that sense returns")
+        raise TypeError(f"frame is a {type(frame).__name__}, but it must be the Frame that sts.sense(...) returns")
     _check_light(light)
     light = jnp.asarray(light, jnp.float32)
     light = jnp.where(light >= 0, jnp.where(light <= 1, light, 1), 0)
@@ -198,9 +198,9 @@ def touch(
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
-        ValueError: `imprint` is empty, is not two-dimensional or has an integer type, `window` has another shape, is
-            not finite or has no area, or a constant of the sensor is out of range (`Sensor.check`). The numbers in
-            traced values raise no error.
+        ValueError: `imprint` is empty, is not two-dimensional or has an integer type. Or `window` does not have the
+            shape (4,), is not finite or has no area. Or a constant of the sensor is out of range (`Sensor.check`). The
+            numbers in traced values raise no error.
     """
     _check_sensor(sensor)
     imprint = _imprint_in_metres(imprint)

@@ -218,7 +218,7 @@ def test_all_classes_are_taken_from_a_folder_without_those_of_the_experiment(fol
     meshes = command.configure(small).collection.meshes
     assert meshes is not None
     assert (meshes.scale, meshes.up) == (0.5, "y")
-    with pytest.raises(ValueError, match="--scale and --up are for the files of a folder"):
+    with pytest.raises(ValueError, match="--scale and --up apply only to mesh files in a folder"):
         command.configure(command.Args(tmp_path, perturbed.SMOKE, up="y"))
 
     (folder / "bottle").rename(folder / "jar")

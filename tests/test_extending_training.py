@@ -138,7 +138,7 @@ def test_a_loss_without_its_own_value_among_its_parts_is_refused(tmp_path):
         total = optax.tree.norm(params)
         return total, (stats, {"size": total})
 
-    with pytest.raises(ValueError, match=r"loss returned the parts \['size'\], but one of them must be `loss`"):
+    with pytest.raises(ValueError, match=r"returned the parts \['size'\], but one part must have the name 'loss'"):
         training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, loss=loss)
 
 

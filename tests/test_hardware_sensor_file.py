@@ -160,7 +160,7 @@ def test_a_truncated_file_is_refused(tmp_path, size):
         ("levels", [256, 0, 0, 0], r"in 0\.\.255"),
         ("commissioned", "yesterday", "commissioned must be a date"),
         ("exposure_visual", True, "exposure_visual is True"),
-        ("lens", 3, r"device\.lens is 3, but it must have the fields width, height"),
+        ("lens", 3, r"device\.lens is 3, but it must be a JSON object with the fields width, height"),
         ("lens.k", [0, 0], r"device\.lens\.k is \[0, 0\]"),
         ("lens.fx", -1, r"fx must be > 0"),
         ("lens.fx", 10**400, "too large|finite number"),

@@ -138,7 +138,7 @@ def configure(args: Args) -> Config:
     scenario = sts.physics.variant(collection.scenario, args.hidden)
     collection = dataclasses.replace(collection, scenario=scenario, parts=args.parts or collection.parts)
     if args.objects is None and (args.scale is not None or args.up is not None):
-        raise ValueError("--scale and --up are for the files of a folder: give the folder with --objects")
+        raise ValueError("--scale and --up apply only to mesh files in a folder: give the folder with --objects")
     if args.objects is not None:
         collection = with_meshes(collection, args.objects, args.workdir, args.classes, scale=args.scale, up=args.up)
     elif args.classes:
@@ -201,7 +201,7 @@ def with_meshes(
     if len(meshes.names) < LEAST_OBJECTS:
         raise ValueError(
             f"--objects {folder} has {len(meshes.names)} usable objects, but the split into training, validation and "
-            f"test needs at least {LEAST_OBJECTS}: add objects. {path} lists the other objects and their problems"
+            f"test needs at least {LEAST_OBJECTS}: add objects. {path} lists the unusable objects and their problems"
         )
     each, rendered = (
         max(count, round(collection.num_objects * count / len(meshes.names)))

@@ -27,8 +27,8 @@ def summarise(
     Each value has a 95 % bootstrap interval over objects.
 
     Args:
-        scores: Scores of the predictors by name, including those of `evaluation.baselines`. A predictor may have scores
-            of the first items only. Its metrics are then computed from these items.
+        scores: Scores of the predictors by name. The predictors must include the baselines (`evaluation.baselines`). A
+            predictor may have scores of the first items only. Its metrics are then computed from these items.
         test: The held-out trajectories (items) that were scored.
         metrics: The metrics to compute. Pass the same metrics to `evaluation.score`, which computes the errors of each
             item.
@@ -46,8 +46,8 @@ def summarise(
         - `scored`: Number of items that were scored, by the name of the predictor.
         - `predictors`: The metrics of each predictor, by the name of the predictor and then of the metric.
         - `differences`: The metrics of each model minus those of each baseline, by the names of the model, of the
-            baseline and of the metric. A model is a predictor other than the baselines and the predictions of
-            `evaluation.ceiling`.
+            baseline and of the metric. A model is a predictor that comes neither from
+            `evaluation.baselines` nor from `evaluation.ceiling`.
 
     Raises:
         ValueError: Two metrics have the same name, or `scores` lacks a baseline.
@@ -62,7 +62,7 @@ def summarise(
     if missing:
         raise ValueError(
             f"scores lacks {', '.join(missing)}: pass the predictions of evaluation.baselines to evaluation.score, "
-            "and add the results"
+            "and add the results to scores"
         )
     names = list(scores)
     scored = {name: _count(own, len(test.object)) for name, own in scores.items()}

@@ -378,7 +378,7 @@ def _decoded_dataclass(kind: Any, value: Any, name: str) -> Any:
     kinds = typing.get_type_hints(kind)
     known = [field.name for field in dataclasses.fields(kind)]
     if not isinstance(value, dict):
-        raise ValueError(f"field {name} is {value!r}, but it must have the fields {', '.join(known)}")
+        raise ValueError(f"field {name} is {value!r}, but it must be a JSON object with the fields {', '.join(known)}")
     for field in known:
         if field not in value:
             raise ValueError(f"field {name}.{field} is missing")

@@ -112,10 +112,10 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Raises:
         TypeError: `key` is not a JAX key.
-        ValueError: `category` is unknown, or its family returns invalid parts. The list of parts is empty, more than
-            one part bounds the contents, or a vertex is not finite. The parts have more than 131,072 faces or vertices
-            in total, lie in a plane, or have a longest side below 5 mm or above 0.15 m. The part that bounds the
-            contents encloses no volume.
+        ValueError: `category` is unknown, or its family returns invalid parts. Parts are invalid if their list is
+            empty, more than one part bounds the contents, or a vertex is not finite. They are also invalid if they have
+            more than 131,072 faces or vertices in total, lie in a plane, or have a longest side below 5 mm or above
+            0.15 m. The part that bounds the contents must enclose a volume.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category

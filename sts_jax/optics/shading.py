@@ -202,7 +202,7 @@ def housing(
         on_pad: True for rays that pass through the pad.
         places: x and y at which the rays cross the plane of the gel's outer face (m).
         size: Width along x and height along y of the pad (m).
-        distance: Distance from the pinhole to this plane (m).
+        distance: Distance from the pinhole to the plane of the gel's outer face (m).
 
     Returns:
         Brightness for each ray, as an sRGB value divided by the sRGB value of the pad. It is 1 on the pad, and at most
@@ -251,8 +251,8 @@ def shade(
     2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.
     3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        background, `empty`, replaces the rest.
-    4. Milky skin: the share `1 - milk` of the result is transmitted. The share `milk * (1 - hidden)` of the background
-       without the object's shadow is added.
+    4. Milky skin: the share `1 - milk` of the result is transmitted. The background without the object's shadow is
+       multiplied by `milk * (1 - hidden)` and added.
 
     Args:
         room: Constants of the external light.

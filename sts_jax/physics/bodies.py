@@ -35,8 +35,8 @@ def check_bodies(bodies: Sequence[Any]) -> None:
 
     Raises:
         TypeError: An item is not a `Body`.
-        BodyError: `hulls` has a shape that the simulation does not support, or a value that is not finite. `shell_mass`
-            is 0, negative or not finite. `Body.check` finds an error.
+        BodyError: `hulls` has a shape that the simulation does not support, or a value that is not finite. Or
+            `shell_mass` is 0, negative or not finite. Or `Body.check` finds an error.
     """
     for i, body in enumerate(bodies):
         if not isinstance(body, Body):

@@ -98,8 +98,8 @@ class Perturbed(Scenario):
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return gravity minus the acceleration of the pad (m/s^2, sensor frame).
 
-        `Scenario.gravity` describes the arguments. If the jerk ends within the time step, the acceleration is
-        multiplied by the jerk's share of the step.
+        `Scenario.gravity` describes the arguments. If the pad stops accelerating within the time step, the
+        acceleration is multiplied by the share of the step before that time.
         """
         acceleration, duration = jerk(condition)
         step = self.contact.timestep
@@ -107,7 +107,7 @@ class Perturbed(Scenario):
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return the velocity that an object without friction would have after the jerk, relative to the pad.
+        """Return the velocity relative to the pad that an object without friction has after the pad has accelerated.
 
         Args:
             condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (3,).

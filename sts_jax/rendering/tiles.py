@@ -55,7 +55,7 @@ def where_active(
 def lines(images: tuple[Float[Array, "a b"], Float[Array, "a b"]]) -> tuple[Float[Array, "1 b"], Float[Array, "a 1"]]:
     """Return the first row of an image of x values, and the first column of an image of y values.
 
-    All rows of the first image are equal, and all columns of the second image are equal.
+    All rows of the first image must be equal. All columns of the second image must be equal.
     """
     return images[0][:1], images[1][:, :1]
 

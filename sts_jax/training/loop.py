@@ -36,7 +36,7 @@ def initial(
 
     Args:
         config: Options of the training.
-        learner: Initialisation and loss of the model, from `learner`.
+        learner: Initialisation and loss of the model, from `training.learner`.
         total: Number of steps of the whole training, which the default optimiser needs for its learning rate schedule.
         optimiser: Optimiser (default: that of `training.optimiser`).
 
@@ -60,11 +60,11 @@ def step(
     """Make one gradient step.
 
     Args:
-        learner: Loss of the model, from `learner`.
+        learner: Loss of the model, from `training.learner`.
         graphdef: Definition of the model.
         config: Options of the training.
-        total: Number of steps of the whole training. The schedule of the learning rate depends on it. The warm-up of
-            beta, the weight of the divergence in the loss, depends on it, too.
+        total: Number of steps of the whole training. The schedule of the learning rate and the warm-up of beta
+            depend on this number. beta is the weight of the divergence in the loss.
         state: State before the step.
         batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
         optimiser: Optimiser that made `state` (default: that of `training.optimiser`).
@@ -87,7 +87,8 @@ def step(
     gradient, (stats, terms) = jax.grad(objective, has_aux=True)(state.params)
     if "loss" not in terms:
         raise ValueError(
-            f"loss returned the parts {sorted(terms)}, but one of them must be `loss`: add it, see training.Loss"
+            f"the loss function returned the parts {sorted(terms)}, but one part must have the name 'loss': add it, "
+            "see training.Loss"
         )
     optimiser = optimiser or optimisers.optimiser(config, total)
     update, rest = optimiser.update(gradient, state.optimiser, state.params)
@@ -112,8 +113,8 @@ def train(
     """Train a model in the folder `workdir`, or resume its training where an earlier call stopped.
 
     On one machine, a training that was killed and resumed ends with the same bits as an uninterrupted training. If the
-    training in `workdir` has finished, the model is loaded and nothing is written. Other files in `workdir` are not
-    changed. Only one process at a time can train in a folder.
+    training in `workdir` has finished, the model is loaded and nothing is written. Files in `workdir` that do not
+    belong to the training are not changed. Only one process at a time can train in a folder.
 
     Args:
         config: Options of the training.

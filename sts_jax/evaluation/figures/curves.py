@@ -84,7 +84,7 @@ def scaling(path: Path, points: Sequence[Trained], *, ceiling: float | None = No
 def training_curves(path: Path, logs: Mapping[str, Sequence[Mapping[str, float]]]) -> None:
     """Draw the terms of the training loss over the gradient steps, with one panel per term and one line per model.
 
-    The figure has a panel for each of these terms that at least one log contains:
+    The figure has a panel for each of the following terms, except those that no log contains:
 
     - `loss`: The total loss.
     - `kl`: The KL divergence of the latent variables from their prior (only models of `sts_jax.mvae`).
