@@ -116,7 +116,8 @@ class Args:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
             raise ValueError(
-                f"each part must be one of {', '.join(known)} for --scenario {self.scenario}, got {', '.join(unknown)}"
+                f"each part to print must be one of {', '.join(known)} for --scenario {self.scenario}, got "
+                f"{', '.join(unknown)}"
             )
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:

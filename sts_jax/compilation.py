@@ -17,7 +17,7 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     """Let JAX keep compiled programs on disk, so that the next session loads them instead of compiling them again.
 
     Call this function once, before the first computation. It changes JAX's settings for the whole process. The commands
-    in `experiments` call it. The library itself never does.
+    in `experiments` call it. The library itself never calls it.
 
     On a CPU, XLA logs an error about processor features for each program that it loads from the cache. This message is
     harmless. XLA lists two of its own tuning options among the features of the processor that compiled the program, and
@@ -25,10 +25,10 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
     `import jax` to hide the message.
 
     Args:
-        folder: Folder of the cache. None selects the folder in the environment variable JAX_COMPILATION_CACHE_DIR. If
-            that variable is set to an empty string, nothing is cached. If the variable is not set, the cache is a
-            folder in `$XDG_CACHE_HOME/sts_jax`, by default in `~/.cache/sts_jax`. Each kind of processor has its own
-            folder there, because a program that was compiled for one kind may not run on another.
+        folder: Folder of the cache. None selects the folder that the environment variable JAX_COMPILATION_CACHE_DIR
+            names. If that variable is set to an empty string, nothing is cached. If the variable is not set, the cache
+            is a folder in `$XDG_CACHE_HOME/sts_jax`, by default in `~/.cache/sts_jax`. Each kind of processor has its
+            own folder there, because a program that was compiled for one kind may not run on another.
 
     Returns:
         The folder, or None if JAX_COMPILATION_CACHE_DIR is empty.
@@ -42,7 +42,7 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
         if not folder:
             return None
     if folder is not None and not os.fspath(folder):
-        raise ValueError("folder is empty: give a path, such as '.' for the current directory.")
+        raise ValueError("the argument folder is an empty string: give a path, such as '.' for the current directory.")
     path = cache_folder() / processor() if folder is None else Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)

@@ -35,8 +35,9 @@ class Replay:
     instead and returns every image.
 
     The times of a `Shot` are times of the replay on the clock `time.monotonic`, not the recorded times. The time
-    between two images is the recorded time divided by the speed. A replay cannot switch lights, so it returns the
-    images of both streams in the order of the recording. Only one thread at a time may use a replay.
+    between two images of the replay is the time between them in the recording, divided by `speed`. A replay cannot
+    switch lights, so it returns the images of both streams in the order of the recording. Only one thread at a time may
+    use a replay.
 
     Attributes:
         skipped: Number of images since `connect` that were not returned because the program read too slowly.
@@ -119,8 +120,8 @@ class Replay:
             CameraError: A video cannot be read.
             ValueError: `warmup_s` is negative or not finite, or the recording is empty or has another version of the
                 format. A replay of two video files also raises this error if the lengths of the videos differ by more
-                than one frame, if the constructor argument `fps` is not positive and finite, or if a path belongs to a
-                device or a stream.
+                than one frame, if the constructor argument `fps` is not positive and finite, or if a path names a
+                camera device or a network stream instead of a file.
         """
         if not 0 <= warmup_s < math.inf:
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -215,8 +216,9 @@ class Replay:
         Raises:
             ValueError: `max_age_ms` is not positive.
             CameraNotConnectedError: The replay is not connected.
-            StaleFrameError: The newest pair is older than `max_age_ms`, or no pair is available yet.
-            EndOfVideoError: The newest pair is older than `max_age_ms`, and the recording has no more pairs.
+            StaleFrameError: No pair is available yet. Or the newest pair is older than `max_age_ms`, and more pairs
+                follow.
+            EndOfVideoError: The newest pair is older than `max_age_ms`, and no more pairs follow.
             CameraError: The recording contains no pair, for example because it has images of one stream only.
             DamagedFileError: An image of the recording is damaged.
         """

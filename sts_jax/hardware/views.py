@@ -34,7 +34,7 @@ def sensor_view(
     tactile: UInt8[np.ndarray, "rows columns 3"],
     resolution: tuple[int, int] = (64, 64),
 ) -> SensorView:
-    """Rectify the two raw images of a pair, or the two backgrounds of a sensor file.
+    """Rectify the two raw images of a pair, or the two images of the empty pad that a sensor file names.
 
     Args:
         lens: Lens and pose of the real camera, from `Device.lens`.
@@ -58,7 +58,7 @@ def relit(view: SensorView, background: SensorView, empty: SensorView) -> Sensor
     """Adapt the brightness and colours of images to those of the sensor on which a model was trained.
 
     The result is `view * empty / background` for each pixel, clipped to [0, 1]. Values of `background` below 1/255 are
-    replaced by 1/255. A model regards every difference from the empty pad of its training images as part of an object.
+    replaced by 1/255. A model regards every difference from the empty pad in its training images as part of an object.
     Without this adaptation, the vignetting of another camera or a dark border of its images would count as an object.
 
     Args:
@@ -75,8 +75,8 @@ def relit(view: SensorView, background: SensorView, empty: SensorView) -> Sensor
     shapes = {name: own.visual.shape for name, own in (("view", view), ("background", background), ("empty", empty))}
     if len(set(shapes.values())) > 1:
         raise ValueError(
-            f"the visual images of view, background and empty must have the same shape, got {shapes}: rectify all of "
-            "them with the same resolution"
+            f"the visual images of `view`, `background` and `empty` must have the same shape, got {shapes}: rectify "
+            "all images with the same resolution"
         )
     return SensorView(
         *(

@@ -85,7 +85,7 @@ def load(
 
     The mesh frame is the file's frame, rotated by `up` and `front`. Its origin is the centroid of the collision hull,
     the shape with which the body collides. This is the convex hull, reduced to at most 64 vertices. `hull_gap` measures
-    how far the surface lies outside it. Surfaces that are not closed are visible from both sides.
+    how far the surface lies outside the collision hull. Surfaces that are not closed are visible from both sides.
 
     The albedo is the texture's value times the corner colour, in linear light. Textures, 8-bit colours and the diffuse
     colour `Kd` of an OBJ file are read as sRGB. Colour factors and vertex colours of a glTF file are read as linear
@@ -98,8 +98,8 @@ def load(
         longest_side: Longest side of the bounding box after scaling (m), from 5 mm to 0.15 m. None keeps the file's
             size. Must be None if `scale` is given.
         scale: Length of one unit of the file (m). None is 1 m.
-        largest: Largest allowed longest side (m), from 5 mm to 0.15 m. A larger mesh is scaled down to it with a
-            warning. None raises an error for a mesh that is longer than 0.15 m, the width of the pad.
+        largest: Upper limit of the longest side (m), from 5 mm to 0.15 m. A larger mesh is scaled down to this limit
+            with a warning. None raises an error for a mesh that is longer than 0.15 m, the width of the pad.
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass of
             the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
@@ -190,7 +190,7 @@ def _check_arguments(
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and (isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4):
-        raise ValueError(f"{path}: faces must be a whole number, at least 4, got {faces!r}")
+        raise ValueError(f"{path}: the argument faces must be a whole number, at least 4, got {faces!r}")
 
 
 def _attitude(
@@ -201,7 +201,7 @@ def _attitude(
         if up not in AXES or front is not None:
             raise ValueError(
                 f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z', or a direction of three "
-                "numbers. Omit front unless up is a direction"
+                "numbers. Omit the argument front unless the argument up is a direction"
             )
         return rotation(*AXES[up])
     try:
@@ -259,13 +259,13 @@ def _check_file(path: Path) -> None:
         return
     if head.lstrip().startswith(b"solid") and b"facet" in head:
         if b"endsolid" not in tail:
-            raise ValueError(f"{path}: the file is truncated, because its text ends without endsolid: replace it")
+            raise ValueError(f"{path}: the file is truncated, because its last line `endsolid` is missing: replace it")
         return
     number = int.from_bytes(head[80:84], "little")  # triangles of 50 bytes each
     if size < 84 + 50 * number or size < 84:
         raise ValueError(
             f"{path}: the file is truncated or not an STL. It has {size:,} bytes, but a binary STL of {number:,} "
-            f"triangles has {84 + 50 * number:,}: replace it"
+            f"triangles has {84 + 50 * number:,} bytes: replace it"
         )
 
 

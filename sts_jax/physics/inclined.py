@@ -33,7 +33,7 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 
 @dataclasses.dataclass(frozen=True)
 class Inclined(Scenario):
-    """An object is laid on the tilted pad or released just above it. Downhill is +y.
+    """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y.
 
     A stop wall stands at the lower edge of the pad. The contents of an object settle in a random direction (`tilt`)
     before the start and do not move on the slope. The centre of pressure in frame 0 then reveals where the contents

@@ -99,8 +99,8 @@ def underside(
 
     Returns:
         Two height maps (m). The first contains only faces that are low enough to press on the gel. The second contains
-        all faces, because every face blocks light that falls on the skin from above. Both maps are `inf` at cells
-        without such a face.
+        all faces, because every face blocks light that falls on the skin from above. Each map is `inf` at cells
+        where it contains no face.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))

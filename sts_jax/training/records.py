@@ -56,8 +56,8 @@ def read(path: Path, last: int) -> list[Record]:
             if number == len(lines):  # the process was killed while it wrote this line
                 break
             raise _files.DamagedFileError(
-                f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): delete this line, or the "
-                "file, to continue without these records."
+                f"{path}, line {number}, is damaged ({type(error).__name__}: {error}): delete this line to "
+                "continue without its record, or delete the file to continue without the earlier records."
             ) from error
         if keep:
             records.append(record)
