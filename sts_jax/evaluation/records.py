@@ -126,7 +126,7 @@ class Metric:
             judged: The errors of the predictor and of the constant baseline, and the true trajectories (items).
 
         Returns:
-            The function, or None if the predictor does not predict the quantity.
+            The function, or None if the predictor does not predict the quantity that the metric measures.
         """
         if self.statistic is not None:
             return self.statistic(judged)

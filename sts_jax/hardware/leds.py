@@ -246,8 +246,8 @@ class Leds:
         up to 5 s. Requests of other threads raise `DisconnectedError` meanwhile.
 
         Args:
-            limit_s: Time after which no further attempt begins (s). For each port, an attempt takes at most the
-                `timeout_s` plus two times the `answer_s` of `connect`.
+            limit_s: Time after which no further attempt begins (s). For each port, an attempt takes at most
+                `timeout_s + 2 * answer_s`, the arguments of `connect`.
 
         Raises:
             DisconnectedError: The controller was not found. The message lists the ports that were tried.

@@ -189,9 +189,9 @@ class ProvenFrames:
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
 
-        After the frame, the controller must confirm that the lights did not change. If `then` requests the switch
-        from the visual to the tactile stream, the answer to this switch is the confirmation. Otherwise, the controller
-        receives one more request.
+        After the frame, the controller must confirm that the lights had not changed until then. The confirmation is
+        part of the controller's answer to the next request. If `then` requires a switch from the visual to the tactile
+        stream, this switch is the next request. Otherwise, a request without a switch is sent.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).

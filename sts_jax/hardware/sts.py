@@ -265,7 +265,10 @@ class STS:
         return self
 
     def disconnect(self) -> None:
-        """Turn the lights off and close both devices. Does nothing if the sensor is not connected."""
+        """Turn the lights off, and close the camera and the LED controller.
+
+        The method does nothing if the sensor is not connected.
+        """
         self._stop_background()
         leds, self._leds = self._leds, None
         if leds is not None:

@@ -90,8 +90,8 @@ def load(
     The albedo is the texture's value times the corner colour, in linear light. Textures, 8-bit colours and the diffuse
     colour `Kd` of an OBJ file are read as sRGB. Colour factors and vertex colours of a glTF file are read as linear
     light (glTF specification). Alpha values are ignored, and so is the `Kd` of an OBJ file with textures. Textures are
-    resized to a square with a side of 1, 256 or 1,024 pixels. Several textures are packed into one square, in which a
-    texture cannot repeat within a face.
+    resized to a square with a side of 1, 256 or 1,024 pixels. Several textures are packed into one square. The
+    repetitions of a texture within a face are then lost.
 
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.

@@ -78,7 +78,9 @@ def items(root: Path) -> tuple[list[Item], list[tuple[str, str]]]:
             continue
         try:
             if name in seen:
-                raise ValueError("the model has several rows in metadata.csv. The first one is used: remove the others")
+                raise ValueError(
+                    "the model has several rows in metadata.csv, of which only the first is used: remove the others"
+                )
             seen.add(name)
             if "_BAD" in categories:
                 raise ValueError("the model has the category _BAD in metadata.csv, so it is not used")

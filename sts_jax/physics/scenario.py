@@ -363,7 +363,7 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
         raise ValueError(
-            f"name is {name!r}, but the scenario {scenario} lacks fields that this variant changes: "
+            f"name is {name!r}, but the scenario {scenario} lacks fields that the variant {name!r} changes: "
             f"declare {', '.join(lacking)} in the scenario's dataclass"
         )
     return dataclasses.replace(scenario, **changes[name])

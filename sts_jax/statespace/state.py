@@ -148,8 +148,8 @@ def heading(state: State) -> Float[Array, "n 2"]:
     If `poses.certainty` is above 0.5, the rotation is known well enough, and the heading is the direction of one of the
     mesh axes, see `poses.heading`. Otherwise, the heading is the long axis of the object's shape in the plane of the
     pad, with an arbitrary sign. The long axis is computed from `State.shown`, the support function in the sensor frame.
-    An image determines this function even if the rotation of the mesh is uncertain. No gradient flows through the
-    heading.
+    An image determines the support function even if the rotation of the mesh is uncertain. No gradient flows through
+    the heading.
 
     Args:
         state: Parts of state codes. For uncertain states, their means.

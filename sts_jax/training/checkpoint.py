@@ -234,8 +234,8 @@ def _manifest(folder: Path) -> manifest.Manifest | None:
     if found is None and _steps(folder):
         raise ValueError(
             f"{folder} has a checkpoint but no {manifest.NAME}: the model was trained by an earlier version of "
-            "sts_jax, or the file was deleted. Damage to the other files cannot be found without it. Delete the folder "
-            f"and train again or, if you trust the files, call training.seal({str(folder)!r}) once."
+            "sts_jax, or the file was deleted. Without this file, damage to the model's files cannot be found. Delete "
+            f"the folder and train again or, if you trust the files, call training.seal({str(folder)!r}) once."
         )
     return found
 
