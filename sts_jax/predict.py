@@ -282,7 +282,7 @@ class Predictor:
     def modalities(self) -> tuple[str, ...]:
         """Names of the inputs that the model accepts, out of "visual", "tactile" and "pose".
 
-        A modality that was absent from all first frames of the training data is not among them.
+        The model does not accept a modality that no trajectory of the training data had in its first frame.
         """
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 

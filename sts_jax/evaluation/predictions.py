@@ -186,9 +186,9 @@ def predict(
         )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:
-        """Predict the trajectories in parts of equal size, to limit the memory.
+        """Predict the trajectories in groups of equal size, to limit the memory.
 
-        The last part is filled with copies of the last trajectory, and their predictions are removed.
+        The last group is filled with copies of the last trajectory, and their predictions are removed.
         """
         count = len(pairs.object)
         size, parts = min(count, _CHUNK), []

@@ -73,8 +73,8 @@ class Pace:
     """Measures the period of a camera's frames, and estimates how many frames were lost.
 
     After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the total.
-    If the next frames arrive early, the missing frames were only late, and `dropped` is reduced again. The numbers
-    that `arrived` has already returned are not corrected.
+    If the frames after this interval follow each other in less than one period, they were late and not lost. `dropped`
+    is then reduced again, but the numbers that `arrived` has already returned are not corrected.
     """
 
     def __init__(self, nominal: float | None):
