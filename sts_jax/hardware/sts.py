@@ -373,8 +373,8 @@ class STS:
 
         Each image is divided into 32 x 24 blocks, and the mean colours of the blocks (0 to 255) are compared. The view
         counts as still if, for `window_s` seconds, no block differs by more than a limit from the same block at the
-        beginning of this period. The limit is the larger of two values: 6, and 8 times the median difference over all
-        blocks. For noisy images, the second value is larger.
+        beginning of this period. The limit is 6. For noisy images, the limit is 8 times the median difference over
+        all blocks, if this is larger than 6.
 
         Args:
             timeout_s: Longest time from the first image to the returned one (s).
