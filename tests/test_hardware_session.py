@@ -200,7 +200,7 @@ def test_closing_with_a_full_disk_names_what_is_lost(tmp_path, monkeypatch):
     add(session)
     monkeypatch.setattr(_files, "write_folder", full)
     session.save(1, "initial", pair(1, "initial"))
-    with pytest.raises(SessionError, match=r"the initial pair of trajectory 1\. They are lost .* Cause: .*No space left"):
+    with pytest.raises(SessionError, match=r"the initial pair of trajectory 1\. They are lost .*No space left"):
         session.close(0.1)
     assert len(list(hardware.load_recordings(tmp_path))) == 1
     with pytest.raises(SessionError, match="open it again"):
