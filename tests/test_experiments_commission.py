@@ -354,7 +354,7 @@ def test_exposure_stops_at_the_limits(no_lag):
 
 
 class Video:
-    """A V4L2 device of OpenCV that sees the lights and shows its exposure."""
+    """A V4L2 device of OpenCV that sees the lights and shows its exposure. The room lights only the left of the view."""
 
     def __init__(self, controller):
         values = {"AUTO_EXPOSURE": 3, "EXPOSURE": 40, "AUTO_WB": 1, "WB_TEMPERATURE": 4600, "FPS": 100}
@@ -379,8 +379,9 @@ class Video:
         return True
 
     def retrieve(self):
-        light = 2.0 + 8.0 * sum(self.controller.levels) / 1020
-        image = np.full((48, 64, 3), min(self.get(cv2.CAP_PROP_EXPOSURE) * light, 255), np.uint8)
+        light = np.full((48, 64, 3), 8.0 * sum(self.controller.levels) / 1020)
+        light[:, :40] += 2.0
+        image = np.minimum(self.get(cv2.CAP_PROP_EXPOSURE) * light, 255).astype(np.uint8)
         image[:8, :8] = self.number % 2
         return True, image
 
