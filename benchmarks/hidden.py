@@ -102,7 +102,7 @@ class Args:
         ValueError: The scenario lacks one of the parts, or `soaked` is combined with an option that it replaces.
     """
 
-    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts to print (default: all parts of the scenario)
+    parts: tyro.conf.Positional[tuple[Part, ...]] = ()  # parts of the printed report (default: all for the scenario)
     scenario: Literal["perturbed", "inclined"] = "perturbed"  # the jerked pad, or the slope
     objects: int | None = None  # number of simulated objects (default: 200)
     num: int = 16  # number of simulated starts of each object
@@ -116,12 +116,12 @@ class Args:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
             raise ValueError(
-                f"each part to print must be one of {', '.join(known)} for --scenario {self.scenario}, got "
-                f"{', '.join(unknown)}"
+                f"each part of the printed report must be one of {', '.join(known)} for --scenario {self.scenario}, "
+                f"got {', '.join(unknown)}"
             )
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:
-            raise ValueError(f"--soaked provides the simulated starts: leave out {' and '.join(unused)}")
+            raise ValueError(f"--soaked provides the simulated trajectories: leave out {' and '.join(unused)}")
 
 
 def outcomes(study: Study, starts: Starts) -> None:

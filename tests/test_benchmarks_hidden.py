@@ -11,7 +11,10 @@ pytestmark = pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ("--soaked a --keep b --objects 200", "--soaked provides the simulated starts: leave out --objects and --keep"),
+        (
+            "--soaked a --keep b --objects 200",
+            "--soaked provides the simulated trajectories: leave out --objects and --keep",
+        ),
         ("fill --scenario inclined", "must be one of outcomes, truth, pictures for --scenario inclined, got fill"),
     ],
 )

@@ -97,7 +97,7 @@ def draw(folder: Path, numbers: tuple[int, ...], path: Path) -> None:
             f"{folder} has no confirmed trajectories with the numbers {sorted(unknown)}: give other --numbers"
         )
     if not recordings.numbers:
-        raise ValueError(f"{folder} has no confirmed trajectory to draw: collect some first")
+        raise ValueError(f"no picture can be drawn, because {folder} has no confirmed trajectory: collect some first")
     chosen = numbers or recordings.numbers[-SHEET:]
     rows = []
     for number in chosen:

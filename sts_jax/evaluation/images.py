@@ -14,7 +14,10 @@ STREAMS = ("visual", "tactile")
 
 @runtime_checkable
 class Streams(Protocol):
-    """First and last images of n trajectories, such as `hardware.RecordedImages` or `dataset.Pairs`."""
+    """Interface of classes that hold the first and last images of n trajectories.
+
+    Two such classes are `hardware.RecordedImages` and `dataset.Pairs`.
+    """
 
     @property
     def visual(self) -> np.ndarray:
@@ -60,11 +63,13 @@ def image_summary(
     """Compute cross-entropy and skill of predicted images, with 95 % bootstrap intervals over trajectories.
 
     The excess of a prediction is its cross-entropy minus the entropy of the true image, so a perfect prediction has
-    excess 0. The skill is 1 minus the excess of the prediction divided by the excess of a reference prediction.
+    excess 0. The skill is `1 - excess / reference_excess`, where `reference_excess` is the excess of a reference
+    prediction.
 
     Args:
-        predictions: Predictions of the last images by the name of the predictor, including those of `image_baselines`.
-            A stream that a predictor does not predict is None.
+        predictions: Dictionary from the name of each predictor to its predictions of the last images in `test`. The
+            dictionary must contain the predictors of `image_baselines`. A stream that a predictor does not predict is
+            None.
         test: The held-out trajectories.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.

@@ -55,10 +55,11 @@ def image_error(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray | No
 
 
 def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = None) -> float:
-    """Compute the skill of predicted images: 1 minus their excess divided by the excess of a reference prediction.
+    """Compute the skill of predicted images relative to a reference prediction: `1 - excess / reference_excess`.
 
     The excess of a predicted image is its cross-entropy minus the entropy of the true image. It is 0 for a perfect
-    prediction. Both excesses are sums over all items (held-out trajectories).
+    prediction. `excess` is the sum of the excesses of the predicted images over all items (held-out trajectories), and
+    `reference_excess` is the same sum for the reference prediction.
 
     Args:
         error: Errors of the predictor for n items.
@@ -140,10 +141,11 @@ def best_of(errors: Sequence[ImageError]) -> ImageError:
     prediction.
 
     Args:
-        errors: A sequence of k errors. Element j has the errors of sample j for all n items.
+        errors: A sequence of k `ImageError` tuples, for n items with k predicted images each. Tuple j has the errors of
+            predicted image j of every item.
 
     Returns:
-        The errors of the best sample of each item.
+        The errors of the best predicted image of each item.
     """
     excess = np.stack([error.excess for error in errors])
     best, item = excess.argmin(0), np.arange(excess.shape[1])
@@ -274,7 +276,7 @@ class Reliability(NamedTuple):
 def reliability(
     confidence: np.ndarray, right: np.ndarray, weight: np.ndarray | None = None, *, bins: int = BINS
 ) -> Reliability:
-    """Compare the probability of the likeliest outcome with the share of items in which it is the true one.
+    """Compare the probability of the likeliest outcome with the share of items whose likeliest outcome is the true one.
 
     Args:
         confidence: Probability of the likeliest outcome of each item, `(n,)`.
@@ -339,7 +341,7 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
 
 
 def median(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Compute the weighted median, the mean of the lower and the upper median.
+    """Compute the weighted median as the mean of the lower and the upper weighted median.
 
     Args:
         values: Values of the items, `(n,)`.

@@ -56,7 +56,8 @@ def summarise(
     twice = sorted({key for key in keys if keys.count(key) > 1})
     if twice:
         raise ValueError(
-            f"metrics has more than one metric named {' and '.join(map(repr, twice))}: give each metric its own name"
+            f"metrics has more than one metric named {' and more than one named '.join(map(repr, twice))}: "
+            "give each metric its own name"
         )
     missing = [name for name in BASELINES if name not in scores]
     if missing:

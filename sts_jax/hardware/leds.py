@@ -101,7 +101,7 @@ class Leds:
             watchdog_ms: Time without requests after which the controller turns its lights off, 100 to 10000 (ms).
 
         Returns:
-            The open connection. Its lights are off.
+            The open connection. The lights of the controller are off.
 
         Raises:
             ValueError: `timeout_s`, `answer_s` or `watchdog_ms` is out of range.
@@ -136,7 +136,7 @@ class Leds:
             timeout_s: Longest wait for an answer on each port (s).
 
         Returns:
-            The open connection. Its lights are off.
+            The open connection. The lights of the controller are off.
 
         Raises:
             ValueError: `timeout_s` is out of range.
@@ -246,8 +246,8 @@ class Leds:
         up to 5 s. Requests of other threads raise `DisconnectedError` meanwhile.
 
         Args:
-            limit_s: Time after which no further attempt begins (s). For each port, an attempt takes at most
-                `timeout_s + 2 * answer_s`, the arguments of `connect`.
+            limit_s: Time after which no further attempt begins (s). An attempt takes at most `timeout_s + 2 * answer_s`
+                for each port. `timeout_s` and `answer_s` are arguments of `connect`.
 
         Raises:
             DisconnectedError: The controller was not found. The message lists the ports that were tried.

@@ -69,8 +69,8 @@ def lock(
 
     Returns:
         The values that the device has now, by field name, and a list of the properties that the driver did not set.
-        A property that the driver lacks is in the list only in two cases. Either `values` requires the property, or
-        the property turns automatic exposure or automatic white balance on and off.
+        A property that the driver lacks is in the list only in two cases. In the first case, the property is needed to
+        set one of `values`. In the second case, the property controls automatic exposure or automatic white balance.
     """
     held: dict[str, float] = {}
     refused: list[Refusal] = []

@@ -42,7 +42,7 @@ class Settling:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Switch:
-    """The frames after a switch of the lights. The last of them must show only the new lights."""
+    """The frames after the lights were switched on or off. The final frame must not show the former lighting."""
 
     delays_s: Float[np.ndarray, "n"]  # time from the acknowledgement to the arrival of each frame (s)
     thumbnails: Float[np.ndarray, "n 24 32 3"]  # thumbnail of each frame, 0 to 255
@@ -83,8 +83,9 @@ def check_contrast(contrast: float) -> None:
 
 
 def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
-    """Return the share `s` of the lights in an image: `look = dark + s (lit - dark)` in the least-squares sense.
+    """Return the brightness of the lights in an image, as a share of their full brightness.
 
+    The share is the number `s` for which `dark + s (lit - dark)` is closest to `look` in the least-squares sense.
     Parts of the view that the lights do not reach have no influence.
 
     Args:
@@ -100,12 +101,12 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 
 
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
-    """Return the progress of a switch of the lights in an image: 0 with the former lights, 1 with the new lights.
+    """Return how far the lights had been switched on or off when an image was taken: 0 means not yet, 1 means fully.
 
-    The result is the median of `(look - before) / change` over the values that the switch changes clearly. Because of
-    the median, an object that moves in less than half of the view has no influence. A change is visible if its size is
-    at least 0.5 (of 255). A visible change is clear if its size is at least a quarter of the median size of the visible
-    changes.
+    The result is the median of `(look - before) / change` over the thumbnail values that the switch of the lights
+    changes clearly. Because of the median, an object that moves in less than half of the view has no influence. A
+    change is visible if its size is at least 0.5 (of 255). A visible change is clear if its size is at least a quarter
+    of the median size of the visible changes.
 
     Args:
         look: Thumbnail of the image.
@@ -127,10 +128,11 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
 def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Settling:
     """Compute the settling times from the frames after several switches of the lights.
 
-    `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if this share differs
-    by at most 0.02 from the share of the last frame after the same switch. The delay of a frame is its time of arrival
-    after the controller's acknowledgement. The settling time is the largest delay of a frame that is not settled, plus
-    one period of the camera. The period is added because later switches can occur at other moments of the exposure.
+    The `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if its
+    `light_share` differs by at most 0.02 from the `light_share` of the final frame in the same `Switch`. The delay of a
+    frame is its time of arrival after the controller's acknowledgement. The settling time is the largest delay of a
+    frame that is not settled, plus one period of the camera. The period is added because later switches can occur at
+    other moments of the exposure.
 
     Args:
         on: Switches from off to on. The scene must be at rest.
@@ -154,8 +156,8 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
     """Return the time from the acknowledgement of a switch to the arrival of the last frame that is not settled (s).
 
-    A frame is settled if its `light_share` differs by at most 0.02 from that of the last frame after the switch. If
-    all frames are settled, the result is 0. The result is never negative.
+    A frame is settled if its `light_share` differs by at most 0.02 from the `light_share` of the final frame in
+    `switch`. If all frames are settled, the result is 0. The result is never negative.
 
     Args:
         switch: The frames after a switch of the lights.

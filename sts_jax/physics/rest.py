@@ -56,7 +56,8 @@ def stable_faces(
         up: Direction that was up when the contents settled, as a unit vector in the mesh frame.
 
     Returns:
-        The stable faces, the most likely first. If the body cannot rest on any face, both fields are empty arrays.
+        The stable faces, the most likely first. If the body cannot rest on any face, both arrays of `StableFaces` are
+        empty.
 
     Raises:
         TypeError: `body` is not a Body, or an argument is traced.
@@ -194,8 +195,8 @@ def _index(faces: StableFaces, face: int | str) -> int:
     count = len(faces.up)
     if not count:
         raise ValueError(
-            "the body rests on no face, because its centre of mass lies outside its hull or less than 0.5 mm inside "
-            "the edge of every face: give `sense` a pose of your own"
+            "the body rests on no face. Its centre of mass would have to lie above a face, and at least 0.5 mm inside "
+            "the outline of this face. Give `sense` a pose of your own."
         )
     numbers = f"faces 0 (the most likely) to {count - 1}" if count > 1 else "face 0 only"
     numbered = f"the body rests on {numbers}"

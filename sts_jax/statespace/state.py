@@ -36,10 +36,11 @@ CODE = sum(SIZES)  # numbers in a state code
 
 
 class State(NamedTuple):
-    """The parts of state codes, which describe the pose, the shape and the mass of n objects.
+    """State codes of n objects, split into the parts that describe the pose, the shape and the mass.
 
     The shape is given by the support function `h(d)` of the convex hull: the maximum of `x . d` over the points x of
-    the hull, for a unit vector d. A `State` can also hold the variances of all parts.
+    the hull, for a unit vector d. A `State` holds either the parts of the state codes or the variances of
+    the parts.
     """
 
     pose: Float[Array, "n 12"]  # pose code
@@ -63,7 +64,7 @@ def split(code: Float[Array, "n code"]) -> State:
 
 
 def join(state: State) -> Float[Array, "n code"]:
-    """Concatenate the parts of state codes. This is the inverse of `split`."""
+    """Join the parts of each state code into one vector. This is the inverse of `split`."""
     return jnp.concatenate(state, axis=-1)
 
 
@@ -98,10 +99,10 @@ def turn(angle: Float[Array, "n 2"], state: State) -> State:
 
     Args:
         angle: Cosine and sine of the rotation angle of each item.
-        state: Parts of the state codes before the rotation.
+        state: State codes before the rotation, split into their parts.
 
     Returns:
-        Parts of the state codes after the rotation.
+        State codes after the rotation, split into their parts.
     """
     return state._replace(
         pose=poses.turn_code(angle, state.pose),
@@ -132,7 +133,7 @@ def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
     """Compute the height of the mesh origin above the lowest point of each object, after a rotation of the object.
 
     Args:
-        state: Parts of the state codes before the rotation.
+        state: State codes before the rotation, split into their parts.
         rotation: Matrices of the rotation in the sensor frame.
 
     Returns:
@@ -143,7 +144,7 @@ def reach(state: State, rotation: Float[Array, "n 3 3"]) -> Float[Array, "n"]:
 
 
 def heading(state: State) -> Float[Array, "n 2"]:
-    """The heading of each object: a direction in the plane of the pad that turns with the object.
+    """Compute the heading of each object: a direction that lies in the plane of the pad and turns with the object.
 
     If `poses.certainty` is above 0.5, the rotation is known well enough, and the heading is the direction of one of the
     mesh axes, see `poses.heading`. Otherwise, the heading is the long axis of the object's shape in the plane of the
@@ -152,7 +153,7 @@ def heading(state: State) -> Float[Array, "n 2"]:
     the heading.
 
     Args:
-        state: Parts of state codes. For uncertain states, their means.
+        state: State codes, split into their parts. If the state codes are uncertain, pass their means.
 
     Returns:
         Cosine and sine of the angle from the x axis of the sensor frame to the heading.

@@ -149,7 +149,7 @@ def shadows(
 
     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
     along u. Elevations are angles above the gel's plane (rad), seen from x. The arctangent is the largest elevation of
-    other skin. e is the elevation of the light's lower edge, and e + penumbra that of its upper edge.
+    other skin. e is the elevation of the light's lower edge, and e + penumbra is the elevation of its upper edge.
 
     A light in the gel's plane, as in the paper, has e = 0. The direction of such a light is perpendicular to the
     normals of flat skin and of the tops of pressed parts, so these receive none of the light. The shadows of such a

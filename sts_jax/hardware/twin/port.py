@@ -69,8 +69,7 @@ class LedPort:
     def _open(self) -> None:
         if self._link is not None and self._link.exists() and not self._link.is_symlink():
             raise FileExistsError(
-                f"the argument link is {self._link}, but this file exists and is not a symbolic link: choose another "
-                "path"
+                f"`link` is {self._link}, but this file exists and is not a symbolic link: choose another path"
             )
         # The slave stays open in this process, because reading the master fails while nobody has opened the slave.
         self._master, self._slave = os.openpty()
