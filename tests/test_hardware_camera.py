@@ -490,7 +490,7 @@ def test_a_camera_in_another_process_is_refused_with_its_id(server):
     command = [sys.executable, "-c", OTHER_PROCESS, server.url]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment()) as process:
         assert process.stdout.readline() == b"connected\n"
-        with pytest.raises(CameraBusyError, match=f"in use by process {process.pid} .*disconnect it"):
+        with pytest.raises(CameraBusyError, match=f"in use by process {process.pid} .*disconnect the camera"):
             connected(server)
         process.stdin.close()
         assert process.wait(SOON_S) == 0  # without a disconnect

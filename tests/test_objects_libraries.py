@@ -119,5 +119,5 @@ def test_bad_objects_are_left_out_and_named(tmp_path):
 def test_a_deleted_file_is_left_out_and_named(folder):
     listed = objects.library(folder, cache=folder / "cache")
     (folder / "loose.obj").unlink()
-    reason = "no such mesh file: restore it, or list the folder again"
+    reason = "no such mesh file: restore it, or call objects.library() again to list the existing files"
     assert objects.bodies(listed, [3]) == ([], [("loose.obj", reason)])

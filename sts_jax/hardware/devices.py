@@ -111,8 +111,8 @@ def locked(config: CameraConfig) -> Iterator[None]:
                 stack.enter_context(_files.lock(folder))
             except _files.LockedError:
                 raise CameraBusyError(
-                    f"{config.name} is in use by {_text(folder / _files.OWNER) or 'another process'}: disconnect it "
-                    "there, or choose another camera."
+                    f"{config.name} is in use by {_text(folder / _files.OWNER) or 'another process'}: disconnect the "
+                    "camera in that process, or choose another camera."
                 ) from None
             except OSError as error:
                 raise CameraError(

@@ -104,10 +104,10 @@ class Grabber:
     def lock_settings(self, timeout_s: float) -> list[str]:
         """Turn the automatic exposure, white balance and focus off, so that these settings keep their current values.
 
-        The thread does this when the next frame has arrived. All frames in the queue are then discarded.
+        The settings are locked when the next frame has arrived. Then all frames in the queue are discarded.
 
         Args:
-            timeout_s: Longest wait for this frame (s).
+            timeout_s: Longest wait for the next frame (s).
 
         Returns:
             Descriptions of the settings that the driver did not accept.
@@ -128,8 +128,8 @@ class Grabber:
 
         Args:
             value: Exposure in the driver's unit (V4L2: 0.1 ms).
-            timeout_s: Longest wait for the next frame (s). If the camera is lost, the wait includes the time until it
-                is found again.
+            timeout_s: Longest wait for the next frame (s). If the camera is lost, the time until it is found again
+                counts towards this limit.
 
         Returns:
             The exposure that the device has now, or None if the driver does not support a manual exposure.
@@ -178,7 +178,7 @@ class Grabber:
             The frame.
 
         Raises:
-            CameraError: There is no frame. `Camera.read` lists the subclasses.
+            CameraError: There is no frame. See `Camera.read` for the subclasses of this error.
         """
         deadline = time.monotonic() + timeout_s
         with self._changed:
@@ -211,7 +211,7 @@ class Grabber:
         """Return the newest frame. After the end of a video file, this is its last frame.
 
         Raises:
-            CameraError: There are no frames at present. `Camera.read` lists the subclasses.
+            CameraError: There are no frames at present. See `Camera.read` for the subclasses of this error.
         """
         with self._changed:
             ended = self._problem is not None and self._problem.error is EndOfVideoError

@@ -51,7 +51,7 @@ class ProtocolError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Hello:
-    """Request for the description of the controller. The reply is a `Controller`."""
+    """Request for the description of the controller. The reply is a `Controller` message."""
 
     sequence: int
     version: int = VERSION  # version of the protocol that the host uses
@@ -59,7 +59,7 @@ class Hello:
 
 @dataclasses.dataclass(frozen=True)
 class Set:
-    """Request to set the levels of the lights. The reply is a `State`."""
+    """Request to set the levels of the lights. The reply is a `State` message."""
 
     sequence: int
     levels: Levels  # duty cycles of the channels, 0 (off) to 255 (always on)
@@ -67,7 +67,7 @@ class Set:
 
 @dataclasses.dataclass(frozen=True)
 class Ping:
-    """Request for the state of the lights. The reply is a `State`.
+    """Request for the state of the lights. The reply is a `State` message.
 
     Like any request, it restarts the watchdog, which turns the lights off after a time without requests.
     """
@@ -77,18 +77,18 @@ class Ping:
 
 @dataclasses.dataclass(frozen=True)
 class Watch:
-    """Request to set the watchdog's period. The reply is a `Watching`.
+    """Request to set the watchdog's period. The reply is a `Watching` message.
 
-    The period is the time without requests after which the controller turns the lights off.
+    The watchdog turns the lights off if the controller receives no request for this period.
     """
 
     sequence: int
-    period_ms: int  # time without requests after which the lights go off, 100 to 10000 (ms)
+    period_ms: int  # the lights go off after this time without a request, 100 to 10000 (ms)
 
 
 @dataclasses.dataclass(frozen=True)
 class Controller:
-    """Reply to `Hello`: the description of the controller."""
+    """The reply to a `Hello` request. It describes the controller."""
 
     sequence: int
     version: int  # version of the protocol that the controller uses
@@ -100,7 +100,7 @@ class Controller:
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """Reply to `Set` and `Ping`: the state of the lights."""
+    """The reply to a `Set` or `Ping` request. It describes the state of the lights."""
 
     sequence: int
     levels: Levels  # duty cycles that are applied at the time of the reply
@@ -111,15 +111,15 @@ class State:
 
 @dataclasses.dataclass(frozen=True)
 class Watching:
-    """Reply to `Watch`: the controller will turn the lights off after `period_ms` without requests."""
+    """The reply to a `Watch` request: the controller will turn the lights off after `period_ms` without requests."""
 
     sequence: int
-    period_ms: int  # time without requests after which the lights go off (ms)
+    period_ms: int  # the lights go off after this time without a request (ms)
 
 
 @dataclasses.dataclass(frozen=True)
 class Refused:
-    """Reply to a request that the controller did not execute, with the reason."""
+    """The reply to a request that the controller did not execute. It gives the reason."""
 
     sequence: int  # 0 if the controller could not read the request's sequence number
     code: Code  # reason for the refusal
@@ -181,7 +181,7 @@ def decode(line: bytes) -> str:
         )
     found = re.fullmatch(rb"([ -)+-~]+)\*([0-9A-F]{4})\n", line)
     if found is None:
-        raise ProtocolError(f"a line must be text, '*', four hexadecimal digits and a newline, got {line!r}")
+        raise ProtocolError(f"a line must consist of a text, '*', four hexadecimal digits and a newline, got {line!r}")
     text, digits = found.groups()
     if int(digits, 16) != checksum(text):
         raise ProtocolError(

@@ -37,7 +37,7 @@ _FIRST_LOG_VAR = -4.0  # log variance of an active latent at initialisation
 
 @dataclass(frozen=True)
 class Modality:
-    """One quantity that a model measures and predicts: an image or a vector.
+    """One quantity that a model receives as an input and predicts as an output: an image or a vector.
 
     Raises:
         ValueError: `shape` is not allowed for `kind`, or `start` is not between 0 and 1.
@@ -53,7 +53,7 @@ class Modality:
 
     def __post_init__(self) -> None:
         if not 0 < self.start < 1:
-            raise ValueError(f"modality {self.name!r}: start is {self.start}, but this grey value must be > 0 and < 1")
+            raise ValueError(f"modality {self.name!r}: start is {self.start}, but it must be a grey value > 0 and < 1")
         if self.kind == "vector" and len(self.shape) == 1 and self.shape[0] > 0:
             return
         if self.kind == "image" and len(self.shape) == 3:

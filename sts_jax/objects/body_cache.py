@@ -41,7 +41,9 @@ def path_of(library: Library, item: Item) -> Path:
     except (OSError, ValueError):
         named = {}  # `load` raises an error for the damaged file
     if not item.path.is_file():
-        raise FileNotFoundError(f"{item.path}: no such mesh file: restore it, or list the folder again")
+        raise FileNotFoundError(
+            f"{item.path}: no such mesh file: restore it, or call objects.library() again to list the existing files"
+        )
     for name, path in [(item.path.name, item.path), *sorted(named.items())]:
         digest.update(name.encode() + b"\0" + (b"" if path is None else hashlib.sha256(path.read_bytes()).digest()))
     return library.cache / f"{digest.hexdigest()[:32]}.npz"
@@ -60,7 +62,7 @@ def write(path: Path, entry: Entry) -> None:
 
 
 def read(path: Path, item: Item) -> Entry | None:
-    """Read the loaded body of an item from a cache file. Return None if the file is missing or damaged."""
+    """Read the body of an item from a cache file. Return None if the file is missing or damaged."""
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             body = Body(**{field.name: jnp.asarray(data[field.name]) for field in dataclasses.fields(Body)})

@@ -88,7 +88,7 @@ def support(body: Body) -> Float[np.ndarray, "128"]:
     """Compute the support function of a body for the 128 unit vectors in DIRECTIONS.
 
     For a direction d, the support function is the largest dot product v . d. The maximum is over the vertices v of the
-    parts with which the body collides.
+    convex parts that represent the body in collisions.
 
     Args:
         body: One body.

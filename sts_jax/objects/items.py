@@ -43,7 +43,7 @@ class Library:
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A loaded item: its body, the gaps between surface and collision parts of the body, and notes on repairs."""
+    """A loaded item: its body, the gaps between the body's surface and its collision parts, and notes on repairs."""
 
     item: Item  # The item that was loaded.
     body: Body  # The loaded body.

@@ -25,7 +25,9 @@ def photograph(
     resolution: tuple[int, int] = (200, 200),
     two_sided: Bool[Array, ""] | bool = False,
 ) -> Float[Array, "h w 3"]:
-    """Draw triangles in daylight and lamplight, from any viewpoint on a white background. The z axis points up.
+    """Draw triangles as seen from any viewpoint, in daylight and lamplight.
+
+    The background is white. The z axis points up.
 
     Args:
         vertices: Vertices in the world frame (m).

@@ -45,7 +45,7 @@ def in_words(outcome: enum.IntEnum) -> str:
 
 
 class Hidden(NamedTuple):
-    """Properties of an object that a camera cannot see, one value per trajectory."""
+    """Invisible properties of an object, such as its friction. Each property has one value per trajectory."""
 
     fill: Float[Array, "*n"]  # Share of the interior's volume that is filled.
     shell_scale: Float[Array, "*n"]  # Mass of the shell over its nominal mass.
@@ -163,7 +163,7 @@ class Scenario(abc.ABC):
 
     @abc.abstractmethod
     def outcome(self, first: Float[Array, "7"], last: Float[Array, "7"]) -> Int[Array, ""]:
-        """Return the outcome of one trajectory, as the number of a member of `outcomes`.
+        """Return the outcome of one trajectory, as the integer value of a member of `outcomes`.
 
         Args:
             first: Pose in the first frame, (7,), simulated or predicted.
@@ -185,7 +185,8 @@ class Scenario(abc.ABC):
     def drift(self, condition: Float[Array, "c"]) -> Float[Array, "2"]:
         """Return the velocity that an object without friction would have relative to the pad.
 
-        Figures draw it as an arrow. The default is the horizontal part of `velocity`.
+        Figures draw this velocity as an arrow. Unless a subclass overrides this method, the result is the horizontal
+        part of `velocity`.
 
         Args:
             condition: The c numbers that `quantities` describes, (c,), in SI units.
@@ -202,12 +203,18 @@ class Scenario(abc.ABC):
 
     @property
     def condition_scale(self) -> tuple[float, ...]:
-        """Typical magnitude of each number of the condition, such as the acceleration of the pad, in SI units."""
+        """Typical magnitude of each number in the condition of a trajectory, in SI units.
+
+        The condition contains the numbers that `quantities` describes, such as the acceleration of the pad.
+        """
         return tuple(q.scale for q in self.quantities for _ in range(2 if q.vector else 1))
 
     @property
     def vectors(self) -> int:
-        """Number of vectors (x, y) in the condition. The vectors come first, before the scalars."""
+        """Number of vectors (x, y) in the condition of a trajectory.
+
+        The condition contains the numbers that `quantities` describes. The vectors come first, before the scalars.
+        """
         return sum(quantity.vector for quantity in self.quantities)
 
     @property
@@ -226,7 +233,9 @@ class Scenario(abc.ABC):
         """
         names = {int(outcome): in_words(outcome) for outcome in self.outcomes}
         if number not in names:
-            raise ValueError(f"number is {number}, but the outcomes of {type(self).__name__} are {names}")
+            raise ValueError(
+                f"number is {number}, but it must be the number of an outcome of {type(self).__name__}: {names}"
+            )
         return names[number]
 
     def described(self, condition: Float[Array | np.ndarray, "c"]) -> str:

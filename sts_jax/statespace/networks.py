@@ -119,7 +119,7 @@ class Config:
         """The fields by name, in values that `json.dumps` accepts.
 
         The field `vectors` is left out if it has its default value 1. Older versions did not save this field, and the
-        fields of a resumed training must equal those of the saved model.
+        configuration of a resumed training must equal the saved configuration.
         """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
@@ -442,9 +442,11 @@ def compose(
     Args:
         layers: Rendered images of n objects, from the decoder.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the size of the rendered images.
-        level: Threshold of each object for sharp outlines, from 0 to 1. A pixel shows the object if its probability p
-            from `layers.covered` is above the threshold, and the empty sensor otherwise. If the threshold is drawn
-            uniformly, a pixel shows the object with the probability p. With None, each pixel has the expected colour.
+        level: Threshold for each object, from 0 to 1. A threshold gives an object sharp outlines in the visual image.
+            `layers.covered` defines the probability p that the object covers a pixel. The pixel shows the object if p
+            is above the threshold. Otherwise, the pixel shows the empty sensor. If the threshold is drawn uniformly,
+            the pixel shows the object with the probability p. With None, the colour of the pixel is the mean of the
+            colours of the object and the empty sensor, with the weights p and 1 - p.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].

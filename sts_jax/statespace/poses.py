@@ -52,7 +52,8 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
     onto the plane of the pad.
 
     Args:
-        code: Means of pose codes (position and rotation matrix) under the density of an uncertain pose.
+        code: Mean pose code (position and rotation matrix) of each object. The mean is over all poses that the object
+            can have, weighted with their probability density.
 
     Returns:
         The certainty of each rotation.
@@ -73,7 +74,7 @@ def about_vertical(angle: Float[Array, "*n 2"]) -> Float[Array, "*n 3 3"]:
 
 
 def nearest(turn: Float[Array, "*n 9"]) -> Float[Array, "*n 3 3"]:
-    """The nearest rotation matrix to each matrix in `turn`, which has the nine numbers of a matrix row by row."""
+    """The rotation matrix nearest to each given matrix. The last axis of `turn` lists the nine entries row by row."""
     return geometry.quat_to_matrix(geometry.quat_from_matrix(turn.reshape(*turn.shape[:-1], 3, 3)))
 
 

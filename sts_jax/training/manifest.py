@@ -68,11 +68,11 @@ def write(folder: Path, step: int | None) -> Manifest:
 
 
 def add(folder: Path, name: str) -> None:
-    """Add the checksum of a file outside the checkpoint to `manifest.json`. Without a manifest, nothing is written.
+    """Add the checksum of a model's file to `manifest.json`. Without a manifest, nothing is written.
 
     Args:
         folder: Folder of the model.
-        name: Name of the file in the folder.
+        name: Name of the file in this folder, such as `blank.npz`. The file is not part of a checkpoint.
 
     Raises:
         OSError: A file cannot be read or written, or the manifest is damaged.

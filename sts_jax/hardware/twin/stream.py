@@ -102,7 +102,10 @@ class CameraThread:
 
 
 class WebServer(http.server.ThreadingHTTPServer):
-    """The HTTP server of a twin. It sends the camera stream and the twin's state, and receives commands and faults."""
+    """The HTTP server of a twin.
+
+    The server sends the camera stream and the twin's state. It receives commands and requests to simulate faults.
+    """
 
     daemon_threads = False  # `server_close` waits for the threads of all connections
     allow_reuse_address = True
@@ -114,7 +117,7 @@ class WebServer(http.server.ThreadingHTTPServer):
             address: Host and TCP port. Port 0 selects a free one.
             twin: Twin that executes the commands.
             camera: Source of the frames.
-            inject: Function that receives the `Fault` of a request.
+            inject: Function that is called with each requested `Fault`.
         """
         self.twin = twin
         self.camera = camera
