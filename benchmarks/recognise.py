@@ -31,7 +31,7 @@ class Args:
     workdir: Annotated[command.Folder, tyro.conf.Positional]  # work directory of an experiment with trained models
     out: Path = Path("recognise.png")  # file of the picture
     given: tuple[str, ...] = ()  # input modalities (default: all inputs of the model)
-    first: int = 0  # place of the first trajectory in the held-out list, from 0
+    first: int = 0  # index of the first trajectory in the held-out list, from 0
     seed: int = 0  # seed of the samples and of the order of the true images
 
 
@@ -39,7 +39,8 @@ def main(args: Args) -> str:
     """Draw the picture and return the answers as text.
 
     Raises:
-        ValueError: `first` is negative, or the held-out list has fewer than ten trajectories from this place on.
+        ValueError: `first` is negative, or the held-out list has fewer than ten trajectories from this index to its
+            end.
     """
     if args.first < 0:
         raise ValueError(f"--first must be at least 0, got {args.first}")
@@ -47,8 +48,8 @@ def main(args: Args) -> str:
     rows = data.members("test")[args.first : args.first + NUMBER]
     if len(rows) < NUMBER:
         raise ValueError(
-            f"--first is {args.first}, but the held-out list has only {len(rows)} trajectories from place {args.first} "
-            f"on, and {NUMBER} are needed: give a smaller --first"
+            f"--first is {args.first}, but the held-out list has only {len(rows)} trajectories from this index to its "
+            f"end, and {NUMBER} are needed: give a smaller --first"
         )
     pairs = data.pairs(rows)
     predictor = sts.Predictor.load(args.workdir / "models" / "statespace")

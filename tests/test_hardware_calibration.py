@@ -275,7 +275,8 @@ def test_missing_boards_are_named(images):
     count = len(hardware.find_board(few).numbers)
     assert 0 < count < 12
     message = (
-        rf"only 3 of 7 images .* 6 are needed.* not found in images 3, 5, 6.*corners were found in image 4 \({count} "
+        r"only 3 of 7 images .* 6 such images are needed.* not found in images 3, 5, 6.*"
+        rf"corners were found in image 4 \({count} "
     )
     with pytest.raises(CalibrationError, match=message + ".*Check that `board`"):
         calibrate([*images[:3], empty, few, empty, empty], BOARD)

@@ -80,7 +80,7 @@ def test_models_of_other_categories_and_defective_rows_are_skipped_with_a_reason
         ("i", "has no unit"),
         ("j", "unit is 'inch'"),
         ("k", "must not be parallel"),
-        ("l", "the column up is"),
+        ("l", "in the column up, but"),
         ("m", "models-OBJ/models/m.obj does not exist"),
         ("d", "several rows"),
         ("o", "_BAD"),

@@ -113,8 +113,8 @@ def class_names(collection: Collection) -> tuple[str, ...]:
 def make_bodies(collection: Collection, indices: np.ndarray) -> list[objects.Body]:
     """Make some objects of a collection.
 
-    An object without a mesh file is generated at random, from its own random key. Object i therefore does not depend on
-    the other indices.
+    An object without a mesh file is generated at random, from its own random key. The object therefore does not
+    depend on the other entries of `indices`.
 
     Args:
         collection: The description of the dataset.

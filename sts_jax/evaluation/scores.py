@@ -46,8 +46,8 @@ def score(
         outcomes: The outcomes of the scenario, `scenario.outcomes`. They are needed if the prediction has
             `outcome_probability`.
         frequency: Frequency of each of the c outcomes among the training trajectories, `(c,)`, from
-            `evaluation.frequency`. Without it, the outcome is that of the prediction, or the likeliest one if the
-            prediction has no outcome.
+            `evaluation.frequency`. None: the predicted outcome is `predicted.outcome`, or the outcome with the
+            largest probability if `predicted.outcome` is None.
         metrics: The metrics of the evaluation. The function calls `Metric.errors` of the metrics that have it, and
             stores the results in `Scores.further`.
 

@@ -116,14 +116,14 @@ class Calibration:
 
 
 def board_image(board: Board = Board(), *, outline: tuple[float, float] = (0.15, 0.15)) -> NDArray[np.uint8]:
-    """Draw an A4 page with the board, its dimensions, a frame around the board, and a ruler of 100 mm.
+    """Draw an A4 page with the board, a frame around the board, a text with all dimensions, and a ruler of 100 mm.
 
     Print the page, and cut it along the frame.
 
     Args:
         board: The board to draw.
-        outline: Width and height of the frame around the board (m). Choose the size of the sensor's gel pad. The
-            board is then centred on the pad if the cut sheet covers the pad exactly.
+        outline: Width and height of the frame around the board (m). Use the width and height of the sensor's gel
+            pad. The board is then centred on the pad when the cut sheet covers the pad exactly.
 
     Returns:
         Grey image with 10 pixels per mm, shape (2970, 2100), uint8.
@@ -448,7 +448,7 @@ def _usable(counts: tuple[int, ...], on_pad: int) -> list[int]:
     if len(used) < FEWEST_IMAGES:
         raise CalibrationError(
             f"only {len(used)} of {len(counts)} images show at least {FEWEST_CORNERS} corners of the board, but at "
-            f"least {FEWEST_IMAGES} are needed.{lacking}{remedy}"
+            f"least {FEWEST_IMAGES} such images are needed.{lacking}{remedy}"
         )
     return used
 

@@ -68,7 +68,10 @@ class Person(Protocol):
     """
 
     def show(self, view: View) -> None:
-        """Show the current view. `collect` calls this method after each attempt to read a pair."""
+        """Show the current view.
+
+        `collect` calls this method after each attempt to read a visual and a tactile image.
+        """
 
     def action(self) -> Action | None:
         """Return the next action of the person, or None if there is none.
@@ -89,7 +92,10 @@ class AutomaticPerson:
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `Action.CONFIRM` if the last view asks to confirm or discard a recorded trajectory, else None."""
+        """Return `Action.CONFIRM` if the last call of `show` received a view in the stage `REVIEW`, else None.
+
+        In this stage, a recorded trajectory is confirmed or discarded.
+        """
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 
 
@@ -123,8 +129,9 @@ def collect(
         count: Largest number of confirmed trajectories in the session, including those of earlier calls. Collecting
             ends when the session has this number. None: no limit.
         note: Text that is stored with each trajectory.
-        patience_s: Longest time without images (s). During this time, the person sees the error, and `collect`
-            continues if a lost camera or LED controller is found again.
+        patience_s: Longest time without images (s). If `sensor.read` fails with a temporary error, the person sees the
+            error, and `collect` tries again for up to this time. Collecting continues if a lost camera or LED
+            controller is found again.
 
     Returns:
         Number of trajectories that were confirmed during this call.

@@ -19,9 +19,10 @@ PARTS = tuple(f"{row} {column}" for row in _ROWS for column in _COLUMNS)
 
 
 def view_angle(lens: Lens, pinhole: Pinhole) -> float:
-    """Return the largest angle between the optical axis of a lens and a ray from the camera to the view (rad).
+    """Return the largest angle from the optical axis of the real camera to a point of the sensor's view (rad).
 
-    The view is the part of the gel's outer face that rectified images show. The largest angle is at one of its corners.
+    The view is the part of the gel's outer face that rectified images show. The point with the largest angle is a
+    corner of the view.
 
     Args:
         lens: The lens and the pose of the real camera.

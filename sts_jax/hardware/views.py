@@ -34,32 +34,37 @@ def sensor_view(
     tactile: UInt8[np.ndarray, "rows columns 3"],
     resolution: tuple[int, int] = (64, 64),
 ) -> SensorView:
-    """Rectify the two raw images of a pair, or the two images of the empty pad that a sensor file names.
+    """Rectify a raw visual image and a raw tactile image.
+
+    The images can come from a `Pair`, or from `Device.background` (images of the empty pad).
 
     Args:
         lens: Lens and pose of the real camera, from `Device.lens`.
         pinhole: The simulated pinhole camera that defines the view, from `Sensor.camera`.
-        visual: Raw visual image, RGB, uint8. For a pair of `STS.read` or of a recording, it is `pair.visual.image`.
-        tactile: Raw tactile image, RGB, uint8. For a pair, it is `pair.tactile.image`.
+        visual: Raw visual image, RGB, uint8, such as `pair.visual.image` of a pair from `STS.read` or from a recording.
+        tactile: Raw tactile image, RGB, uint8, such as `pair.tactile.image`.
         resolution: Height and width of the rectified images (pixels), usually `Predictor.preprocessing.resolution`.
 
     Returns:
         The rectified images. Each pixel is the mean of the raw image over the pixel's area.
 
     Raises:
-        ValueError: An image is not uint8, or its size is not that of `lens`. Or `resolution` is out of range. Or the
-            view contains rays at larger angles than `Lens.largest_angle`.
+        ValueError: An image is not uint8, or its size is not `lens.height` x `lens.width`. Or `resolution` is out of
+            range. Or the view contains rays at larger angles than `Lens.largest_angle`.
     """
     images = (rectified(lens, pinhole, image, resolution) for image in (visual, tactile))
     return SensorView(*(image.astype(np.float32) / 255 for image in images))
 
 
 def relit(view: SensorView, background: SensorView, empty: SensorView) -> SensorView:
-    """Adapt the brightness and colours of images to those of the sensor on which a model was trained.
+    """Adapt the brightness and colours of images to the sensor on which a model was trained.
 
     The result is `view * empty / background` for each pixel, clipped to [0, 1]. Values of `background` below 1/255 are
-    replaced by 1/255. A model regards every difference from the empty pad in its training images as part of an object.
-    Without this adaptation, the vignetting of another camera or a dark border of its images would count as an object.
+    replaced by 1/255.
+
+    In the training images of a model, the empty pad always looks like `empty`. The model therefore regards every
+    difference from `empty` as part of an object. Without this adaptation, the vignetting of another camera or a dark
+    border of its images would count as an object.
 
     Args:
         view: Rectified images of a sensor.
@@ -108,14 +113,15 @@ def recorded_images(
         The rectified images, in the order of the trajectories' numbers.
 
     Raises:
-        ValueError: There is no confirmed trajectory, or the size of the images is not that of `lens`.
+        ValueError: There is no confirmed trajectory, or the size of the images is not `lens.height` x `lens.width`.
         DamagedFileError: A file is missing or damaged.
     """
     width, height = recordings.session["width"], recordings.session["height"]
     if (width, height) != (lens.width, lens.height):
         raise ValueError(
             f"{recordings.folder} has images of {width}x{height} pixels, but the lens belongs to images of "
-            f"{lens.width}x{lens.height} pixels: use the lens from the sensor file of the device that collected them"
+            f"{lens.width}x{lens.height} pixels: use the lens from the sensor file of the device that took the "
+            "images in this folder"
         )
     if not len(recordings):
         raise ValueError(

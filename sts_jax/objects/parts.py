@@ -66,7 +66,9 @@ def convex_parts(
 
 
 def decompose(body: Body) -> Body:
-    """Replace the collision hull of a body by several convex parts, which fit scissors or a bowl more closely.
+    """Replace the collision hull of a body by several convex parts.
+
+    Several parts fit a shape that is not convex, such as scissors or a bowl, more closely than a single hull.
 
     Args:
         body: One body.

@@ -125,7 +125,7 @@ def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path |
     if not unit:
         raise ValueError(
             "the row of the model in metadata.csv has no unit, so the size of the mesh is unknown: write the "
-            "metres per unit of the mesh, such as 0.01, into the column `unit`"
+            "length of 1 mesh unit (in metres, such as 0.01) into the column `unit`"
         )
     try:
         scale = float(unit)
@@ -151,5 +151,8 @@ def _vector(text: str, key: str) -> Vector | None:
     try:
         x, y, z = (float(part) for part in text.replace("\\", "").split(","))
     except ValueError as error:
-        raise ValueError(f"the column {key} is {text!r} in metadata.csv, but it must have three numbers") from error
+        raise ValueError(
+            f"the row of the model in metadata.csv has {text!r} in the column {key}, but this cell must contain three "
+            "numbers"
+        ) from error
     return x, y, z

@@ -36,8 +36,8 @@ class Hull(NamedTuple):
     """The p convex parts of an object in the mesh frame, as arrays of h vertices, e edges and f triangular faces.
 
     If a part has fewer vertices, its last vertex is repeated, so that all parts have arrays of the same size. The same
-    holds for edges and faces. The axis of coordinates is before the axis of points, because XLA vectorises
-    along the last axis.
+    holds for edges and faces. The last axis of each array runs over the vertices, edges or faces of a part, because
+    XLA vectorises along the last axis.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m
@@ -56,7 +56,8 @@ class Contacts(NamedTuple):
 def hull(parts: np.ndarray) -> Hull:
     """Compute the vertices, edges and face planes of p convex parts.
 
-    The result is padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part, where n is the number of points.
+    The result is padded to n vertices, 3 n - 6 edges and 2 n - 4 faces per part, where n is the number of points
+    of each part.
 
     Args:
         parts: n points of each of the p parts, (p, n, 3) (m). Repeated points have no effect.
@@ -236,13 +237,16 @@ def collide(
     num: int = PAD_CONTACTS,
     plane: tuple[int, int] = (0, 1),
 ) -> Contacts:
-    """Find the contacts of an object with a box whose top is centred at the origin.
+    """Find the contacts between an object and a box. The top of the box is centred at the origin.
 
-    A point can become a contact if its depth is above 0 and above the largest depth minus 1 mm (`SKIN`). The first
-    contact is the deepest point. The second is the deepest of the points that are more than 1 mm (`APART`) away from
-    the first one. For each of `num` - 2 evenly spaced directions, the point with the largest score is a contact. The
-    score of a point is its coordinate along the direction plus 5 times (`STEEP`) its depth. Distances and directions
-    are measured in `plane`.
+    There is a candidate for each vertex of the object inside the box, for each edge of the object that crosses a rim
+    of the top, and for each corner of the top inside the object. A candidate can become a contact if its depth is above
+    0 and above the largest depth minus 1 mm (`SKIN`).
+
+    The first contact is the deepest candidate. The second contact is the deepest of the candidates that are more than
+    1 mm (`APART`) away from the first contact. For each of `num` - 2 evenly spaced directions, the candidate with the
+    largest score is a contact. The score of a candidate is its coordinate along the direction plus `STEEP` (5) times
+    its depth. Distances and directions are measured in `plane`.
 
     Args:
         body: Convex parts of the object.

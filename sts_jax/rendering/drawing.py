@@ -66,7 +66,11 @@ def draw(
 
 @jax.jit
 def touch(sensor: Sensor, imprint: Float[Array, "h w"], window: Float[Array, "4"]) -> Float[Array, "h w 3"]:
-    """Draw the tactile image of an imprint (m) in a window of the gel's face (m). `sts_jax.touch` has the details."""
+    """Draw the tactile image of an imprint. `sts_jax.touch` has the details.
+
+    `imprint` contains depths (m). `window` is the part of the gel's face that the image shows: left, top, width,
+    height (m).
+    """
     rows, columns = imprint.shape
     pitch = window[2:] / jnp.array([columns, rows], jnp.float32)
     seen = jnp.concatenate([window[:2] - pitch, window[2:] + 2 * pitch])

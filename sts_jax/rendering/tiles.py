@@ -35,8 +35,9 @@ def where_active(
     Args:
         function: Function `(params, images) -> result`. It must map a pytree of images of any shape
             (a + 2 ring, b + 2 ring) to a pytree of images (a, b). A pixel of the result must depend only on pixels at
-            most `ring` rows and columns away. If the given images have a third axis, with one entry for each tile, the
-            result must have this axis too. The function must not close over traced values. Pass these in `params`.
+            most `ring` rows and columns away. `function` may receive a batch of tiles as images of shape
+            (a + 2 ring, b + 2 ring, number of tiles). It must then return images of shape (a, b, number of tiles).
+            `function` must not close over traced values. Pass traced values in `params`.
         active: Mask of the pixels at which the result is needed.
         params: First argument of `function`.
         images: Pytree of images (h + 2 ring, w + 2 ring). An image with a single row or column is broadcast.

@@ -16,7 +16,8 @@ from sts_jax.statespace.objective import reduced
 class Samples(NamedTuple):
     """Samples of the last frame: k final poses for each of n items, and images of some of these poses.
 
-    The images show the first poses of each item. The argument `drawn` of `sample` is the number of these poses.
+    Of the k poses of an item, only the poses with index 0 to `drawn` - 1 have images. `drawn` is an argument of
+    `sample`.
     """
 
     belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
@@ -60,8 +61,8 @@ def sample(
             is drawn for each of these poses.
 
     Returns:
-        The posterior in the first frame, the probabilities of the outcomes, the sampled final poses and images, and the
-        mean images of each item over the `drawn` samples.
+        The posterior of the state code and the appearance code of the first frame, the probabilities of the outcomes,
+        the sampled final poses and images, and the mean images of each item over the `drawn` samples.
 
     Raises:
         ValueError: `drawn` is out of range.

@@ -48,9 +48,9 @@ class Seen(NamedTuple):
 class Scene(abc.ABC):
     """Base class of the scenes in front of the twin's camera.
 
-    A subclass defines `at`, which returns the state of the scene at a time, and `ends`, which returns the images of a
-    state. A scene that can change also defines `command`. The other methods are optional. `Twin` never calls `at` and
-    `command` at the same time.
+    A subclass defines two methods. `at` returns the state of the scene at a given time. `ends` returns two images of
+    the scene in a given state: one with the LEDs off, and one with the LEDs at full power. A scene that can change also
+    defines `command`. The other methods are optional. `Twin` never calls `at` and `command` at the same time.
     """
 
     exposure: float = 1.0  # exposure of the visual stream divided by that of the tactile stream (`Room.exposure`)
@@ -60,19 +60,19 @@ class Scene(abc.ABC):
         """Return the state of the scene at a time.
 
         Args:
-            time_s: Time on the twin's clock (s). The twin computes a frame after its exposure, so a few commands may
-                have changed the scene between `time_s` and this call.
+            time_s: Time on the twin's clock (s). The twin computes each frame only after the exposure of this frame. A
+                few commands may therefore have changed the scene between `time_s` and this call.
         """
 
     @abc.abstractmethod
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return two images of the scene in a state: with the LEDs off, and with the LEDs at full power.
+        """Return two images of the scene: one with the LEDs off, and one with the LEDs at full power.
 
-        The images are rendered now unless `prepare` has rendered them before.
+        The images show the scene in the state `seen`. They are rendered now unless `prepare` has rendered them before.
 
         Args:
             seen: State of the scene, as `at` returns it.
-            blender: The twin's `Blender`, which mixes both images in each frame. Its method `ends` converts the
+            blender: The twin's `Blender`, which mixes the two images into camera frames. `Blender.ends` converts the
                 rendered images to linear light, and applies lens distortion and vignetting.
 
         Returns:
@@ -86,7 +86,7 @@ class Scene(abc.ABC):
 
         Args:
             command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            blender: Blender of the twin, which converts the rendered images.
+            blender: The twin's `Blender`. Its method `ends` converts the rendered images.
         """
 
     def command(self, command: str, time_s: float) -> None:
@@ -112,7 +112,7 @@ class Scene(abc.ABC):
         need the thread.
 
         Args:
-            blender: Blender of the twin, which converts the rendered images.
+            blender: The twin's `Blender`. Its method `ends` converts the rendered images.
         """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
@@ -243,7 +243,7 @@ class ObjectScene(Scene):
             trajectory: Number of the trajectory, from 0. A trajectory that was not simulated before is simulated now.
 
         Raises:
-            ValueError: No trajectory of the scenario comes to rest.
+            ValueError: The object comes to rest in none of 32 successive simulated trajectories.
         """
         return self._motion(trajectory).outcome
 
@@ -251,7 +251,7 @@ class ObjectScene(Scene):
         """Return the state of the scene at a time (s), see `Scene.at`.
 
         Raises:
-            ValueError: No trajectory of the scenario comes to rest.
+            ValueError: The object comes to rest in none of 32 successive simulated trajectories.
         """
         index = bisect.bisect_right(self._events, time_s, key=lambda event: event[0]) - 1
         since_s, phase, number = self._events[max(index, 0)]
@@ -264,7 +264,10 @@ class ObjectScene(Scene):
         return Seen(phase, number, frame, tuple(float(value) for value in motion.pose[frame]))
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return both images of a state (`Scene.ends`). The images of each pose are rendered only once."""
+        """Return the image with the LEDs off and the image with the LEDs at full power, see `Scene.ends`.
+
+        The images show the scene in the state `seen`. The images of each pose are rendered only once.
+        """
         if seen.phase is Phase.EMPTY:
             return self._render(-1, 0, blender)
         return self._render(seen.trajectory, seen.frame, blender)
@@ -291,7 +294,7 @@ class ObjectScene(Scene):
 
         Raises:
             ValueError: The command is unknown, `release` comes without a held object, `time_s` is earlier than in the
-                previous call, or no trajectory of the scenario comes to rest.
+                previous call, or the object comes to rest in none of 32 successive simulated trajectories.
         """
         last_s, _, number = self._events[-1]
         if time_s < last_s:
