@@ -106,7 +106,7 @@ def main(config: Config) -> None:
         OSError: The picture cannot be written.
     """
     if config.num < 1:
-        raise ValueError(f"--num is {config.num}, but it must be at least 1 object per class")
+        raise ValueError(f"--num is {config.num}, but the number of objects per class must be at least 1")
     families = {category: sts.objects.find_family(category) for category in config.categories}
     output.check_picture(config.out)
     key = jax.random.key(config.seed)

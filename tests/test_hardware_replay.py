@@ -199,7 +199,7 @@ def test_late_readers_miss_images(folder):
 def test_the_newest_pair_and_stale_ones(folder):
     with hardware.Replay(folder, speed=1.0, loop=True) as replay:
         replay._start_s += 1000.0
-        with pytest.raises(hardware.StaleFrameError, match="no pair is available yet"):
+        with pytest.raises(hardware.StaleFrameError, match="tactile image is available yet"):
             replay.read_latest()
         replay._start_s = time.monotonic() - 4.5 * PERIOD_S  # the image 4 has come, but not its partner
         newest = replay.read_latest(60_000)

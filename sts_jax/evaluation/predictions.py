@@ -107,8 +107,8 @@ class Forecaster(Protocol):
 
         Args:
             shape: Leading axes of the prediction.
-            condition: The c known quantities of the scenario in SI units, such as an acceleration of the pad,
-                `(*shape, c)`. None for scenarios without such quantities.
+            condition: Known quantities of the scenario in SI units, such as an acceleration of the pad, as an array
+                `(*shape, c)` for c quantities. None for scenarios without such quantities.
 
         Returns:
             An object with the same fields as the result of `__call__`.
@@ -158,9 +158,10 @@ def predict(
     The predicted outcome follows from the predicted pose. The outcome probabilities are those of the model if it
     predicts them. Otherwise, they are the shares of the outcomes among the samples, if there are samples.
 
-    If the model predicts no pose, the outcome comes from the predicted visual image. It is `FELL_OFF` if the image
-    shows no object, and the other outcome if it shows one. This requires a scenario with two outcomes, and the
-    arguments `validation` and `blank`. If one of these is missing, the outcome is None.
+    If the model predicts no pose, the outcome follows from the predicted visual image. This requires a scenario with
+    two outcomes, and the arguments `validation` and `blank`. If the image shows no object, the outcome is `FELL_OFF`.
+    If the image shows an object, the outcome is the scenario's other outcome. The outcome is None if the scenario has
+    more than two outcomes, or if `validation` or `blank` is None.
 
     Args:
         predictor: The model.

@@ -75,7 +75,8 @@ def _check(summary: dict, metrics: Sequence[Metric]) -> None:
     missing = [metric.name for metric in metrics if metric.name not in known]
     if missing:
         raise ValueError(
-            f"summary lacks the metrics {', '.join(missing)}: pass these metrics to the functions score and summarise"
+            f"summary lacks the metrics {', '.join(missing)}: pass these metrics to the functions score() and "
+            "summarise()"
         )
 
 

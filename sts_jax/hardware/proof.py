@@ -79,14 +79,14 @@ class ProvenFrames:
         self.discarded = 0  # frames that `shot` did not return
 
     def stop(self) -> None:
-        """Interrupt `shot` or `pair` in another thread.
+        """Interrupt a call of `shot` or `pair` that runs in another thread.
 
-        The interrupted method soon raises an error. Call `resume` before the next image.
+        The interrupted call soon raises an error. Call `resume` before the next call of `shot` or `pair`.
         """
         self._stopping = True
 
     def resume(self) -> None:
-        """Allow new images after `stop`."""
+        """Undo `stop`, so that images can be taken again."""
         self._stopping = False
 
     def measure_settling(self, switches: int, watch_s: float) -> Settling:
@@ -130,15 +130,15 @@ class ProvenFrames:
         return found
 
     def _begin(self, settling: Settling, dark: Thumbnail, lit: Thumbnail) -> None:
-        """Use settling times from now on, and store one image of each stream to compare later frames with."""
+        """Use settling times from now on, and store a visual and a tactile image to compare later frames with."""
         self._settling = settling
         check_contrast(difference(dark, lit))
         self._effect, self._looks = lit - dark, {"visual": dark, "tactile": lit}
 
     def see_both(self, settling: Settling) -> None:
-        """Use known settling times from now on, and take one image of each stream.
+        """Use known settling times from now on, and take a visual image (lights off) and a tactile image (lights on).
 
-        Later frames are compared with these images to find out whether the lights are off or on.
+        Later frames are compared with these two images to find out whether the lights are off or on.
 
         Args:
             settling: Times for which frames are discarded after a switch of the lights.
@@ -162,7 +162,7 @@ class ProvenFrames:
         return found
 
     def pair(self, deadline: float) -> Pair:
-        """Take an image of each stream. The frames of both images arrive after the start of this call.
+        """Take a visual and a tactile image. The frames of both images arrive after the start of this call.
 
         The first image is of the stream for which the lights are already set, so a pair needs only one switch.
 
@@ -189,9 +189,9 @@ class ProvenFrames:
     def shot(self, stream: Stream, deadline: float, *, after_s: float = 0.0, then: Stream | None = None) -> Shot:
         """Take an image of one stream.
 
-        After the frame, the controller must confirm that the lights had not changed until then. The confirmation is
-        part of the controller's answer to the next request. If `then` requires a switch from the visual to the tactile
-        stream, this switch is the next request. Otherwise, a request without a switch is sent.
+        After the frame has arrived, a request is sent to the controller. The controller's answer must confirm that the
+        lights did not change between the switch to `stream` and this request. If `then` requires a switch from the
+        visual to the tactile stream, this switch is the request. Otherwise, the request switches no lights.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).

@@ -120,7 +120,7 @@ class Recorder:
             shot: Image to write. It must be later than all images that were added before.
 
         Raises:
-            ValueError: The size of the image differs from the size in the `origin` of this recorder.
+            ValueError: The image does not have the height and width in the argument `origin` of the constructor.
             OSError: The disk is full or the folder is not writable. All images that were added before are kept.
         """
         height, width = self._size

@@ -227,13 +227,16 @@ class Replay:
         self._opened()
         self._look()
         if self._newest is None:
-            raise StaleFrameError("no pair is available yet: call async_read() to wait for the first one.")
+            raise StaleFrameError(
+                "no pair of a visual and a tactile image is available yet: call async_read() to wait for the first "
+                "pair."
+            )
         age_ms = 0.0 if self._speed is None else 1000 * (time.monotonic() - self._due_s(self._newest[0]))
         if age_ms > max_age_ms:
             self._pair_from(self._position)  # raises `EndOfVideoError` if there are no more pairs
             raise StaleFrameError(
-                f"the newest pair is {age_ms:.0f} ms old, but at most {max_age_ms:g} ms are allowed: raise max_age_ms, "
-                "or call read()."
+                f"the newest pair of images is {age_ms:.0f} ms old, but at most {max_age_ms:g} ms are allowed: raise "
+                "max_age_ms, or call read()."
             )
         return self._pair(*self._newest)
 
@@ -392,8 +395,9 @@ class Replay:
         wait_s = 0.0 if self._speed is None else self._due_s(pair[1]) - time.monotonic()
         if wait_s > limit_s:
             raise LightError(
-                f"the next pair of {self._name} becomes available in {1000 * wait_s:.0f} ms, but timeout_ms is "
-                f"{1000 * limit_s:g}: raise timeout_ms. The recording may have a gap here."
+                f"{self._name}: the next pair of a visual and a tactile image becomes available in "
+                f"{1000 * wait_s:.0f} ms, but timeout_ms is {1000 * limit_s:g}: raise timeout_ms. The recording may "
+                "have a gap here."
             )
         self._newest, self._fresh, self._position = pair, False, max(self._position, pair[1] + 1)
         return self._pair(*pair)

@@ -39,7 +39,10 @@ class SensorFileError(ValueError):
 
 
 class WrongDeviceError(SensorFileError):
-    """Raised if the camera or the LED controller is not that of the sensor file. The message names both devices."""
+    """Raised if the connected camera or LED controller is not the one that the sensor file describes.
+
+    The message names the devices of the sensor file, and each connected device that differs.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,7 +267,7 @@ class Device:
         return image
 
     def check_identity(self, *, camera: str | None = None, leds: str | None = None) -> None:
-        """Raise an error if the connected camera or LED controller is not the one that this device describes.
+        """Raise an error if the connected camera or LED controller is not the one that is named in this `Device`.
 
         Args:
             camera: Path or URL of the connected camera. None: the camera is not compared.

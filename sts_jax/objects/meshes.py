@@ -90,8 +90,8 @@ def load(
     The albedo is the texture's value times the corner colour, in linear light. Textures, 8-bit colours and the diffuse
     colour `Kd` of an OBJ file are read as sRGB. Colour factors and vertex colours of a glTF file are read as linear
     light (glTF specification). Alpha values are ignored, and so is the `Kd` of an OBJ file with textures. Textures are
-    resized to a square with a side of 1, 256 or 1,024 pixels. Several textures are packed into one square. The
-    repetitions of a texture within a face are then lost.
+    resized to a square with a side of 1 pixel, 256 pixels or 1,024 pixels. Several textures are packed into one square.
+    The repetitions of a texture within a face are then lost.
 
     Args:
         path: The mesh file. Its materials and images are looked up in the same folder.
@@ -103,8 +103,9 @@ def load(
         mass: Mass of the body (kg), spread over its surface. The body then has no contents. None computes the mass of
             the shell from `density`.
         density: Mass of the shell per area (kg/m^2), if `mass` is None.
-        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3. The argument `fill` of `rigid`
-            is the share of the interior that is filled. If False, the body has no contents.
+        hollow: If True and `mass` is None, the body has contents of 1,000 kg/m^3. The body does not store how full it
+            is. The filled share of the interior is an argument of the function `rigid`. If False, the body has no
+            contents.
         strict: If True, a mesh that is not closed or encloses no volume is an error, and so is a missing material or
             image of an OBJ file. If False, these defects are repaired with a warning. The contents of such a mesh then
             fill its convex hull, and missing materials and images are left out.
@@ -181,7 +182,8 @@ def _check_arguments(
             raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most {PAD}")
         if value is not None and value < SMALLEST:
             raise ValueError(
-                f"{path}: {name} is {value} m, but the smallest object is {SMALLEST} m long: give at least {SMALLEST}"
+                f"{path}: {name} is {value} m, but an object must be at least {SMALLEST} m long: give at least "
+                f"{SMALLEST}"
             )
     try:
         check_category(category)
@@ -200,8 +202,8 @@ def _attitude(
     if isinstance(up, str):
         if up not in AXES or front is not None:
             raise ValueError(
-                f"{path}: up is {up!r} and front is {front}, but up must be 'x', 'y' or 'z', or a direction of three "
-                "numbers. Omit the argument front unless the argument up is a direction"
+                f"{path}: up is {up!r} and front is {front}, which is not allowed: pass 'x', 'y' or 'z' as up and omit "
+                "front, or pass a direction of three numbers as up, with or without front"
             )
         return rotation(*AXES[up])
     try:
@@ -232,7 +234,8 @@ def _read(path: Path, images: Path | None, texture: Path | None) -> list[trimesh
     for piece in pieces if sheet is not None else []:
         if getattr(piece.visual, "uv", None) is None:
             raise ValueError(
-                f"{path}: the mesh has no texture coordinates, so {texture} cannot be applied to it: omit texture="
+                f"{path}: the mesh has no texture coordinates, so {texture} cannot be applied to it: omit the argument "
+                "texture"
             )
         material = trimesh.visual.material.PBRMaterial(baseColorTexture=sheet)
         piece.visual = trimesh.visual.TextureVisuals(uv=piece.visual.uv, material=material)
@@ -282,16 +285,16 @@ def _factor(
     extent *= factor
     if extent < SMALLEST:
         raise ValueError(
-            f"{path}: the longest side is {extent * 1e3:.2g} mm, but the smallest object is {SMALLEST * 1e3:g} mm "
-            "long: check the unit of the file, and give longest_side in metres, or scale in metres per unit"
+            f"{path}: the longest side is {extent * 1e3:.2g} mm, but it must be at least {SMALLEST * 1e3:g} mm: check "
+            "the unit of the file, and give longest_side (in metres), or give scale (in metres per unit)"
         )
     if largest is not None and extent > largest:
         warnings.warn(f"{path}: the longest side is {extent:.3g} m, scaled down to {largest} m", stacklevel=3)
         return factor * largest / extent
     if extent > PAD:
         raise ValueError(
-            f"{path}: the longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side in metres, or "
-            "scale in metres per unit (0.001 if the file is in millimetres)"
+            f"{path}: the longest side is {extent:.3g} m, but the pad is {PAD} m wide: give longest_side (in metres), "
+            "or give scale (in metres per unit, 0.001 if the file is in millimetres)"
         )
     return factor
 

@@ -74,7 +74,7 @@ def rings(outline: np.ndarray, levels: Sequence[tuple[Number, Number]]) -> np.nd
 
     Args:
         outline: Outline of n points, (n, 2) (mm).
-        levels: Factor that scales the outline, and height z (mm), for each ring.
+        levels: Two numbers for each ring: the factor that scales the outline, and the height z of the ring (mm).
     """
     return np.stack([np.column_stack([outline * scale, np.full(len(outline), z)]) for scale, z in levels])
 

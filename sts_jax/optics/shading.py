@@ -23,8 +23,8 @@ Scalar = float | Array
 class Room:
     """Constants of the external light on the object, and of the gel and skin through which the camera sees the object.
 
-    The skin is a translucent paint. Colours are linear RGB, unless stated otherwise. Values without a source are our
-    choice.
+    The skin is a translucent paint. Colours are linear RGB, unless stated otherwise. Values for which no reference is
+    cited are our choice.
     """
 
     # Light that reaches a surface from all sides, including the light that leaks through and under the object.
@@ -116,16 +116,16 @@ def hidden_sky(
     decreases linearly from 1 to 0.
 
     The share that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`. Here d is
-    the horizontal distance from the point to the edge of the half-plane. It is negative if the half-plane extends over
-    the point. A strip is the difference of two half-planes, so it hides the difference of their shares. The shares are
-    computed on a grid of about 30 x 30 cells:
+    the horizontal distance from the point to the edge of the half-plane, and d is negative if the half-plane extends
+    over the point. A strip is the difference of two half-planes, so it hides the difference of their shares. The shares
+    are computed on a grid of about 30 x 30 cells:
 
         hidden = max_z Y_z slice_z X_z^T
 
     Y_z slice_z X_z^T is a product of matrices, and the maximum over the slices is taken in each cell. slice_z is the
-    share of each cell that the slice covers. A strip over column j of the grid, at the height z, hides the share
-    X_z[i, j] of the sky from the centre of column i. Y_z is the matrix for rows. Quadratic splines interpolate between
-    the cells.
+    share of each cell that the slice covers. X_z[i, j] is the share of the sky that is hidden, as seen from the centre
+    of column i, by a strip over column j at the height z. Y_z is the same matrix for rows instead of columns. Quadratic
+    splines interpolate between the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns

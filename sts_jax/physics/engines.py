@@ -89,8 +89,9 @@ def roll_worlds(worlds: Worlds, model: mjx.Model, data: mjx.Data) -> Rolled:
     """Simulate n trajectories in MJX.
 
     Args:
-        worlds: Starts, hulls and gravity of the trajectories. The arrays of all hulls must have the same size.
-        model: Model of the scene (`scene.template`). The values in `worlds.fields` replace some of its fields.
+        worlds: Starts, hulls and gravity of the trajectories. The arrays of all hulls must have the same shapes.
+        model: Model of the scene (`scene.template`). For each trajectory, some fields of this model are replaced by the
+            values in `worlds.fields`.
         data: Data of the same scene.
 
     Returns:
@@ -115,8 +116,8 @@ def drawn_fields(
 ) -> dict[str, np.ndarray]:
     """Compute the fields of MJX's model that depend on mass properties and friction.
 
-    The fields are computed for each of n draws of hidden properties. `scene.set_rigid` sets the fields of a model
-    of C MuJoCo, and the fields are copied from this model.
+    The fields are computed for each of n draws of hidden properties. `scene.set_rigid` writes the mass properties and
+    the friction of a draw into a model of C MuJoCo. The values of the fields are then read from this model.
 
     Args:
         bodies: All bodies.
@@ -161,8 +162,8 @@ def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
         chunk: Largest number of trajectories in a call of the returned function.
 
     Returns:
-        Function that takes the indices of at most `chunk` trajectories and returns their results. The hulls of
-            their bodies must have arrays of the same size.
+        Function that takes the indices of at most `chunk` trajectories and returns their results. In one call, the
+            hulls of all bodies must have arrays of the same shapes.
 
     Raises:
         BodyError: The mass properties or the friction of a body are out of range.

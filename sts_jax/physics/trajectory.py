@@ -12,7 +12,10 @@ from sts_jax.physics.scenario import Hidden, Outcome
 
 
 class Trajectory(NamedTuple):
-    """n trajectories with f frames each, ordered body by body. Each trajectory has one body."""
+    """n trajectories with f frames each. Each trajectory is the motion of one body.
+
+    The trajectories of body 0 come first, then those of body 1, and so on.
+    """
 
     time: Float[Array, "n f"]  # Time (s), 0 at frame 0.
     pose: Float[Array, "n f 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.

@@ -42,7 +42,7 @@ def weights(
 def weighted(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """Multiply the values at the three corners of the nearest face by the weights of these corners, at each pixel.
+    """Multiply `corners.value` at the three corners of the nearest face by the weights of the corners, at each pixel.
 
     The sum of the three products is the interpolated value. The arguments are those of `weights`.
     """
@@ -57,7 +57,8 @@ def interpolated(
 
     Args:
         corners: Vertices and faces of the object, with the value at each vertex.
-        images: Index of the nearest face, column and row of each pixel, as for `weights`.
+        images: Three arrays: the index of the nearest face at each pixel, the column of each pixel, and the row of each
+            pixel. They are the arguments `winner`, `column` and `row` of the function `weights`.
 
     Returns:
         Value at each pixel, meaningless at pixels without a face.

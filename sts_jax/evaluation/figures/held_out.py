@@ -43,8 +43,8 @@ def predictions(
             no rows.
         num: Largest number of trajectories to draw. They are the first ones of `predicted`.
         title: Title of the figure.
-        scenario: The scenario of the trajectories, for the names of the outcomes and the arrows. If it is None, the
-            figure has no arrows, and the names are those of `physics.Outcome`.
+        scenario: The scenario of the trajectories. It determines the velocities for the arrows and the names for the
+            outcomes. If `scenario` is None, the figure has no arrows, and the names are those of `physics.Outcome`.
     """
     streams = [name for name in ("visual", "tactile") if getattr(predicted, name) is not None]
     samples, outcomes = predicted.samples or Predicted(), OUTCOMES if scenario is None else scenario.outcomes
@@ -85,10 +85,11 @@ def predictions(
 
 
 def calibration(path: Path, scores: Mapping[str, Scores], *, title: str) -> None:
-    """Draw how often the likeliest outcome is the true one, as a function of its predicted probability.
+    """Draw how often a predictor is right, as a function of the predictor's confidence.
 
-    The frequencies of a calibrated predictor equal the probabilities. A second plot below shows the number of held-out
-    trajectories in each bin of the probability.
+    The predictor is right if the outcome with the largest predicted probability is the true outcome. The confidence is
+    this largest probability. If a predictor is calibrated, the frequency of right predictions equals the confidence. A
+    second plot below shows the number of held-out trajectories in each bin of the confidence.
 
     Args:
         path: The PNG file to write.
