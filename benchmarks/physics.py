@@ -86,7 +86,8 @@ class Args:
     def __post_init__(self) -> None:
         chosen = [name for name in ("engines", "pipeline", "scaling", "compile") if getattr(self, name)]
         if len(chosen) > 1:
-            raise ValueError(f"give at most one of these options, got {' and '.join(f'--{name}' for name in chosen)}")
+            given = " and ".join(f"--{name}" for name in chosen)
+            raise ValueError(f"{given} exclude each other: give only one of them")
 
 
 class Speeds(NamedTuple):

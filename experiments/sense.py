@@ -147,7 +147,8 @@ def lay(config: Config, sensor: sts.Sensor, body: sts.objects.Body) -> tuple[np.
     shares = sts.physics.stable_faces(body, fill=FILL).share
     if not 0 <= config.rest < len(shares):
         raise ValueError(
-            f"--rest is {config.rest}, but the object can rest on {len(shares)} faces: give 0 to {len(shares) - 1}"
+            f"--rest is {config.rest}, but it must be an index from 0 to {len(shares) - 1}, because the object can "
+            f"rest on {len(shares)} faces"
         )
     rest = sts.physics.place(body, sensor, face=config.rest, fill=FILL)
     turn = Rotation.from_quat(np.asarray(rest.pose[3:], float), scalar_first=True)

@@ -79,8 +79,8 @@ def sense(
     - The pose or the wrench is not finite.
     - The squared length of the quaternion is zero or infinite in float32.
     - The body is traced, and one of its vertices, normals or colours is not finite.
-    - The sensor is traced, and a constant is out of range (`Sensor.check`). Traced constants then have their default
-      values. A sensor that is not traced raises an error instead.
+    - The sensor is traced, and a constant is out of range (`Sensor.check`). The images are then rendered with the
+      default values of all traced constants. A sensor that is not traced raises an error instead.
 
     The function is compiled once for each resolution and each size of the body's arrays (faces, vertices and texture).
     Bodies are padded to a few sizes, so that many bodies share a compiled program. The function can be called under
@@ -96,8 +96,9 @@ def sense(
             show the largest centred part of the view.
         crop: If True, the images show only a window around the object, with the aspect ratio of `resolution`.
         moving_edges: If True, the derivative of the tactile image with respect to the pose includes the motion of the
-            imprint's edges across pixels. This derivative serves to fit poses, and is accurate on average over a few
-            pixels. If False, the derivative ignores moving edges. The images are the same in both cases.
+            imprint's edges across pixels. This derivative serves to fit poses. Its mean over a few neighbouring pixels
+            is accurate, but its value at a single pixel may not be. If False, the derivative ignores moving edges. The
+            images are the same in both cases.
 
     Returns:
         The images, with the pose that is drawn and the pressure on the gel.
@@ -160,8 +161,8 @@ def expose(sensor: Sensor, frame: Frame, light: ScalarLike) -> Float[Array, "*n 
     Raises:
         TypeError: `sensor` is not a `Sensor`, `frame` is not a `Frame`, or `light` is not a number.
         ValueError: `light` is outside [0, 1] or is an array with axes, or a constant of the sensor is out of range
-            (`Sensor.check`). The numbers in traced values raise no error. If a traced constant of the sensor is out of
-            range, all traced constants have their default values.
+            (`Sensor.check`). A traced value causes an error only if its shape is wrong. If a traced constant of the
+            sensor is out of range, the image is rendered with the default values of all traced constants.
     """
     _check_sensor(sensor)
     sensor, _ = sensor.guard()
@@ -192,15 +193,15 @@ def touch(
 
     Returns:
         Image in [0, 1]. It equals `Frame.tactile` of the same imprint, except that `sense` samples more finely if the
-        shorter side of the image is below `Sensor.fine_below` pixels. Traced numbers cannot raise errors. If a traced
-        constant of the sensor or a traced `window` is invalid, the image shows flat skin, and `window` counts as None.
-        If a constant is invalid, all traced constants also have their default values.
+        shorter side of the image is below `Sensor.fine_below` pixels. No error is raised if the numbers in a traced
+        `window` or in a traced constant of the sensor are invalid. The image then shows flat skin, and `window` counts
+        as None. For an invalid constant, the image is also rendered with the default values of all traced constants.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
         ValueError: `imprint` is empty, is not two-dimensional or has an integer type. Or `window` does not have the
-            shape (4,), is not finite or has no area. Or a constant of the sensor is out of range (`Sensor.check`). The
-            numbers in traced values raise no error.
+            shape (4,), is not finite or has no area. Or a constant of the sensor is out of range (`Sensor.check`).
+            A traced value causes an error only if its shape or type is wrong.
     """
     _check_sensor(sensor)
     imprint = _imprint_in_metres(imprint)

@@ -45,8 +45,8 @@ def wait(text: str, every: float | None) -> str:
     except EOFError:
         raise ValueError(
             "the Enter key cannot be read, because the standard input has ended: give --every SECONDS to wait for a "
-            "fixed time instead. To avoid live pictures of the board, also give --board-images FOLDER or --ideal-lens "
-            "DEGREES"
+            "fixed time instead. To run without live pictures of the board, give --board-images FOLDER or --ideal-lens "
+            "DEGREES in addition to --every"
         ) from None
 
 

@@ -159,8 +159,8 @@ def check(config: Config) -> None:
         listed, nearest = ", ".join(map(str, allowed)), min(allowed, key=lambda size: abs(size - config.image_size))
         raise ValueError(
             f"image_size must be one of {listed} for collection.resolution {height} {width} and model "
-            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or a resolution that is a "
-            "multiple of the image size"
+            f"{config.model!r}, got {config.image_size}: give --image-size {nearest}, or choose another resolution and "
+            "image size. The resolution must be a multiple of the image size"
         )
     if config.model == "paper" and config.steps is not None and len(config.steps) != len(names):
         raise ValueError(

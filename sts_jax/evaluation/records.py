@@ -69,7 +69,8 @@ class Metric:
 
     A metric is computed in two steps, because predicted images are too large to keep. First, `score` calls `errors`,
     which returns one number per item (held-out trajectory). Then `summarise` calls `statistic`, which returns a
-    function of the weights of the items. The bootstrap over objects evaluates this function with many weights.
+    function of the weights of the items. The bootstrap over objects evaluates this function many times, each time with
+    different weights.
 
     A metric needs `errors`, `statistic` or both. Without `statistic`, the metric is the weighted mean of `errors`.
     Without `errors`, `statistic` uses the fields of `Scores`.

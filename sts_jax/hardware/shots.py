@@ -23,9 +23,8 @@ class NotStillError(TimeoutError):
 class Shot:
     """An image of one stream, with the times between which the lights did not change.
 
-    The lights did not change from `before.acknowledged_s` to `until_s`, and the frame arrived between these times. It
-    also arrived at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the
-    lights.
+    Between the times `before.acknowledged_s` and `until_s`, the lights did not change, and the frame arrived. The frame
+    arrived at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the lights.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only
@@ -34,12 +33,12 @@ class Shot:
     sequence: int  # number of the frame since the camera was connected
     epoch: int  # number of the camera's connection, which changes when a lost camera is found again
     before: Lit  # the controller's answer to the switch of the lights before the frame
-    until_s: float  # time until which the controller's next answer proves that the lights did not change (s)
+    until_s: float  # time until which the lights did not change (s). The controller's next answer proves this
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pair:
-    """An image of each stream. `STS` takes them one after the other."""
+    """A visual image and a tactile image. `STS` takes these two images one after the other."""
 
     visual: Shot  # image with the lights off
     tactile: Shot  # image with the lights on

@@ -55,7 +55,8 @@ class STS:
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
       lights. Earlier frames may show the former lights.
     - Two successive frames since the switch have shown the effect of the new lights.
-    - The controller's next answer after the frame shows that the lights have not changed since the acknowledgement.
+    - After the frame arrived, the controller answered the next request. This answer shows that the lights have not
+      changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
     - It is not identical to the frame before. Identical frames are allowed if `CameraConfig.frozen_after_s` is None.
     - It is not black. Black frames are allowed if the last image of the same stream was black, or if there was none.
@@ -82,8 +83,9 @@ class STS:
             leds: An open LED controller, or the name of its port. `disconnect` closes the controller in both cases, and
                 a later `connect` opens its port again.
             levels: Duty cycles of the four channels in the tactile stream, 0 to 255. All are 0 in the visual stream.
-            settling: Times for which frames are discarded after a switch of the lights, from an earlier measurement
-                with the same devices. None: `connect` measures them, which needs a scene at rest.
+            settling: Settling times from an earlier measurement with the same devices. After each switch of the lights,
+                frames are discarded for the settling time. None: `connect` measures the settling times, which needs a
+                scene at rest.
             exposures: Exposures of the visual and of the tactile stream, in the unit of the camera's driver. If they
                 differ, the camera must be a device, and the exposure is set at each switch of the lights. Equal
                 exposures are not set: give such a value in `CameraConfig.exposure`. None: not changed.
@@ -196,7 +198,7 @@ class STS:
 
     @property
     def levels(self) -> protocol.Levels:
-        """Duty cycles of the four light channels in images of the tactile stream, 0 (off) to 255 (always on)."""
+        """Duty cycles of the four LED channels while tactile images are taken, 0 (off) to 255 (always on)."""
         return self._levels
 
     @property
@@ -206,7 +208,7 @@ class STS:
 
     @property
     def settling(self) -> Settling:
-        """The times for which frames are discarded after a switch of the lights.
+        """The settling times: how long frames are discarded after the lights are switched off or on.
 
         Raises:
             CameraNotConnectedError: No settling times were given, and `connect` has not measured them yet.
@@ -276,7 +278,7 @@ class STS:
         self._camera.disconnect()
 
     def read(self, timeout_ms: float | None = None) -> Pair:
-        """Take one image of each stream.
+        """Take one image of the visual stream and one image of the tactile stream.
 
         Both frames arrive after the start of the call. The first frame may have been exposed earlier. The time from
         exposure to arrival is at most one settling time. The first image belongs to the stream for which the lights are
@@ -293,19 +295,19 @@ class STS:
         Raises:
             LightError: The time ended before one frame of each stream was proven to show the right lights.
             LedError: The controller does not answer, or a lost controller was not found within `reconnect_s`.
-            CameraError: The sensor is not connected, or the camera sends no usable frames. `Camera.read` lists the
-                subclasses.
+            CameraError: The sensor is not connected, or the camera sends no usable frames. For the subclasses of
+                `CameraError`, see `Camera.read`.
             ValueError: `timeout_ms` is not positive.
         """
         self._stop_background()
         return self._connected.pair(time.monotonic() + self._limit_s(timeout_ms, 2))
 
     def async_read(self, timeout_ms: float | None = None) -> Pair:
-        """Return the newest pair that has not been returned yet, or wait for the next one.
+        """Return the newest pair of images that has not been returned yet, or wait for the next pair.
 
         The first call starts a thread that takes pairs continuously, until `read`, `stream`, `wait_until_still` or
-        `disconnect` is called. An error ends the thread. The next call of `async_read` or `read_latest` raises this
-        error, and the call after it starts a new thread.
+        `disconnect` is called. An error ends the thread. The first call of `async_read` or `read_latest` after the
+        error raises the same error, and the second call starts a new thread.
 
         Args:
             timeout_ms: Longest wait (ms). None: three times the sensor's `timeout_s`.
@@ -320,7 +322,7 @@ class STS:
         return self._started().next(self._limit_s(timeout_ms, 3))
 
     def read_latest(self, max_age_ms: float = 500.0) -> Pair:
-        """Return the newest pair that the thread of `async_read` has taken, without waiting.
+        """Return the newest pair of images that the thread of `async_read` has taken, without waiting.
 
         The same pair may be returned several times. The thread is started if it is not running.
 
@@ -340,7 +342,10 @@ class STS:
         pair = self._started().latest()
         taken_s = None if pair is None else min(pair.visual.time_s, pair.tactile.time_s)
         if pair is None or taken_s is None:
-            raise StaleFrameError("no pair has been taken yet: call async_read() to wait for the first one.")
+            raise StaleFrameError(
+                "no pair of a visual and a tactile image has been taken yet: call async_read() to wait for the first "
+                "pair."
+            )
         age_ms = 1000 * (time.monotonic() - taken_s)
         if age_ms > max_age_ms:
             raise StaleFrameError(
@@ -350,7 +355,7 @@ class STS:
         return pair
 
     def stream(self, duty: float = 0.5, *, dwell: int = 1) -> Iterator[Shot]:
-        """Return an endless iterator over images of both streams.
+        """Return an endless iterator over images of the visual stream and the tactile stream.
 
         Args:
             duty: Share of tactile images, 0 to 1.
@@ -373,8 +378,7 @@ class STS:
 
         Each image is divided into 32 x 24 blocks, and the mean colours of the blocks (0 to 255) are compared. The view
         counts as still if, for `window_s` seconds, no block differs by more than a limit from the same block at the
-        beginning of this period. The limit is 6. For noisy images, the limit is 8 times the median difference over
-        all blocks, if this is larger than 6.
+        beginning of this period. The limit is 8 times the median difference over all blocks, but at least 6.
 
         Args:
             timeout_s: Longest time from the first image to the returned one (s).
@@ -394,8 +398,9 @@ class STS:
         """Measure the settling times, and use them from now on. The scene must be at rest.
 
         The lights are switched several times in each direction, and the frames after each switch are compared. The
-        first frames may still show the former lights, fully or partly. The settling time is the longest time from the
-        controller's acknowledgement of a switch to the arrival of such a frame, plus the time between two frames.
+        first frames may still show the former lights, fully or partly. The delay of a frame is the time from the
+        controller's acknowledgement of the switch to the arrival of the frame. The settling time is the largest delay
+        of all frames that still show the former lights fully or partly, plus the time between two frames.
 
         Args:
             switches: Number of switches of the lights in each direction, off to on and on to off.
@@ -457,7 +462,7 @@ class STS:
 
 
 def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
-    """Return an endless iterator over the streams of successive images.
+    """Return an endless iterator that chooses "visual" or "tactile" for each successive image.
 
     Args:
         duty: Share of tactile images, 0 to 1. After each group of `dwell` images, the share of tactile images so far

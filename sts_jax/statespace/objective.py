@@ -60,8 +60,9 @@ def experts(
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], of the same size as the inputs.
 
     Returns:
-        The experts by input, `(n, code + look)`. The expert of `pose` or `state` has a very large variance for all
-        numbers that the input does not contain.
+        The experts by name of the input, each of shape `(n, code + look)`. `code` is the length of the state code, and
+        `look` is the length of the appearance code. The inputs `pose` and `state` contain only some entries of the two
+        codes. For the other entries, the experts of these inputs have a very large variance.
     """
     # Masked items are set to zero before the networks, because 0 * NaN would make the product and its gradient NaN.
     change = {name: _counted(counts[name], inputs[name] - empty[name]) for name in IMAGES if name in inputs}
@@ -219,9 +220,9 @@ def loss(
 
     Returns:
         The loss, and its terms by name without their weights. A term that depends on inputs is a mean over the items
-        that have these inputs. The term `state` is a squared error of state codes, and all other terms are in nats.
-        For `state`, `doubt` and `first`, the means of the model's image inputs are added. For `covered`, the means of
-        the first and the last frame are added.
+        that have these inputs. Each of the terms `state`, `doubt` and `first` is a sum of such means, one mean for each
+        image input of the model. The term `covered` is the sum of a mean for the first frame and a mean for the last
+        frame. The term `state` is a squared error of state codes, and all other terms are in nats.
     """
     model = nnx.merge(graphdef, params)
     config = model.config

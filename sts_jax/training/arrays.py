@@ -16,9 +16,9 @@ class Arrays:
     """A training set in memory.
 
     `inputs` and `targets` are dictionaries of arrays by name, such as `visual`, `tactile` or `pose`. `present` and
-    `target_present` contain Boolean arrays, which are True for the samples that have the input or the target of the
-    same name. The first axis of all these arrays and of `condition` is the sample. Images are uint8, or float32 in
-    [0, 1].
+    `target_present` are dictionaries of Boolean arrays. `present[name]` is True for each sample that has the input
+    `name`, and `target_present[name]` is True for each sample that has the target `name`. The first axis of all these
+    arrays and of `condition` is the sample. Images are uint8, or float32 in [0, 1].
 
     Raises:
         ValueError: The arrays whose first axis is the sample have different lengths, or the length 0.
@@ -58,8 +58,8 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: Indices into the first axis of the fields `views` and `falls`, given as `views=` and `falls=`.
-                A field for which no indices are given is left out of the batch.
+            further: Keyword arguments `views` and `falls`. Each contains indices into the first axis of the arrays in
+                the field of the same name. If an argument is not given, its field is left out of the batch.
 
         Returns:
             The selected arrays by name of the field. The field named `empty` is included as a whole.
@@ -84,15 +84,15 @@ def order(seed: int, samples: int, batch_size: int, start: int, stop: int) -> It
     """Iterate over the batches of a training, each as an array of sample indices.
 
     Each epoch is a random permutation of all samples. A batch may contain the end of one epoch and the start of the
-    next, so that no sample is dropped. The batch of a given number does not depend on `start` and `stop`, so that a
-    resumed training uses the same batches.
+    next, so that no sample is dropped. The batches of a training are numbered from 0. The samples in batch k do not
+    depend on `start` and `stop`, so that a resumed training uses the same batches.
 
     Args:
         seed: Seed of the permutations.
         samples: Number of samples.
         batch_size: Number of samples in a batch.
-        start: Number of the first batch. The numbers of the batches of a training start at 0.
-        stop: Number of the last batch plus 1, as in `range(start, stop)`.
+        start: Number k of the first batch.
+        stop: Number k of the last batch, plus 1, as in `range(start, stop)`.
 
     Yields:
         Indices of the samples of one batch, `(batch_size,)`.

@@ -24,7 +24,7 @@ _NORMAL = 1.4826  # standard deviation of a normal distribution divided by its m
 
 @dataclasses.dataclass(frozen=True)
 class Preprocessing:
-    """How images, poses and scenario conditions are encoded for a model, and which tactile images show a contact.
+    """The encoding of images, poses and scenario conditions for a model, and the test for a contact in tactile images.
 
     A scenario condition has the known quantities of a trajectory, such as the acceleration of the pad.
 

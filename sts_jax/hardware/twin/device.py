@@ -187,8 +187,8 @@ class Twin:
             The state after the command.
 
         Raises:
-            ValueError: The command is unknown, the scene is constant (such as a `Picture`), `release` comes without a
-                held object, or the object comes to rest in none of 32 successive simulated trajectories.
+            ValueError: The command is unknown, the scene is constant (such as a `Picture`), `release` is given while no
+                object is held, or the object does not come to rest in any of 32 simulated trajectories in a row.
         """
         with self._commands:
             if self._clock is not None:

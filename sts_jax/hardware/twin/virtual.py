@@ -1,4 +1,4 @@
-"""`VirtualSensor`: reads pairs of visual and tactile images from a twin on its virtual clock."""
+"""`VirtualSensor`: reads pairs of visual and tactile images from a twin that runs on a virtual clock."""
 
 import numpy as np
 
@@ -20,9 +20,9 @@ _ATTEMPTS = 10  # images of one stream without a proof of their light after whic
 
 
 class VirtualSensor:
-    """Reads pairs of visual and tactile images from a twin on its virtual clock.
+    """Reads pairs of visual and tactile images from a twin that runs on a virtual clock.
 
-    `hardware.collect` accepts it in place of `hardware.STS`.
+    `hardware.collect` accepts a `VirtualSensor` in place of `hardware.STS`.
 
     ```python
     body = sts_jax.objects.make(jax.random.key(0), "bottle")
@@ -48,7 +48,7 @@ class VirtualSensor:
         """Connect to a twin, and measure its settling times unless they are given.
 
         Args:
-            twin: Twin on its virtual clock. Its scene must be at rest if the settling times are measured.
+            twin: Twin that runs on a virtual clock. The scene must be at rest if the settling times are measured.
             levels: Duty cycles of the four LED channels in the tactile stream, 0 to 255, not all 0. All are 0 in the
                 visual stream.
             settling: Settling times of an earlier measurement. Default: they are measured now.
