@@ -127,7 +127,9 @@ def check(config: Config) -> None:
     if config.seconds is not None and not config.seconds > 0:
         raise ValueError(f"--seconds must be > 0, got {config.seconds}")
     if config.record is not None and config.replay:
-        raise ValueError("--record and --replay exclude each other: copy the folder of the recording instead")
+        raise ValueError(
+            "--record and --replay exclude each other: leave out one of them. To duplicate a recording, copy its folder"
+        )
 
 
 @contextlib.contextmanager

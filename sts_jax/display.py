@@ -168,8 +168,8 @@ def load(path: str | os.PathLike[str]) -> Any:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The path is a folder, or its suffix is not `.npz`.
-        OSError: The file is damaged, or was written by another program or another version of `save`. In each case, the
-            error is a `DamagedFileError`.
+        DamagedFileError: The file is damaged, or was written by another program or by another version of `save`.
+            DamagedFileError is an OSError.
     """
     path = Path(path)
     if not path.exists():

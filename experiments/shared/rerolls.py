@@ -95,8 +95,8 @@ def reroll(
     samples = mean.samples
     if samples is None or samples.pose is None or samples.outcome is None:
         raise TypeError(
-            "evaluation.ceiling must return samples of the pose and of the outcome, but one of the fields samples, "
-            "samples.pose and samples.outcome is None"
+            "evaluation.ceiling must return samples of the pose and of the outcome, but the field `samples`, "
+            "`samples.pose` or `samples.outcome` of its result is None"
         )
     one = evaluation.Predicted(*(None if leaf is None else leaf[0] for leaf in samples[:4]))
     scores = {

@@ -22,8 +22,10 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
     - The copy predicts that the last frame equals the first one.
     - The nearest neighbour is the last frame of the most similar training trajectory. Two trajectories are compared by
       the squared distance between their first visual images. In scenarios with a condition (an input such as an
-      acceleration of the pad), the squared distance between the conditions is added. Both distances are then divided by
-      their variances in the training set, so that they have the same weight.
+      acceleration of the pad), the squared distance between the conditions is added. Before the addition, the squared
+      distance between the images is divided by the variance of the images in the training set, and the squared distance
+      between the conditions is divided by the variance of the conditions in the training set. The two distances
+      therefore have the same weight.
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. The predicted height is the
       median last height of the training objects that stay on the pad. The rule predicts no images.
 

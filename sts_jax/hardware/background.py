@@ -42,7 +42,7 @@ class Background:
     def latest(self) -> Pair | None:
         """Return the newest pair, or None if no pair has been taken yet.
 
-        If an error has ended the thread, this method raises the same error.
+        If an error has ended the thread that takes the pairs, this method raises the same error.
         """
         with self._changed:
             self._raise()
@@ -51,7 +51,7 @@ class Background:
     def next(self, limit_s: float) -> Pair:
         """Wait until there is a pair that this method has not returned yet, and return the newest pair.
 
-        If an error has ended the thread, this method raises the same error.
+        If an error has ended the thread that takes the pairs, this method raises the same error.
 
         Args:
             limit_s: Longest wait (s).

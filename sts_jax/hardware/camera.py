@@ -26,7 +26,7 @@ class Camera:
         frame = camera.read()
     ```
 
-    A background thread fetches the frames continuously, so that no old frames collect in the driver. If a device or
+    A background thread fetches the frames continuously, so that no old frames wait in the driver. If a device or
     stream is lost, this thread opens it again under the same path or URL. The `epoch` of a frame counts the
     reconnections before this frame.
 
@@ -60,7 +60,8 @@ class Camera:
             ValueError: `warmup_s` is negative or not finite.
 
         Warns:
-            UserWarning: The source did not accept a setting, or is a stream although `CameraConfig.lock` is True.
+            UserWarning: The source did not accept a setting, or `CameraConfig.lock` is True but the source is a stream.
+                A `Camera` cannot lock the settings of a stream.
         """
         if not 0 <= warmup_s < float("inf"):
             raise ValueError(f"warmup_s must be >= 0 and finite, got {warmup_s}")
@@ -149,7 +150,9 @@ class Camera:
         return self._connected().held
 
     def set_exposure(self, exposure: float) -> float | None:
-        """Set the exposure of a device between two frames. The new exposure appears a few frames after the call.
+        """Set the exposure of a device as soon as the next frame has arrived.
+
+        The new exposure appears in the images a few frames after the call.
 
         Args:
             exposure: New exposure, > 0, in the driver's unit (V4L2: 0.1 ms).
@@ -173,11 +176,11 @@ class Camera:
         return self._connected().set_exposure(exposure, self.config.timeout_s)
 
     def read(self, timeout_ms: float | None = None) -> Captured:
-        """Return a frame that was exposed after the call.
+        """Return a frame whose exposure began after the start of this call.
 
-        The first `CameraConfig.in_flight` frames that arrive after the call are discarded, because they may have been
-        exposed before the call. If the source is a video file, the method returns the oldest frame that has not been
-        returned yet.
+        The first `CameraConfig.in_flight` frames that arrive after the start of the call are discarded, because their
+        exposure may have begun earlier. If the source is a video file, no frame is discarded, and the method returns
+        the oldest frame that has not been returned yet.
 
         Args:
             timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera is lost when the call begins,
@@ -210,7 +213,7 @@ class Camera:
             The frame.
 
         Raises:
-            CameraError: There is no frame. `read` lists the subclasses.
+            CameraError: There is no frame. See the documentation of `read` for the subclasses of CameraError.
             ValueError: `timeout_ms` is not positive.
         """
         return self._connected().wait(self._timeout_s(timeout_ms), exposed_now=False)
@@ -226,7 +229,8 @@ class Camera:
 
         Raises:
             StaleFrameError: The newest frame is older than `max_age_ms`.
-            CameraError: There are no frames at present. `read` lists the subclasses.
+            CameraError: There are no frames at present. See the documentation of `read` for the subclasses of
+                CameraError.
             ValueError: `max_age_ms` is not positive.
         """
         if not max_age_ms > 0:

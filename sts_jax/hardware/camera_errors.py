@@ -30,7 +30,7 @@ class CameraTimeoutError(CameraError, TimeoutError):
 
 
 class CameraLostError(CameraError):
-    """The device or the stream was lost. A thread tries to open it again."""
+    """The device or the stream was lost. The camera's background thread tries to open the lost source again."""
 
 
 class FrameSizeError(CameraError):

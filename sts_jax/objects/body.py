@@ -32,8 +32,8 @@ class Body:
 
     The object is a shell, whose interior can be filled with contents such as water. `rigid` computes mass, centre of
     mass and inertia of the shell with its contents. The origin lies inside the convex hull. The object usually stands
-    or lies with +z up. The albedo at a point is the texture's value times the interpolated corner colour (as in glTF),
-    in linear light.
+    or lies with +z up. Each corner of a face has a colour. The albedo at a point of the face is the texture's value
+    times the colour that is interpolated between the corners (as in glTF), in linear light.
     """
 
     vertices: Float[Array, "*n v 3"]  # Vertices of the visible surface (m).
@@ -69,10 +69,10 @@ class Body:
             values = np.asarray(getattr(self, field.name))
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 number = int((~np.isfinite(values)).sum())
-                which = f"is {values}" if values.ndim == 0 else f"has {number:,} values that are not finite"
-                raise ValueError(
-                    f"{field.name} {which}, but all values must be finite: repair the mesh, or omit the body"
-                )
+                problem = f"{field.name} has {number:,} values that are not finite"
+                if values.ndim == 0:
+                    problem = f"{field.name} is {values}"
+                raise ValueError(f"{problem}, but all values must be finite: repair the mesh, or omit the body")
         faces = np.asarray(self.faces)
         if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
             raise ValueError(
@@ -233,9 +233,10 @@ def fill_moments(
     """Compute volume, centre and second moments of the liquid that fills a share of a closed mesh from below.
 
     The triangles are clipped to the half-space below the liquid's surface. Each clipped triangle and a reference point
-    form a tetrahedron with a signed volume. The moments of the liquid are the sums over these tetrahedra. The liquid's
-    surface has no triangles, so its tetrahedra are missing from the sums. The reference point lies on this surface, so
-    that the missing tetrahedra have no volume. Bisection finds the height of the surface.
+    form a tetrahedron with a signed volume. The moments of the liquid are the sums over these tetrahedra. No triangles
+    cover the liquid's surface, so the tetrahedra between this surface and the reference point are missing from the
+    sums. The reference point lies on the liquid's surface, so that the missing tetrahedra have no volume. Bisection
+    finds the height of the liquid's surface.
 
     Args:
         interior: Triangles of a closed surface (m), counter-clockwise seen from outside. Triangles without area have no

@@ -24,8 +24,8 @@ def references(path: Path, images: Path | None = None) -> dict[str, Path | None]
 
     Returns:
         Dictionary from the name of each file, as written in the mesh or material file, to its path. The path of a
-        missing file is None. For an OBJ file, images other than colours (`map_Kd`) are not listed. For other formats,
-        the dictionary is empty.
+        missing file is None. For an OBJ file, the only images in the dictionary are the colour images (`map_Kd`). For
+        files other than `.obj` and `.gltf`, the dictionary is empty.
     """
     if path.suffix.lower() == ".gltf":
         tree = json.loads(path.read_text())

@@ -99,8 +99,8 @@ def rasterise(
         keep: Mask of the vertices that may be drawn. A face is drawn only if the mask is True for all its corners.
         two_sided: If True, faces are also visible from behind.
         shape: Height and width of the image (pixels).
-        within: Limit in units of `order`, or None. If given, the result has a second image that contains only near
-            faces: those with at least one corner whose order is below the limit.
+        within: Limit in units of `order`, or None. If given, the result also has an image of only the near faces. A
+            face is near if the order of at least one of its corners is below the limit.
         chunk: Number of runs that are drawn at a time. A run is a part of one row of a face, up to 8 pixels long.
 
     Returns:

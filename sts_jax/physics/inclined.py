@@ -35,13 +35,13 @@ CLEARANCE = 0.001  # m, smallest distance of a start on the slope from the stop 
 class Inclined(Scenario):
     """An object starts at rest on the tilted pad, or is released just above it. Downhill is +y.
 
-    A stop wall stands at the lower edge of the pad. The contents of an object settle in a random direction (`tilt`)
-    before the start and do not move on the slope. The centre of pressure in frame 0 then reveals where the contents
-    lie. The weight alone reveals little.
+    A stop wall stands at the lower edge of the pad. Before the start, the contents of an object settle while the object
+    has a random orientation (limited by the field `tilt`). On the slope, the contents do not move inside the object.
+    The centre of pressure in frame 0 therefore reveals where the contents lie. The weight alone reveals little.
 
-    In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie. A
-    start at rest therefore has the best of `tries` random poses. In this pose, the contents have the largest influence
-    on tipping.
+    In most poses, the contents hardly matter: a flat object stays and a high object tips, wherever its contents lie.
+    For a start at rest, several random poses are therefore compared (the field `tries` is their number). The object
+    starts in the pose in which its contents have the largest influence on tipping.
 
     Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
     section "Data Collection".
@@ -89,16 +89,20 @@ class Inclined(Scenario):
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
         if not 0 <= self.resting <= 1:
-            raise ValueError(f"scenario.resting is {self.resting}, but the share of starts at rest must be from 0 to 1")
+            raise ValueError(
+                f"scenario.resting is {self.resting}, but it must be from 0 to 1 (share of the trajectories that start "
+                "at rest)"
+            )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one start uphill of the stop wall. `Scenario.start` describes the arguments.
 
-        A start at rest has the best of `tries` random poses. In a good pose, the object tips with some contents and
-        stays with others. Each pose is tested with several random contents. The margin m of one test is the distance by
-        which the centre of mass, projected vertically onto the pad, lies inside the area that supports the object. The
-        margin is negative if the object tips. The best pose has the largest value of
-        `min(mean(max(m, 0)), mean(max(-m, 0)))`, with means over the tests.
+        For a start at rest, several random poses are drawn (the field `tries` is their number), and the best pose is
+        used. In a good pose, the amount and the place of the object's contents decide whether the object tips or stays.
+        Each pose is therefore tested with several random contents. The margin m of one test is the distance by which
+        the centre of mass, projected vertically onto the pad, lies inside the area that supports the object. The margin
+        is negative if the object tips. The best pose has the largest value of `min(mean(max(m, 0)), mean(max(-m, 0)))`,
+        with means over the tests of the pose.
         """
         kind, face, turn, free, gap, x, y = jax.random.split(key, 7)
         rests = jax.random.uniform(kind) < self.resting

@@ -17,7 +17,10 @@ rigid_of_draws = jax.jit(jax.vmap(objects.rigid, in_axes=(None, 0, 0, 0)))  # on
 
 
 class Rigid(NamedTuple):
-    """Mass properties and friction of n objects, each with its own hidden properties, in float64."""
+    """Mass properties and friction of n objects, as float64 arrays with one entry per object.
+
+    The entry of an object depends on its hidden properties, such as the filled share of its interior.
+    """
 
     mass: Float[np.ndarray, "n"]  # Mass (kg).
     com: Float[np.ndarray, "n 3"]  # Centre of mass in the mesh frame (m).

@@ -33,12 +33,12 @@ CLEARANCE = 0.002  # m, smallest distance between the points that touch the pad 
 
 @dataclasses.dataclass(frozen=True)
 class Released(Scenario):
-    """A hand leans an object over an edge of one of its faces, holds it there on the pad and lets go at frame 0.
+    """A hand tilts an object about an edge of its bottom face, holds it tilted on the pad, and lets go at frame 0.
 
-    At one angle of lean, the balance angle, the object would balance on the edge. The hand holds it at a random angle
-    near the balance angle. At a smaller angle the object returns to its face, and at a larger angle it topples. The
-    balance angle depends on the place of the contents, which can lie anywhere in the object. Near the balance angle,
-    the contents therefore decide the outcome.
+    At one angle, the balance angle, the object would balance on the edge. The hand holds the object at a random angle
+    near the balance angle. From a smaller angle, the object returns to its bottom face. From a larger angle, it
+    topples. The balance angle depends on the place of the contents, which can lie anywhere in the object. Near the
+    balance angle, the contents therefore decide the outcome.
 
     In frame 0 the object is at rest. The pad carries a random share of the weight (`carried`). The hand carries the
     rest of the weight and balances all moments. The wrench in frame 0 follows from the held pose and this share
@@ -91,20 +91,25 @@ class Released(Scenario):
         check_range("carried", self.carried)
         if self.carried[1] > 1:
             raise ValueError(
-                f"scenario.carried is {self.carried}, but both limits must be > 0 and <= 1 (share of the weight on the "
-                "pad)"
+                f"scenario.carried is {self.carried}, but it must be (low, high) with 0 < low <= high <= 1 (share of "
+                "the object's weight that the pad carries)"
             )
         if self.tries < 1:
             raise ValueError(f"scenario.tries is {self.tries}, but it must be >= 1")
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one held pose and the share of the weight on the pad. `Scenario.start` describes the arguments.
+        """Draw one held pose and the share of the weight that the pad carries.
 
-        The object stands on a stable face and is tilted over an edge of this face. Edges at which the object balances
-        at a tilt of 15 to 45 degrees are preferred. Two faces meet at such an edge, and the object stands on
-        the narrower face. In most cases, it turns by less than 45 degrees to return to this face, and by more to
-        topple. `outcome` uses this difference. If `tries` random edges include no such edge, for example for a cylinder
-        on its side, the object is tilted over another edge.
+        `Scenario.start` describes the arguments.
+
+        The object stands on a stable face and is tilted about an edge of this face. The edge is chosen from random
+        edges (the field `tries` is their number). Edges at which the object balances at a tilt of 15 to 45 degrees are
+        preferred. If no random edge is of this kind, for example for a cylinder on its side, the object is tilted about
+        another edge.
+
+        Two faces meet at a preferred edge, and the object stands on the narrower face. In most cases, the object turns
+        by less than 45 degrees if it returns to the narrower face, and by more than 45 degrees if it topples onto the
+        wider face. `outcome` uses this difference.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)
@@ -145,9 +150,10 @@ class Released(Scenario):
         - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
-        `start` usually leans an object by less than 45 degrees from the narrower of two faces. If the faces meet at a
-        right angle, the object then turns by more than 45 degrees to reach the wider face. An object that has turned by
-        less has returned to the narrower face.
+        `start` places an object on an edge between two of its faces. The object is usually tilted by less than 45
+        degrees from its pose on the narrower face. If the two faces meet at a right angle, the object turns by more
+        than 45 degrees to reach the wider face. An object that has turned by less than 45 degrees has therefore
+        returned to the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

@@ -52,7 +52,10 @@ class Gel:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Equilibrium:
-    """Equilibrium of a rigid object on the gel. The motion begins at the pose in which the object is placed."""
+    """Equilibrium of a rigid object on the gel.
+
+    The object moves from its given pose to the equilibrium. `sink` and `turn` describe this motion.
+    """
 
     # Motion along -z (m), which follows the rotation.
     sink: Float[Array, "*n"]
@@ -98,13 +101,14 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
     """Find the equilibrium of an object: the depth and tilts at which the gel balances Fz, Mx and My of the wrench.
 
-    The gel is a grid of cells, and each cell is an independent spring. An object with heights h over the cells at x and
-    y sinks by d, and turns by the small angles a about x and b about y. Let k be the stiffness of the gel. The new
-    heights h' of the object and the pressure p are then
+    The gel is a grid of cells, and each cell is an independent spring. Let h be the height of the object above the cell
+    whose centre has the coordinates x and y. The object sinks by d. It also turns by a small angle a about the x axis,
+    and by a small angle b about the y axis. Let k be the stiffness of the gel. Above the cell, the object then has the
+    height h' and exerts the pressure p:
 
         h' = h - d + a y - b x,   p = k max(0, -h')
 
-    With the area A of a cell, the balance
+    Let A be the area of a cell. With sums over all cells, the balance
 
         Fz = sum p A,   Mx = sum y p A,   My = -sum x p A
 

@@ -38,7 +38,7 @@ def initial(
         config: Options of the training.
         learner: Initialisation and loss of the model, from `training.learner`.
         total: Number of steps of the whole training, which the default optimiser needs for its learning rate schedule.
-        optimiser: Optimiser (default: that of `training.optimiser`).
+        optimiser: Optimiser (default: the optimiser from `training.optimiser`).
 
     Returns:
         The definition of the model, and the state before the first step.
@@ -67,7 +67,7 @@ def step(
             depend on this number. beta is the weight of the divergence in the loss.
         state: State before the step.
         batch: Arrays of the batch, from `Arrays.take`. uint8 images are converted to float32 in [0, 1].
-        optimiser: Optimiser that made `state` (default: that of `training.optimiser`).
+        optimiser: Optimiser that made `state` (default: the optimiser from `training.optimiser`).
 
     Returns:
         The state after the step, with the same structure and dtypes, and the parts of the loss before the step.
@@ -127,16 +127,17 @@ def train(
             `own` means only the modalities in the subset.
         preprocessing: JSON values that describe how images and vectors were made, such as `dataclasses.asdict(p)` of a
             `Preprocessing` p. They are stored in `config.json`.
-        loss: Loss that replaces the loss of the model (default: that of `training.learner`). `targets` and `absent` are
-            not passed to it.
-        optimiser: Optimiser that replaces Adam (default: that of `training.optimiser`). The fields of `config` for
-            Adam, for the learning rate and for the clipping are then not used.
+        loss: Loss that replaces the loss from `training.learner`, or None. `targets` and `absent` are not passed to the
+            given loss.
+        optimiser: Optimiser that replaces Adam (the optimiser from `training.optimiser`), or None. A given optimiser
+            does not use the fields of `config` for Adam, for the learning rate and for the clipping.
         notes: JSON values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
             must have the same notes, because the functions themselves cannot be compared.
         progress: Function that is called after every step with the number of steps done, their total number, and the
             latest record of `metrics.jsonl` (empty before the first record).
-        log: Function that is called with the step and the values of each record. In a resumed training, the records of
-            earlier calls come first, so that every call of `train` passes all records of the training in order.
+        log: Function that is called once for each record, with the step and the values of the record. A resumed
+            training first passes the records from earlier calls of `train` to `log`. Every call of `train` therefore
+            passes all records of the training in order.
 
     Returns:
         The trained model.
