@@ -90,7 +90,7 @@ class Predictor:
         try:
             preprocessing = training.preprocessing_from_json(model.settings.get("preprocessing", {}))
         except ValueError as error:
-            raise ValueError(f"{path / 'config.json'}, preprocessing: {error}") from error
+            raise ValueError(f"the field 'preprocessing' of {path / 'config.json'} is not valid: {error}") from error
         for field, asked in (("resolution", resolution and tuple(resolution)), ("crop", crop)):
             there = getattr(preprocessing, field)
             if asked is not None and asked != there:
@@ -282,7 +282,7 @@ class Predictor:
     def modalities(self) -> tuple[str, ...]:
         """Names of the inputs that the model accepts, out of "visual", "tactile" and "pose".
 
-        The model does not accept a modality that no trajectory of the training data had in its first frame.
+        The model accepts an input only if the first frame of at least one training trajectory contains this input.
         """
         return tuple(name for name in self._inputs if name not in self.preprocessing.absent)
 
@@ -295,12 +295,14 @@ class Predictor:
         """Check the type and shape of the input `name`, and return it as float32. A traced value stays traced."""
         if name not in (*self._inputs, *self.preprocessing.absent):
             raise ValueError(
-                f"{self.name} does not accept {name}: it was trained on {', '.join(self._inputs)}. Leave {name}= out."
+                f"{self.name} does not accept {name}: the model was trained on {', '.join(self._inputs)}. Leave out "
+                f"the argument {name}."
             )
         if name in self.preprocessing.absent:
             raise ValueError(
-                f"{self.name} cannot use {name}: it was absent from all first frames of the training data (before a "
-                f"fall, for example, nothing touches the pad). Leave {name}= out, or use a model of another scenario."
+                f"{self.name} cannot use {name}: the input {name} was absent from all first frames of the training "
+                f"data (before a fall, for example, nothing touches the pad). Leave out the argument {name}, or use a "
+                "model of another scenario."
             )
         array = _arguments.checked_array(name, value, "7 numbers" if name == "pose" else "floats in [0, 1]")
         if not jnp.issubdtype(array.dtype, jnp.floating):
@@ -323,13 +325,13 @@ class Predictor:
         """Check the argument `state`, and return it as float32."""
         if isinstance(self.model.config, mvae.Config):
             raise ValueError(
-                f"{self.name} does not accept the argument state: only state-space models do. Leave state= out."
+                f"{self.name} does not accept the argument state: only state-space models do. Leave out this argument."
             )
         array = _arguments.checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
         if array.shape != (*lead, statespace.STATE_CODE):
             raise ValueError(f"state has shape {array.shape}, but it must have shape {(*lead, statespace.STATE_CODE)}.")
         if not _arguments.traced(array) and not np.isfinite(array).all():
-            raise ValueError("state has NaN or infinite values: give finite numbers, or leave state= out.")
+            raise ValueError("state has NaN or infinite values: give finite numbers, or leave out the argument state.")
         return _arguments.float32(array)
 
     def _checked_condition(
@@ -341,12 +343,12 @@ class Predictor:
         shape = None if array is None else array.shape
         if shape != (None if width == 0 else (*lead, width)):
             given = "is missing" if shape is None else f"has shape {shape}"
-            wanted = f"needs shape {(*lead, width)}, in SI units" if width else "accepts none: leave condition= out"
+            wanted = f"needs shape {(*lead, width)}, in SI units" if width else "accepts no condition: leave it out"
             raise ValueError(f"condition {given}, but {self.name} {wanted}.")
         if array is None:
             return None, None
         if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):
-            raise ValueError(f"condition is {array.dtype}, but it must be an array of numbers in SI units.")
+            raise ValueError(f"condition has the type {array.dtype}, but it must be an array of numbers in SI units.")
         condition = _arguments.float32(array)
         scale = np.array(self.preprocessing.condition_scale)
         if _arguments.traced(condition):

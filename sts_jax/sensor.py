@@ -59,8 +59,8 @@ class Sensor:
           objects are drawn. All objects that press on the gel are therefore drawn.
         - `gel.max_depth`, the largest depth of the imprint, is at most `gel.thickness`.
         - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
-        - No light shines from outside through the opaque skin: z <= 0 in every direction of `Lights` and every position
-          of `Leds`.
+        - No internal light lies outside the skin, which is opaque: z <= 0 in every row of `directions` (`Lights`) or
+          `positions` (`Leds`).
         - LEDs do not lie in the gel. They may lie beside the gel, where their light enters through its edges. They may
           also lie behind the pinhole, because the camera casts no shadow.
 
@@ -73,9 +73,9 @@ class Sensor:
         """Check a sensor whose constants may be traced by `jit`, and replace invalid traced constants.
 
         Returns:
-            A sensor and a flag. If all constants are in range, the sensor is this one and the flag is True. If a traced
-            constant is out of range, all traced constants have their default values and the flag is False. If any
-            constant is traced, the flag is traced too.
+            A sensor and a flag. If all constants are in range, the sensor has the constants of `self` and the flag is
+            True. If a traced constant is out of range, all traced constants have their default values and the flag is
+            False. If any constant is traced, the flag is traced too.
 
         Raises:
             ValueError: A constant that is not traced is out of range, or a traced one has a wrong shape (see `check`).

@@ -156,13 +156,13 @@ def test_one_stage_runs_on_the_results_of_the_stages_before_it(tmp_path, monkeyp
     monkeypatch.setattr(dataset, "load", lambda folder: None)
     stages.main(freefall.SMOKE, tmp_path, only="collect")
     assert ran == ["collect"]
-    with pytest.raises(FileNotFoundError, match="dataset is not a collected dataset: run with --only collect first"):
+    with pytest.raises(FileNotFoundError, match=r"dataset is not a collected dataset: first run .* `--only collect`"):
         stages.main(freefall.SMOKE, tmp_path, only="train")
     (tmp_path / "dataset").mkdir()
     (tmp_path / "dataset" / "collection.json").write_text("{}")
     stages.main(freefall.SMOKE, tmp_path, only="train")
     assert ran == ["collect", "train"]
-    with pytest.raises(FileNotFoundError, match="statespace is not a trained model: first run with --only train"):
+    with pytest.raises(FileNotFoundError, match=r"statespace is not a trained model: first run .* `--only train`"):
         stages.main(freefall.SMOKE, tmp_path, only="evaluate")
     (tmp_path / "models" / "statespace").mkdir(parents=True)
     (tmp_path / "models" / "statespace" / "config.json").write_text("{}")

@@ -85,7 +85,7 @@ def test_the_sensor_file_of_the_twin_rectifies_to_the_simulated_view(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"camera": "/dev/video0"}, "--camera is /dev/video0, but --twin has no devices: leave out --camera or --twin"),
+        ({"camera": "/dev/video0"}, "--camera is /dev/video0, but no device is used with --twin: leave out --camera"),
         ({"leds": "/dev/ttyACM0"}, "--leds is /dev/ttyACM0"),
         ({"count": 0}, "count must be >= 1, got 0"),
         ({"size": (0, 480)}, "at least 1 pixel"),

@@ -241,7 +241,7 @@ def test_a_model_without_preprocessing_is_named(folder, tmp_path, monkeypatch):
     for wrong in ({}, {"view": "pad"}, {**model.settings["preprocessing"], "resolution": 3}):
         settings = {**model.settings, "preprocessing": wrong}
         monkeypatch.setattr(training, "load", lambda _, settings=settings: model._replace(settings=settings))
-        with pytest.raises(ValueError, match=r"config\.json, preprocessing: .* training\.train\(.*, preprocessing="):
+        with pytest.raises(ValueError, match=r"config\.json is not valid: .* training\.train\(.*, preprocessing="):
             sts.Predictor.load(folder)
 
 

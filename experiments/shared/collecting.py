@@ -66,7 +66,8 @@ def device(config: Collect) -> tuple[hardware.STS, EmptyPad | None]:
         raise ValueError(
             f"{'--camera' if config.camera is None else '--leds'} is missing. Cameras found: "
             f"{', '.join(str(camera) for camera in cameras) or 'none'}. Serial ports found: "
-            f"{', '.join(port.device for port in ports) or 'none'}. Give both options, or a sensor file with --sensor"
+            f"{', '.join(port.device for port in ports) or 'none'}. Give --camera and --leds, "
+            "or a sensor file with --sensor"
         )
     width, height = config.size or (1640, 1232)
     camera = hardware.CameraConfig(config.camera, width, height, fourcc=config.fourcc, lock=config.lock)
@@ -141,7 +142,7 @@ def of_twin(config: Collect) -> simulated.Simulated:
     devices = {"camera": config.camera, "leds": config.leds, "sensor": config.sensor, "fourcc": config.fourcc}
     for name, value in devices.items():
         if value is not None:
-            raise ValueError(f"--{name} is {value}, but --twin has no devices: leave out --{name} or --twin")
+            raise ValueError(f"--{name} is {value}, but no device is used with --twin: leave out --{name} or --twin")
     default = simulated.Simulated(config.workdir)
     return simulated.Simulated(
         config.workdir,

@@ -82,7 +82,9 @@ def _collected(workdir: Path) -> dataset.Dataset:
         FileNotFoundError: There is no complete dataset.
     """
     if not (workdir / "dataset" / "collection.json").exists():
-        raise FileNotFoundError(f"{workdir / 'dataset'} is not a collected dataset: run with --only collect first")
+        raise FileNotFoundError(
+            f"{workdir / 'dataset'} is not a collected dataset: first run the command with `--only collect`"
+        )
     return dataset.load(workdir / "dataset")
 
 
@@ -91,7 +93,7 @@ def _check_trained(config: Config, workdir: Path, split: str) -> None:
     for name in MODELS[config.model]:
         folder = model_folder(workdir, name, config, split)
         if not (folder / "config.json").exists():
-            raise FileNotFoundError(f"{folder} is not a trained model: first run with --only train")
+            raise FileNotFoundError(f"{folder} is not a trained model: first run the command with `--only train`")
 
 
 def note(path: Path, lines: Sequence[str]) -> None:

@@ -34,7 +34,7 @@ def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndar
         last: Last poses, true or predicted, `(n, 7)`.
 
     Returns:
-        Numbers of the outcomes, int `(n,)`.
+        Outcome of each trajectory, int `(n,)`. Each outcome is the value of a member of `scenario.outcomes`.
     """
     return np.asarray(jax.vmap(scenario.outcome)(jnp.asarray(first), jnp.asarray(last)))
 
@@ -42,8 +42,9 @@ def outcome_of_pose(scenario: physics.Scenario, first: np.ndarray, last: np.ndar
 def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
     """Estimate the probabilities of outcomes from samples.
 
-    A probability is the share of the samples with this outcome. One additional sample is spread evenly over all
-    outcomes, so no probability is 0.
+    Each item has k samples, and there are c possible outcomes. The probability of an outcome is
+    `(count + 1 / c) / (k + 1)`, where `count` is the number of the item's samples with this outcome. No probability is
+    therefore 0.
 
     Args:
         outcome: Outcomes of k samples for each of n items, int `(k, n)`. Each is the value of a member of `outcomes`.
@@ -59,7 +60,8 @@ def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
 def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
     """Compute the frequencies of the outcomes among training trajectories.
 
-    One additional trajectory is spread evenly over all outcomes, so no frequency is 0.
+    There are n trajectories and c possible outcomes. The frequency of an outcome is `(count + 1 / c) / (n + 1)`, where
+    `count` is the number of trajectories with this outcome. No frequency is therefore 0.
 
     Args:
         outcome: Outcome of each trajectory, the value of a member of `outcomes`, int `(n,)`.
@@ -83,10 +85,10 @@ def outcome_of_image(
         visual: Images in [0, 1], `(n, height, width, 3)`.
         blank: Image of the sensor without an object, in [0, 1], `(height, width, 3)`.
         threshold: Largest mean absolute difference from `blank` (see `emptiness`) at which an image shows no object.
-        stays: Number of the outcome for objects that stay on the pad (default: `physics.Outcome.RESTS`).
+        stays: Outcome of objects that stay on the pad, as an integer (default: `physics.Outcome.RESTS`).
 
     Returns:
-        Numbers of the outcomes, int `(n,)`.
+        Outcome of each image, int `(n,)`. Each outcome is either the value of `physics.Outcome.FELL_OFF` or `stays`.
     """
     empty = emptiness(visual, blank) <= threshold
     return np.where(empty, int(physics.Outcome.FELL_OFF), stays)

@@ -58,9 +58,9 @@ def ceiling(
 
     Returns:
         A prediction with the re-rolls as samples (images in `uint8`). The predicted images are the means of the
-        samples' images. The predicted pose is the central pose of the samples (`metrics.centre`). The outcome
-        probabilities are the shares of the outcomes among the re-rolls and one additional sample, which is spread
-        evenly over all outcomes (`shares`).
+        samples' images. The predicted pose is the central pose of the samples (`metrics.centre`). For a scenario with c
+        outcomes, the probability of an outcome is `(count + 1 / c) / (times + 1)`, where `count` is the number of the
+        item's re-rolls with this outcome.
 
     Raises:
         ValueError: `times` is below 1.

@@ -25,8 +25,8 @@ def rows_of(data: Dataset, split: str = "object") -> dict[str, np.ndarray]:
 
     Args:
         data: The dataset.
-        split: `object` holds out whole objects, as `Dataset.split` lists them. `trajectory` holds out random
-            trajectories as in the paper, so training and test have objects in common.
+        split: With `object`, whole objects are held out, and `Dataset.split` contains the objects of each part. With
+            `trajectory`, random trajectories are held out as in the paper, so training and test have objects in common.
 
     Returns:
         Indices of the trajectories, int `(n,)`, for each of `train`, `validation` and `test`. With

@@ -43,7 +43,9 @@ class Stage(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class GuideConfig:
-    """Thresholds and times of the guide, the state machine that leads a person through the recording of trajectories.
+    """Thresholds and times of the guide.
+
+    The guide is the state machine that leads a person through the recording of trajectories.
 
     Raises:
         ValueError: A field is out of range.
@@ -52,13 +54,13 @@ class GuideConfig:
     deviations: float = 6.0  # threshold of a block's change, in standard deviations of the noise of the block's mean
     smallest_change: float = 3.0  # lower limit of the threshold of a block's change, of 255
     largest_threshold: float = 24.0  # upper limit of the threshold of a block's change, of 255
-    contact_blocks: int = 3  # least number of small blocks (48 x 64) that differ from the empty pad in a contact
+    contact_blocks: int = 3  # least number of small blocks (48 rows of 64) that differ from the empty pad in a contact
     watched: Literal["both", "tactile"] = "both"  # streams in which movements are detected
     empty_s: float = 0.5  # time without movement after which the pad counts as empty (s)
     hold_s: float = 0.5  # time without movement before the initial pair is taken (s)
     rest_s: float = 1.0  # time without movement before the final pair is taken (s)
     pairs: int = 4  # least number of pairs of images in each of these times, at least 3
-    hint_s: float = 10.0  # time in one stage after which a hint is shown (s)
+    hint_s: float = 10.0  # time in the same stage after which a hint is shown (s)
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -108,9 +110,10 @@ class EmptyPad:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """The state of the guide, the state machine that leads a person through the recording of trajectories.
+    """The state of the guide.
 
-    `start` makes the first state.
+    The guide is the state machine that leads a person through the recording of trajectories. `start` makes the first
+    state.
     """
 
     stage: Stage  # current stage
@@ -178,8 +181,9 @@ def _noise(looks: Float[np.ndarray, "n rows columns 3"]) -> Float[np.ndarray, "r
 def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.ndarray, "height width 3"]) -> EmptyPad:
     """Make an `EmptyPad` from the images of the empty pad in a sensor file.
 
-    `Device.background` reads these images. The noise in the result is 0, because it cannot be measured from one image.
-    `has_contact` then estimates it from the image to test, and `step` measures it before each trajectory.
+    `Device.background` reads these images. The noise in the result is 0, because noise cannot be measured from a single
+    image. If the noise is 0, `has_contact` uses an estimate of the noise from the image that it tests. Before each
+    trajectory, `step` measures the noise.
 
     Args:
         visual: Raw image of the empty pad without light, RGB.
@@ -190,7 +194,9 @@ def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.nda
 
 
 def start(empty: EmptyPad | None = None, *, trusted: bool = False) -> State:
-    """Make the first state of the guide, the state machine that leads a person through the recording of trajectories.
+    """Make the first state of the guide.
+
+    The guide is the state machine that leads a person through the recording of trajectories.
 
     Args:
         empty: Appearance of the empty pad, for example from `known_pad`. None: not known yet.
@@ -211,10 +217,10 @@ def step(config: GuideConfig, state: State, observation: Observation) -> tuple[S
         observation: Result of `observe` for the new pair of images.
 
     Returns:
-        The new state, and "initial", "final" or None. If it is "initial", the caller must save the previous pair of
-        images as the pair of the held object. If it is "final", the caller must save the previous pair as the pair of
-        the object at rest. Nothing moved while this pair was taken, because the pairs before and after it show no
-        movement. None means that there is nothing to save.
+        The new state, and "initial", "final" or None. For "initial", the caller must save the previous pair of images
+        as the pair of the held object. For "final", the caller must save the previous pair of images as the pair of the
+        object at rest. The pairs before and after the saved pair show no movement, so nothing moved while the saved
+        pair was taken. For None, there is nothing to save.
     """
     moved = not state.window or not _same(config, state, state.window[0], observation)
     window = (observation,) if moved else (state.window[0], *state.window[1:][-_KEPT:], observation)
@@ -303,11 +309,12 @@ def _enter(state: State, stage: Stage) -> State:
 def has_contact(config: GuideConfig, empty: EmptyPad, observation: Observation) -> bool:
     """Return True if the tactile image shows a contact.
 
-    A tactile image shows a contact if at least `config.contact_blocks` of its 48 x 64 small blocks differ from the
-    empty pad by more than a threshold. The median difference over all blocks is subtracted first, so that a change in
-    the brightness of the whole image is not a contact. The threshold is `config.deviations` times the noise, but at
-    least `config.smallest_change` and at most `config.largest_threshold`. The noise is the larger one of two estimates:
-    `sqrt(1 + 1 / config.pairs)` times the noise in `empty`, and 1.4826 times the median absolute difference.
+    The tactile image is divided into 48 rows of 64 small blocks. The image shows a contact if at least
+    `config.contact_blocks` small blocks differ from the empty pad by more than a threshold. The median difference over
+    all small blocks is first subtracted from each difference, so that a change in the brightness of the whole image is
+    not a contact. The threshold is `config.deviations` times the noise, but at least `config.smallest_change` and at
+    most `config.largest_threshold`. The noise is the larger one of two estimates: `sqrt(1 + 1 / config.pairs)` times
+    the noise in `empty`, and 1.4826 times the median absolute difference.
 
     Args:
         config: Thresholds.
@@ -369,7 +376,10 @@ _HINTS = {
 
 
 def instruction(config: GuideConfig, state: State) -> str:
-    """Return the text of the instruction for the person, with a hint after `config.hint_s` seconds in one stage."""
+    """Return the text of the instruction for the person.
+
+    The text also contains a hint if the guide has been in the same stage for at least `config.hint_s` seconds.
+    """
     if state.stage is Stage.CLEAR and state.empty is None and not state.trusted:
         return f"{_INSTRUCTIONS[Stage.CLEAR]} Then confirm."
     late = state.now_s is not None and state.since_s is not None and state.now_s - state.since_s >= config.hint_s

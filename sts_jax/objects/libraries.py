@@ -60,8 +60,8 @@ def library(
         folder: Folder of the objects.
         cache: Folder for the loaded bodies, which is created if it is missing. None loads the mesh files each time.
         scale: Length of one unit of the files (m), above 0. None uses ShapeNetSem's table, or 1 m without a table.
-        longest_side: Longest side to which every object is scaled (m), from 5 mm to 0.15 m. None keeps the sizes. Must
-            be None if `scale` is given.
+        longest_side: Length to which the longest side of every object is scaled (m), from 5 mm to 0.15 m. None keeps
+            the sizes. Must be None if `scale` is given.
         up: Axis of the files that becomes +z. None uses ShapeNetSem's table. Without a table, None is "y" for glTF and
             "z" for other formats.
         faces: Largest number of faces and of vertices, at least 4. Larger meshes are decimated, which needs the package

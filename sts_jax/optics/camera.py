@@ -99,9 +99,9 @@ def to_pixels(
         points: Points in the sensor frame (m).
 
     Returns:
-        Columns and rows of the points (pixels, whole numbers at pixel centres), and their depths along the optical axis
-        from the pinhole (m). A point nearer than `Camera.near` is projected as if it had this depth, but its own
-        depth is returned.
+        Columns and rows of the points (pixels), and depths of the points along the optical axis from the pinhole (m).
+        The column and the row are whole numbers at the centre of a pixel. A point nearer than `Camera.near` is
+        projected as if its depth were `Camera.near`, but its true depth is returned.
     """
     depth = points[:, 2] + camera.distance
     on_face = camera.distance * points[:, :2] / jnp.maximum(depth, camera.near)[:, None]

@@ -1,4 +1,4 @@
-"""Simulation of several trajectories of one body in C MuJoCo, the engine for CPUs.
+"""Simulation of several trajectories of the same body in C MuJoCo, the engine for CPUs.
 
 The results have the same meaning as those of MJX (`physics.roll`). A world is MuJoCo's state of one trajectory.
 
@@ -173,12 +173,12 @@ def _record(steps: _Steps, frames: int) -> Record:
 
 
 class _Simulation(NamedTuple):
-    """The worlds of n trajectories of one body. Their records are written in place."""
+    """The worlds of n trajectories of the same body. The records of the worlds are written in place."""
 
     batch: mujoco.batch.Batch
     points: Float[np.ndarray, "h 3"]  # m, vertices of the hull in the mesh frame
     lowest: float  # m, see `_gone`
-    change: Float[np.ndarray, "n f s 3"]  # N, weight in each step minus the weight in the last step
+    change: Float[np.ndarray, "n f s 3"]  # N, weight in each step minus the weight in the final step
     timestep: float  # s
     records: Record
 
@@ -192,10 +192,10 @@ def roll(
     *,
     freeze: bool = True,
 ) -> tuple[Ends, Record]:
-    """Simulate n trajectories of one body from their starts to the last frame, each independent of the others.
+    """Simulate n independent trajectories of the same body, each from its start to its last frame.
 
-    The gravity of a model is constant in MuJoCo. It is set to the gravity of the last time step. In steps with another
-    gravity, the difference acts as a force on the object's centre of mass.
+    The gravity of a MuJoCo model is constant, and is set to the gravity in the final time step of the trajectory. In
+    time steps with another gravity, the difference acts as a force on the object's centre of mass.
 
     Args:
         models: Models of the n trajectories, each a copy of the result of `compile_body`. Their gravity is overwritten.

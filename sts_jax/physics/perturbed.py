@@ -36,7 +36,11 @@ class Jerk(NamedTuple):
 
 
 def jerk(condition: Float[Array | np.ndarray, "*n 3"]) -> Jerk:
-    """Split conditions of `Perturbed`, (..., 3), into acceleration (x, y) and duration."""
+    """Split each condition of the scenario `Perturbed` into the pad's acceleration and the acceleration's duration.
+
+    Args:
+        condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (..., 3).
+    """
     return Jerk(condition[..., :2], condition[..., 2])
 
 
@@ -98,8 +102,8 @@ class Perturbed(Scenario):
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return gravity minus the acceleration of the pad (m/s^2, sensor frame).
 
-        `Scenario.gravity` describes the arguments. If the pad stops accelerating within the time step, the
-        acceleration is multiplied by the share of the step before that time.
+        `Scenario.gravity` describes the arguments. If the acceleration of the pad ends within the time step, the mean
+        acceleration over the time step is subtracted.
         """
         acceleration, duration = jerk(condition)
         step = self.contact.timestep
@@ -107,7 +111,7 @@ class Perturbed(Scenario):
         return jnp.append(-acceleration * share, -G)
 
     def drift(self, condition: Float[Array, "3"]) -> Float[Array, "2"]:
-        """Return the velocity relative to the pad that an object without friction has after the pad has accelerated.
+        """Return the velocity of an object without friction, relative to the pad, after the pad has accelerated.
 
         Args:
             condition: Acceleration of the pad along x and y (m/s^2) and its duration (s), (3,).

@@ -18,7 +18,7 @@ def lit_skin(
     pitch: Float[Array, "2"],
     slopes: tuple[Float[Array, "1 b"], Float[Array, "a 1"]],
 ) -> list[Float[Array, "h w"]]:
-    """Compute the brightness of the skin under its internal light, for a grid of camera rays.
+    """Compute the brightness of the gel's skin under the lights inside the sensor, for a grid of camera rays.
 
     Args:
         sensor: Constants of the sensor.

@@ -43,8 +43,8 @@ class Model(NamedTuple):
 def load(workdir: str | os.PathLike[str]) -> Model:
     """Load a trained model from its folder.
 
-    All files are compared with their checksums first. A training may run in the folder at the same time. The optimiser
-    of the training does not matter, because its state is not read.
+    First, all files are compared with their checksums. You can also load the model while a training runs in the folder.
+    The optimiser of the training does not matter, because the state of the optimiser is not read.
 
     Args:
         workdir: Folder of the model, which was the `workdir` of `train`.

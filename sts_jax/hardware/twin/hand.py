@@ -28,7 +28,7 @@ class Hand(AutomaticPerson):
         Args:
             twin: Twin whose object the hand moves.
             session: Session that receives the trajectories.
-            patience_s: Longest time in one stage of the guide, > 0 (s on the twin's clock).
+            patience_s: Longest time in the same stage of the guide, > 0 (s on the twin's clock).
 
         Raises:
             ValueError: `patience_s` is not positive.
@@ -45,7 +45,7 @@ class Hand(AutomaticPerson):
         self._unseen = 0  # held poses in a row without a visible contact
 
     def show(self, view: View) -> None:
-        """Receive a view from `hardware.collect`, and send the twin the command for its instruction.
+        """Receive a view from `hardware.collect`, and send the twin the command that fits the view's instruction.
 
         Args:
             view: Newest images and instruction.
@@ -72,10 +72,10 @@ class Hand(AutomaticPerson):
                 self._held_s, self._unseen = None, 0
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
-                f"hardware.collect still shows the instruction `{view.instruction}` after "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): the thresholds "
-                "of hardware.collect do not suit the twin's images, or patience_s of Hand is too short. Change the "
-                "argument config (a GuideConfig) of hardware.collect, or increase patience_s"
+                f"hardware.collect has shown the instruction `{view.instruction}` for "
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, without movement: {view.still}): the "
+                "thresholds of hardware.collect do not suit the twin's images, or patience_s of Hand is too short. "
+                "Change the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
 
     def action(self) -> Action | None:

@@ -99,12 +99,13 @@ class LightHistory:
         return Light(min(max(integral / (end_s - start_s), lowest), highest), lowest, highest)
 
     def forget(self, before_s: float) -> None:
-        """Delete old changes. Afterwards, the argument `start_s` of `over` must be at least `before_s`.
+        """Delete the changes of the LED levels up to the time `before_s`, except the latest of these changes.
 
-        The last change at or before this time is kept, because it determines the brightness after this time.
+        The latest of these changes is kept, because it determines the brightness at the time `before_s`. After this
+        call, the argument `start_s` of `over` must be at least `before_s`.
 
         Args:
-            before_s: The time (s), on the same clock as the argument `time_s` of `set`.
+            before_s: Time (s), on the same clock as the argument `time_s` of `set`.
         """
         keep = bisect.bisect_right(self._changes, before_s, key=lambda change: change.time_s) - 1
         del self._changes[:keep]
