@@ -70,12 +70,12 @@ def predict(
         blank: Tactile image of the untouched sensor in [0, 1].
         inputs: Inputs by the name of the modality. "visual" and "tactile" are images in [0, 1], (*n, height, width, 3).
             "pose" is a position (m) and a unit quaternion, (*n, 7). Any of these may be missing.
-        present: Masks (*n,) by the name of the modality, False for items of the batch that are ignored. A modality
-            without a mask is used for all items. Tactile images without contact are always ignored, unless the model
-            was trained with blank tactile images as inputs.
-        condition: The c known parameters of each trajectory in SI units, (*n, c), for models that were trained with
-            them.
-        key: Random key that draws the samples. None draws no samples.
+        present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
+            this item of the batch. A modality without a mask is used for all items. Tactile images without contact are
+            always ignored, unless the model was trained with blank tactile images as inputs.
+        condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without
+            known parameters.
+        key: Random key for the samples. If it is None, no samples are drawn.
         num_samples: Number of samples to draw from the posterior. Each sample is decoded to images and a pose.
         shape: Leading axes of the prediction if `inputs` is empty. The prediction is then made from the prior.
 
@@ -141,10 +141,11 @@ def predict_samples(
         empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
         inputs: All inputs of the model by the name of the modality: images (*n, height, width, 3) and poses (*n, 7).
             `completed` adds placeholders for inputs that are not given.
-        present: Masks (*n,) by the name of the modality, False for items of the batch that are ignored.
-        condition: The c known parameters of each trajectory in SI units, (*n, c), for models that were trained with
-            them.
-        key: Random key that draws the samples. None is `jax.random.key(0)`, so that every call gives the same result.
+        present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
+            this item of the batch.
+        condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without
+            known parameters.
+        key: Random key for the samples. None stands for `jax.random.key(0)`, so that every call gives the same result.
         num_samples: Number of samples to return in `Prediction.samples`.
         shape: Leading axes *n of the inputs and the prediction.
         calibration: Correction of the probability density of the final pose, from `statespace.fit_calibration`. None

@@ -66,7 +66,7 @@ def test_usable_objects_are_collected_and_others_are_listed(folder: Path, tmp_pa
     cans, listing = dataset.survey_meshes(folder, SCENARIO, classes=("can",))
     assert set(cans.labels) == {"can"}
     assert "torn" not in listing
-    with pytest.raises(ValueError, match=r"classes contains cup, but .* has only the classes box, can: choose"):
+    with pytest.raises(ValueError, match=r"`classes` contains cup, but .* has only the classes box, can: choose"):
         dataset.survey_meshes(folder, SCENARIO, classes=("can", "cup"))
 
     (folder / "box" / "1.stl").write_bytes((folder / "box" / "2.stl").read_bytes())

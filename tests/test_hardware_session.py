@@ -229,7 +229,7 @@ def test_too_many_waiting_pairs_are_refused_and_too_little_space_is_named(tmp_pa
         monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 1000}))
         with pytest.raises(SessionError, match="only 0 MB are free"):
             session.check_ready()
-        with pytest.raises(ValueError, match=r"save\(\) was not called with its final pair"):
+        with pytest.raises(ValueError, match=r"call save\(\) with the final image pair"):
             session.confirm(0)
 
 

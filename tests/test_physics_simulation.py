@@ -306,7 +306,7 @@ def test_progress_and_resampling(
     assert done[-1] == NUM
     monkeypatch.setattr(simulation, "SUNK_LIMIT", 0.0)
     monkeypatch.setattr(simulation, "ATTEMPTS", 1)
-    with pytest.raises(ValueError, match=r"body 0: trajectory 0 of this body failed in 1 draws"):
+    with pytest.raises(ValueError, match=r"body 0: trajectory 0 of this body failed in each of 1 attempts"):
         physics.simulate(jax.random.key(3), bodies[0], Sensor(), SCENARIO, 1, chunk=24, engine=engine)
 
 

@@ -41,8 +41,8 @@ def survey_meshes(
 ) -> tuple[Meshes, str]:
     """Search a folder for mesh files that a scenario can use.
 
-    If several files contain the same mesh, only one of them is used, whatever their names and formats. Otherwise, one
-    object could be in both the training and the test part of a dataset.
+    If several files contain the same mesh, whatever their names and formats, only one of these files is used. As a
+    result, no object is in both the training part and the test part of a dataset.
 
     Args:
         folder: Folder of mesh files with one sub-folder per class, or folder of the dataset ShapeNetSem (see
@@ -70,7 +70,7 @@ def survey_meshes(
     unknown = sorted(set(classes) - set(library.classes))
     if unknown:
         raise ValueError(
-            f"the argument classes contains {', '.join(unknown)}, but {folder} has only the classes "
+            f"the argument `classes` contains {', '.join(unknown)}, but {folder} has only the classes "
             f"{', '.join(library.classes)}: choose among these"
         )
     items = tuple(item for item in library.items if not classes or item.label in classes)

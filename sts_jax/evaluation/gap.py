@@ -296,10 +296,10 @@ def _matched(
         return False
     if set(common) != set(np.r_[real_group, simulated_group]) or len(real) != len(simulated):
         raise ValueError(
-            f"real_group and simulated_group have {len(common)} trajectories in common, for "
-            f"{len(real)} real and {len(simulated)} simulated images. The two groups must have either no common "
-            "trajectory, or the same trajectories and equally many images: "
-            "keep only the common trajectories, or give the simulated images other trajectory numbers"
+            f"real_group ({len(real)} images) and simulated_group ({len(simulated)} images) have {len(common)} "
+            "trajectories in common. The two groups must have either no common trajectory, or the same trajectories "
+            "and equally many images: keep only the common trajectories, or give the simulated images other trajectory "
+            "numbers"
         )
     return True
 

@@ -103,7 +103,7 @@ class Capture:
         """Return the time of the last frame (s), or None if this time is unknown.
 
         The time is on the clock of the device's driver. It has no jitter, unlike the time at which the frame reaches
-        this process. It exists only for devices.
+        this process. For files and streams, this method returns None.
         """
         time_ms = self.properties.get(cv2.CAP_PROP_POS_MSEC) if self._config.kind == "device" else 0.0
         return time_ms / 1000 if time_ms > 0 else None
@@ -173,7 +173,7 @@ def size_error(config: CameraConfig, width: int, height: int) -> FrameSizeError:
 
 
 def check_source(config: CameraConfig) -> None:
-    """Raise a `CameraError` if a device or a file does not exist, is of the wrong kind, or may not be opened."""
+    """Raise a `CameraError` if a device or a file does not exist, is of the wrong kind, or is not accessible to you."""
     if config.kind == "stream" or (config.kind == "device" and sys.platform != "linux"):
         return
     path = Path(devices.device_path(config.target))

@@ -72,9 +72,10 @@ class _Gap(NamedTuple):
 class Pace:
     """Measures the period of a camera's frames, and estimates how many frames were lost.
 
-    After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the total.
-    If the frames after this interval follow each other in less than one period, they were late and not lost. `dropped`
-    is then reduced again, but the numbers that `arrived` has already returned are not corrected.
+    After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the number
+    of all lost frames. If the next frames follow each other in less than one period, some or all of the n frames were
+    only late, not lost. `dropped` is then reduced by the number of late frames. The numbers that `arrived` has already
+    returned are not corrected.
     """
 
     def __init__(self, nominal: float | None):
@@ -96,14 +97,14 @@ class Pace:
         return 1 / statistics.median(self._intervals) if len(self._intervals) >= _FEWEST else None
 
     def arrived(self, time_s: float) -> int:
-        """Record a frame, and return the estimated number of frames that were lost just before it.
+        """Record a frame, and return the estimated number of frames that were lost just before this frame.
 
         Args:
             time_s: Time of the frame (s).
 
         Returns:
             Estimated number of lost frames. The number is 0 if this is the first frame, if the period is unknown,
-            or if `time_s` is not later than the time of the frame before.
+            or if `time_s` is not later than the time of the previous frame.
         """
         last, self._last = self._last, time_s
         if last is None or time_s <= last:
@@ -130,5 +131,8 @@ class Pace:
         self._gap = gap._replace(frames=frames, missing=missing) if missing and frames < gap.limit else None
 
     def interrupted(self) -> None:
-        """Ignore the interval before the next frame. Call this after an interruption of the connection."""
+        """Do not use the interval before the next frame to measure the period or to count lost frames.
+
+        Call this method after an interruption of the connection.
+        """
         self._last, self._gap, self.delayed = None, None, False

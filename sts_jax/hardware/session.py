@@ -187,8 +187,8 @@ class Session:
         free = shutil.disk_usage(self.folder).free
         if free < self._raw_bytes * 2:  # for the new trajectory and for one that may wait
             raise SessionError(
-                f"cannot start a new trajectory, because only {free / 1e6:.0f} MB are free in {self.folder}, and two "
-                f"trajectories need up to {2 * self._raw_bytes / 1e6:.0f} MB: free some disk space."
+                f"cannot start a new trajectory, because only {free / 1e6:.0f} MB are free in {self.folder}, but at "
+                f"least {2 * self._raw_bytes / 1e6:.0f} MB must be free: free some disk space."
             )
 
     def begin(self) -> int:
@@ -206,7 +206,8 @@ class Session:
             pair: The images.
 
         Raises:
-            SessionError: 6 changes are not on disk yet, or the session is closed. The pair will not be written.
+            SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
+                discards) are not on disk yet. The pair will not be written.
         """
         folder = recordings.trajectory_folder(self.folder, number)
 
@@ -223,18 +224,21 @@ class Session:
         """Confirm a trajectory in the background. `load_recordings` reads only confirmed trajectories.
 
         Args:
-            number: Number of the trajectory, from `begin`. Both of its pairs must have been passed to `save`.
+            number: Number of the trajectory, from `begin`. The initial and the final image pair of this trajectory must
+                have been passed to `save`.
             note: Text that is stored with the trajectory.
 
         Raises:
-            SessionError: 6 changes are not on disk yet, or the session is closed. The trajectory is not confirmed.
-            ValueError: The initial or the final pair of the trajectory was not passed to `save` of this object.
+            SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
+                discards) are not on disk yet. The trajectory is not confirmed.
+            ValueError: The initial or the final image pair of the trajectory was not passed to `save` of this
+                `Session`.
         """
         ends: tuple[End, End] = ("initial", "final")
         if missing := [end for end in ends if (number, end) not in self._saved]:
             raise ValueError(
-                f"trajectory {number} cannot be confirmed, because save() was not called with its "
-                f"{' and '.join(missing)} pair: call save() before confirm()"
+                f"trajectory {number} cannot be confirmed yet: call save() with the {' and the '.join(missing)} image "
+                "pair of this trajectory before confirm()"
             )
         write = lambda: recordings.confirm_trajectory(self.folder, number, note)  # noqa: E731
         self._add(_Job(f"the confirmation of trajectory {number}", write, number))
@@ -243,10 +247,11 @@ class Session:
         """Move a trajectory to the folder `discarded` in the background. Nothing is deleted.
 
         Args:
-            number: Number of the trajectory. If the trajectory has no saved pair, nothing happens.
+            number: Number of the trajectory. If no image pair of this trajectory was saved, nothing happens.
 
         Raises:
-            SessionError: 6 changes are not on disk yet, or the session is closed. The trajectory is not discarded.
+            SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
+                discards) are not on disk yet. The trajectory is not discarded.
         """
 
         def move() -> None:

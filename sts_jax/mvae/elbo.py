@@ -32,8 +32,9 @@ from sts_jax.mvae.networks import MVAE, Config, Modality
 class Terms(NamedTuple):
     """The loss of a batch, and its parts before they are multiplied by `beta` and `Modality.weight`.
 
-    Each part is a mean over pairs of a sample and a subset of the modalities. The mean excludes the pairs that the loss
-    ignores. For example, a pair is ignored if the sample has inputs, but none from the modalities of the subset.
+    Each part is a mean over combinations (sample, subset of the modalities). The mean excludes the combinations that
+    the loss ignores. For example, a combination is ignored if the sample has inputs, but none from the modalities of
+    the subset.
     """
 
     loss: Float[Array, ""]  # the weighted sum that is minimised, averaged over the batch
@@ -80,16 +81,16 @@ def loss(
 ) -> tuple[Float[Array, ""], tuple[nnx.State, Terms]]:
     """Compute the loss of one batch in training mode: a negative evidence lower bound, see the docstring of the module.
 
-    The loss is a sum over all non-empty subsets of the modalities. For each subset, the model predicts the targets from
-    the inputs of the modalities in the subset.
+    The loss is a sum over all non-empty subsets of the modalities, averaged over the batch. For each subset, the model
+    predicts the targets from the inputs of the modalities in the subset.
 
     The `absent` modalities are removed from all subsets. If several subsets are then equal, the term of one subset is
     computed and multiplied by the number of equal subsets. Naming a modality in `absent` gives the same loss as masking
     it in every sample, in less time.
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
-    mean and one variance of each channel for this call. In this mean and this variance, every subset has the same
-    weight as in the loss. If two subsets have the same present modalities in a sample, they use the same noise for the
+    mean and one variance of each channel for this call. As in the loss, n equal subsets count n times in this
+    mean and this variance. If two subsets have the same present modalities in a sample, they use the same noise for the
     latent `z`.
 
     Args:
@@ -99,11 +100,11 @@ def loss(
         key: Random key for the noise of `z`.
         inputs: Inputs by modality, `(batch, *shape)`. Images are in [0, 1]. A modality without an input counts as
             absent.
-        targets: Targets of all modalities at the later time, `(batch, *shape)`. Images are in [0, 1].
+        targets: Targets of all modalities at a later time than the inputs, `(batch, *shape)`. Images are in [0, 1].
         present: Masks of the inputs by modality, `(batch,)`. True means that the sample has the input. An input without
             a mask is present in all samples. Values of samples whose mask is False have no influence and may be NaN.
         target_present: Masks of the targets by modality, `(batch,)`. True means that the sample has the target. A
-            target whose mask is False adds 0 to the loss, which remains a mean over the whole batch.
+            target whose mask is False adds 0 to the loss. The loss is still divided by the size of the whole batch.
         condition: Numbers that are appended to the latent of each sample, `(batch, condition)`. None if
             `config.condition` is 0.
         beta: Weight of the divergence of the posterior from the prior.
@@ -115,8 +116,8 @@ def loss(
         A tuple `(loss, (stats, terms))` with the loss, the new running batch statistics, and the parts of the loss.
 
     Raises:
-        ValueError: A name or `asked` is unknown, a target is missing, or `condition` has another width than the model
-            needs.
+        ValueError: The name of a modality is unknown, `asked` is unknown, a target is missing, or `condition` has
+            another width than the model needs.
     """
     model = nnx.merge(graphdef, params, stats, copy=True)
     config = model.config
@@ -176,7 +177,7 @@ def infer(
         standard normal prior.
 
     Raises:
-        ValueError: `inputs` is empty, or a name is not the name of a modality.
+        ValueError: `inputs` is empty, or a key of `inputs` or `present` is not the name of a modality.
     """
     model = nnx.merge(graphdef, state)
     unknown = sorted({*inputs, *(present or {})} - set(model.config.names))
@@ -243,8 +244,8 @@ def predict(
         The predictions by modality, as from `decode`, and the posterior, as from `infer`.
 
     Raises:
-        ValueError: `inputs` is empty, a name is not the name of a modality, or `condition` has another width than the
-            model needs.
+        ValueError: `inputs` is empty, a key of `inputs` or `present` is not the name of a modality, or `condition` has
+            another width than the model needs.
     """
     posterior = infer(graphdef, state, inputs, present=present)
     return decode(graphdef, state, posterior.mean, condition=condition), posterior
@@ -312,10 +313,8 @@ def _noise(key: PRNGKeyArray, groups: list[_Group], left: Array, shape: tuple[in
 def _with_condition(config: Config, z: Array, condition: Array | None) -> Array:
     width = 0 if condition is None else condition.shape[-1]
     if width != config.condition:
-        raise ValueError(
-            f"condition has width {width}, but the model needs width {config.condition}: give an array of this "
-            "width, or None if the model needs width 0"
-        )
+        remedy = f"an array of width {config.condition}" if config.condition else "None"
+        raise ValueError(f"condition has width {width}, but the model needs width {config.condition}: give {remedy}")
     if condition is None:
         return z
     return jnp.concatenate([z, jnp.broadcast_to(condition, (*z.shape[:-1], width))], axis=-1)

@@ -103,8 +103,8 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Args:
         key: Key from `jax.random.key`, consumed by the call.
-        category: One of CATEGORIES, such as "bottle", or "module:NAME" for a `Family` of your own (`find_family`), or
-            a `Family`.
+        category: A name in CATEGORIES (such as "bottle"), a `Family`, or a string "module:NAME" that names a
+            `Family` (see `find_family`).
 
     Returns:
         A body whose +z axis points up in its usual pose. A body of one of CATEGORIES has a longest side of 50 to 130
@@ -112,10 +112,11 @@ def make(key: PRNGKeyArray, category: str | Family) -> Body:
 
     Raises:
         TypeError: `key` is not a JAX key.
-        ValueError: `category` is unknown, or its family returns invalid parts. Parts are invalid if their list is
-            empty, more than one part bounds the contents, or a vertex is not finite. They are also invalid if they have
-            more than 131,072 faces or vertices in total, lie in a plane, or have a longest side below 5 mm or above
-            0.15 m. The part that bounds the contents must enclose a volume.
+        ValueError: `category` is unknown, or the family returns invalid parts. There must be at least one part. At most
+            one part may have `interior=True`, which marks the surface around the object's contents. This part must
+            enclose a volume. All vertices must be finite. All parts together may have at most 131,072 faces and at most
+            131,072 vertices. The parts must not all lie in one plane. The longest side of the object must be between
+            5 mm and 0.15 m.
     """
     check_key(key)
     family = find_family(category) if isinstance(category, str) else category

@@ -66,11 +66,12 @@ def simulate(
         scenario: `Freefall()`, `Inclined()`, `Perturbed()`, `Released()` or another `Scenario`.
         num: Number of trajectories of each body.
         hidden: Hidden properties (friction, mass of the shell, and contents) that replace the random ones, ordered body
-            by body. With n trajectories in total, its field `up` has the shape (n, 3), and the other fields have the
-            shape (n,). The start of a trajectory is the same with and without `hidden`, unless the number of failures
-            of the trajectory (`Trajectory.resampled`) differs.
-        progress: True shows a progress bar on standard error. A function is called after each chunk with the number of
-            trajectories done so far. With MJX, tens of seconds of compilation precede the first chunk.
+            by body. If all bodies together have n trajectories, the field `up` has the shape (n, 3), and the other
+            fields have the shape (n,). The start of a trajectory is the same with and without `hidden`, unless the
+            number of failures of the trajectory (`Trajectory.resampled`) differs.
+        progress: True shows a progress bar on standard error. If `progress` is a function, it is called after each
+            chunk with the number of trajectories done so far. With MJX, tens of seconds of compilation precede the
+            first chunk.
         chunk: Largest number of trajectories that are simulated at once. With MJX, each new value causes a compilation
             and changes the results by rounding errors. Larger values suit a GPU. With C MuJoCo, `chunk` is the largest
             number for each thread, and the results do not depend on `chunk`.
@@ -82,7 +83,7 @@ def simulate(
         `num` trajectories of body 0, then `num` trajectories of body 1, and so on.
 
     Raises:
-        BodyError: A body cannot start in the scenario, has bad values, or has a trajectory that fails in five draws.
+        BodyError: A body cannot start in the scenario, has bad values, or has a trajectory that fails five times.
             BodyError is a ValueError.
         ValueError: Another argument is out of range. The message names the argument.
         TypeError: An argument has the wrong type.
@@ -174,9 +175,9 @@ def _accepted(
             worst = int(attempt.argmax())
             raise BodyError(
                 int(setup.which[worst]),
-                f"trajectory {nth[worst]} of this body failed in {ATTEMPTS} draws, because it has non-finite values or "
-                f"the object sinks more than {SUNK_LIMIT} m into the pad or the stop wall: check the thickness of the "
-                "body's hull and the body's mass",
+                f"trajectory {nth[worst]} of this body failed in each of {ATTEMPTS} attempts, because it has "
+                f"non-finite values or the object sinks more than {SUNK_LIMIT} m into the pad or the stop wall: check "
+                "the thickness of the body's hull and the body's mass",
             )
     rolled = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *(rows[i] for i in range(count)))
     return _Accepted(starts, hidden, rolled, attempt)

@@ -28,14 +28,16 @@ def with_moving_edges(
 
     v is the motion of the visible surface in the image (pixels), and `rate` is the change of the surface's depth below
     the gel's face (m). The second term is a sum over pairs of neighbouring pixels. For each pair, the difference of the
-    two imprints is multiplied by the v of the pixel at which the object is nearer to the camera. Each pixel of the pair
-    receives half of this product. The pairs are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients".
-    The derivative is accurate on average over a few pixels.
+    two imprints is multiplied by the component of v along the line from one pixel to the other. This component is taken
+    at the pixel at which the object is nearer to the camera. Each pixel of the pair receives half of the product. The
+    pairs are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on
+    average over a few pixels.
 
     Args:
         imprint: Depth of the imprint below the gel's face (m).
         corners: Vertices of the object in the image, with the value 1 / depth (1/m).
-        images: Index of the nearest face, column and row of each pixel, three images (h, w).
+        images: Three images (h, w): the index of the nearest face at each pixel, the column of each pixel, and the row
+            of each pixel.
         depth: Depth of the object from the pinhole (m), `inf` where there is no object.
         on_pad: True for pixels whose rays pass through the pad.
         follows: True for pixels in which the imprint follows the surface of the object. False for flat skin, and where

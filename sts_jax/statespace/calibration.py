@@ -116,8 +116,8 @@ def fit(
 ) -> Calibration:
     """Fit the calibration of a model to the final poses of trajectories that its training did not see.
 
-    For each subset of the inputs, the calibration maximises the likelihood of the true outcomes and final poses, times
-    a prior that favours values near 1.
+    The calibration has three values for each subset of the inputs. These values maximise the likelihood of the true
+    outcomes and final poses, multiplied by a prior that favours calibration values near 1.
 
     Args:
         graphdef: Definition of the model, from `init`.

@@ -13,9 +13,9 @@ from typing import Any, BinaryIO, TextIO
 class Exposure:
     """The ground truth of one frame.
 
-    All times are on the twin's clock. If the twin is served, this clock is `time.monotonic`. If the fault
-    `repeat` delivers an earlier frame again, `index`, `due_s` and `fault` belong to the new delivery. All other fields
-    are those of the earlier frame.
+    All times are on the twin's clock. If the twin runs in a server (class `Served`), this clock is `time.monotonic`. If
+    the fault `repeat` delivers an earlier frame again, `index`, `due_s` and `fault` belong to the new delivery. All
+    other fields are those of the earlier frame.
     """
 
     index: int  # number of the frame, from 0
