@@ -219,9 +219,9 @@ class Predictor:
 
         Args:
             shape: Sizes of the leading axes of the predictions. The default is a single prediction.
-            condition: The c known parameters of each trajectory in SI units, (*shape, c), for models that were trained
-                with them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and its duration
-                (s).
+            condition: Known parameters of each trajectory in SI units, (*shape, number of parameters), for models that
+                were trained with them. For scenario `Perturbed`: acceleration of the pad along x and y (m/s^2), and
+                its duration (s).
 
         Returns:
             The predictions.

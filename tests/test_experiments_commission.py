@@ -354,7 +354,7 @@ def test_exposure_stops_at_the_limits(no_lag):
 
 
 class Video:
-    """A V4L2 device of OpenCV that sees the lights and shows its exposure. The room lights only the left of the view."""
+    """A V4L2 device of OpenCV that sees the lights and shows its exposure. The left of its view is never dark."""
 
     def __init__(self, controller):
         values = {"AUTO_EXPOSURE": 3, "EXPOSURE": 40, "AUTO_WB": 1, "WB_TEMPERATURE": 4600, "FPS": 100}

@@ -95,7 +95,7 @@ class Forecaster(Protocol):
         key: Any = None,
         num_samples: int = 0,
     ) -> Any:
-        """Predict from the inputs that are not None. `sts_jax.Predictor` describes the arguments.
+        """Predict from the inputs that are not None. See `sts_jax.Predictor` for the arguments.
 
         Returns:
             An object with the fields `visual`, `tactile`, `pose`, `outcome_probability` and `samples` of

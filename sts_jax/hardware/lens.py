@@ -1,6 +1,6 @@
 """The model of a real sensor's fisheye lens, and the conversion of its images to the simulated sensor's pinhole view.
 
-Pixel coordinates are (column, row), with whole numbers at pixel centres. A *raw* image comes from the camera. A
+Pixel coordinates are (column, row). The centre of a pixel has whole numbers. A *raw* image comes from the camera. A
 *rectified* image shows the view of the simulated sensor's pinhole camera. A raw pixel and a rectified pixel correspond
 if their rays meet the gel's outer face (z = 0 in the sensor frame) in the same point.
 """

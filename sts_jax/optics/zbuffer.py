@@ -6,9 +6,9 @@ with the product of faces and pixels. Each step is one scatter-min of 32-bit key
 the index of the face in the low bits. The choice of the face has no gradient. Values that are interpolated on the
 chosen face have gradients.
 
-Pixel coordinates are (column, row), whole numbers at pixel centres, x to the right and y down. The order of a point is
-a number that is smaller for nearer points and affine across a face on the screen: -1 / depth in the view of a pinhole,
-and depth in a parallel projection.
+Pixel coordinates are (column, row). The centre of a pixel has whole numbers. Columns increase to the right and rows
+downwards. The order of a point is a number that is smaller for nearer points and affine across a face on the screen. It
+is -1 / depth in the view of a pinhole, and depth in a parallel projection.
 """
 
 import math

@@ -82,7 +82,7 @@ def refusal(body: Body, scenario: Scenario) -> str | None:
 
 def _refusal(faces: StableFaces, scenario: Scenario) -> str | None:
     if not len(faces.up):
-        return "it rests on no face, because its centre of mass lies outside its hull or at the edge of every face"
+        return "it rests on no face, because its centre of mass is not above the inside of any face"
     if scenario.must_stand and faces.up[:, 2].max() < math.cos(UPRIGHT):
         return f"it does not stand upright (+z up), as {type(scenario).__name__} needs"
     return None

@@ -56,7 +56,7 @@ class Freefall(Scenario):
             )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start: a random place and orientation in the air. `Scenario.start` describes the arguments."""
+        """Draw one start: a random place and orientation in the air. See `Scenario.start` for the arguments."""
         del pad
         turn, radius, angle = jax.random.split(key, 3)
         quat = geometry.random_quat(turn)

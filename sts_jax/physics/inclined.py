@@ -95,7 +95,7 @@ class Inclined(Scenario):
             )
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start uphill of the stop wall. `Scenario.start` describes the arguments.
+        """Draw one start uphill of the stop wall. See `Scenario.start` for the arguments.
 
         For a start at rest, several random poses are drawn (the field `tries` is their number), and the best pose is
         used. In a good pose, the amount and the place of the object's contents decide whether the object tips or stays.

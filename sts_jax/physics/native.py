@@ -244,7 +244,7 @@ def _simulation(
     gravity: Float[np.ndarray, "n f s 3"],
     velocity: Float[np.ndarray, "n 6"],
 ) -> _Simulation:
-    """Create the worlds at their starts, with records of objects that stay there. `roll` describes the arguments."""
+    """Create the worlds at their starts, with records of objects that stay there. See `roll` for the arguments."""
     count, frames, _, _ = gravity.shape
     mass = np.array([model.body("object").mass[0] for model in models])
     for model, pull in zip(models, gravity[:, -1, -1], strict=True):

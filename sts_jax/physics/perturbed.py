@@ -88,7 +88,7 @@ class Perturbed(Scenario):
 
         The condition is a random acceleration of the pad along x and y (m/s^2), and its duration (s).
 
-        `Scenario.start` describes the arguments.
+        See `Scenario.start` for the arguments.
         """
         del pad
         turn, radius, angle, push, heading, time = jax.random.split(key, 6)
@@ -102,7 +102,7 @@ class Perturbed(Scenario):
     def gravity(self, time: Float[Array, ""], condition: Float[Array, "3"]) -> Float[Array, "3"]:
         """Return gravity minus the acceleration of the pad (m/s^2, sensor frame).
 
-        `Scenario.gravity` describes the arguments. If the acceleration of the pad ends within the time step, the mean
+        See `Scenario.gravity` for the arguments. If the acceleration of the pad ends within the time step, the mean
         acceleration over the time step is subtracted.
         """
         acceleration, duration = jerk(condition)

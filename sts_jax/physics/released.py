@@ -100,7 +100,7 @@ class Released(Scenario):
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one held pose and the share of the weight that the pad carries.
 
-        `Scenario.start` describes the arguments.
+        See `Scenario.start` for the arguments.
 
         The object stands on a stable face and is tilted about an edge of this face. The edge is chosen from random
         edges (the field `tries` is their number). Edges at which the object balances at a tilt of 15 to 45 degrees are

@@ -129,7 +129,7 @@ def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact,
 
 
 def scene_xml(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> str:
-    """Return the scene as MuJoCo's XML. `compile_scene` describes the arguments."""
+    """Return the scene as MuJoCo's XML. See `compile_scene` for the arguments."""
     meshes, shapes = [], []
     for index, part in enumerate(np.unique(parts, axis=0)):
         points = " ".join(f"{x:.9g}" for x in np.unique(part, axis=0).ravel())

@@ -18,7 +18,7 @@ Terms = dict[str, Array]  # scalars by name: the loss and its parts
 class Loss(Protocol):
     """Type of a loss function: a pure function of a model, a random key and one batch.
 
-    `jax.grad` and `jax.jit` can trace it. `__call__` describes the arguments.
+    `jax.grad` and `jax.jit` can trace it. See `__call__` for the arguments.
     """
 
     def __call__(
