@@ -50,7 +50,7 @@ def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int 
     A condition is the input that a scenario applies to a trajectory, such as an acceleration of the pad.
 
     Args:
-        condition: The c numbers of each condition. Vectors (x, y) in the plane of the pad come first. They are followed
+        condition: The numbers of each condition. Vectors (x, y) in the plane of the pad come first. They are followed
             by scalars, which do not change.
         symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
             s % 4 quarter turns about the z axis. Symmetry 0 is the identity.

@@ -191,8 +191,8 @@ def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
 def coverage(samples: np.ndarray, target: np.ndarray, level: float = LEVEL) -> np.ndarray:
     """Determine whether true positions lie in the central region of their samples.
 
-    The mean of the results over all items is the coverage. For a calibrated predictor, its expected value is `level`,
-    for every number of samples and every distribution.
+    The mean of the results over all items is the coverage. If the predictor is calibrated, the expected coverage is
+    `level`, for every number of samples and every distribution.
 
     The result of an item depends on the rank of its true position. The true position and its k samples are k + 1
     points. They are sorted by their mean distance from the other points, and the most central point has rank 1. If the

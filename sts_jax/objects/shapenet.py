@@ -116,7 +116,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
             raise ValueError(f"{table}: the file cannot be read as a table ({error}): download it again") from error
         if not any("rest" in row for row in rows):
             return rows
-    raise ValueError(f"{table}: the table has rows with more cells than columns: download it again")
+    raise ValueError(f"{table}: some rows of the table have more cells than the header has columns: download it again")
 
 
 def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:

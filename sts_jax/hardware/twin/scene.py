@@ -86,7 +86,7 @@ class Scene(abc.ABC):
 
         Args:
             command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            blender: The twin's `Blender`. Its method `ends` converts the rendered images.
+            blender: The twin's `Blender` object, which converts the rendered images in its method `ends`.
         """
 
     def command(self, command: str, time_s: float) -> None:
@@ -112,7 +112,7 @@ class Scene(abc.ABC):
         need the thread.
 
         Args:
-            blender: The twin's `Blender`. Its method `ends` converts the rendered images.
+            blender: The twin's `Blender` object, which converts the rendered images in its method `ends`.
         """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
