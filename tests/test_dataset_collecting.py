@@ -37,6 +37,7 @@ def sparse(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_stored_frames_are_those_that_sense_draws(folder):
     data = dataset.load(folder)
     assert data.trajectory["pose"].shape == (8, 12, 7)

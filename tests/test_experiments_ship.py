@@ -57,6 +57,7 @@ def test_a_shipped_model_is_loaded_by_its_name_and_replaced_by_the_next(models, 
     assert [path.name for path in models.iterdir()] == ["falls"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["size", "damage", "absence"])
 def test_an_earlier_model_stays_if_the_new_one_is_refused(models, workdir, monkeypatch, fault):
     (models / "falls").mkdir(parents=True)
@@ -77,6 +78,7 @@ def test_an_earlier_model_stays_if_the_new_one_is_refused(models, workdir, monke
     assert [path.name for path in models.iterdir()] == ["falls"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["", "..", "runs/falls", "free fall"])
 def test_a_name_with_other_characters_is_refused(models, workdir, name):
     with pytest.raises(ValueError, match="it must consist of letters, digits and underscores"):

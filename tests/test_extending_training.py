@@ -87,7 +87,7 @@ def test_a_term_is_added_to_the_usual_loss(tmp_path):
     assert more[-1]["penalty"] < more[0]["penalty"]
 
 
-@pytest.mark.parametrize("kill", [3, 5])
+@pytest.mark.parametrize("kill", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_killed_run_with_another_loss_and_optimiser_gives_identical_parameters(tmp_path, kill):
     def run(folder, **more):
         optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(1e-2))
@@ -122,6 +122,7 @@ def test_a_folder_is_not_resumed_with_another_loss_optimiser_or_note(tmp_path):
     assert run(optimiser=adam, notes=notes).step == 6
 
 
+@pytest.mark.slow
 def test_an_optimiser_without_arrays_resumes(tmp_path):
     def run(folder, optimiser, **more):
         return training.train(CONFIG, MODEL, arrays(), workdir=tmp_path / folder, optimiser=optimiser, **more)
@@ -142,7 +143,7 @@ def test_a_loss_without_its_own_value_among_its_parts_is_refused(tmp_path):
         training.train(CONFIG, MODEL, arrays(), workdir=tmp_path, loss=loss)
 
 
-@pytest.mark.parametrize("kill", [1, 3, 4, 5, 6])
+@pytest.mark.parametrize("kill", [3, *(pytest.param(step, marks=pytest.mark.slow) for step in (1, 4, 5, 6))])
 def test_a_logger_receives_each_record_once_in_every_call(tmp_path, kill):
     """Also records of earlier calls, so that a log that starts empty is complete wherever the run was killed."""
 
@@ -168,6 +169,7 @@ def test_a_logger_receives_each_record_once_in_every_call(tmp_path, kill):
     assert run("killed") == (whole, False)  # also of a finished run
 
 
+@pytest.mark.slow
 def test_a_further_modality_trains_loads_and_predicts_without_a_change_of_the_library(tmp_path):
     """The pose follows from the sound alone: the error is far below that of the mean pose."""
     rng = np.random.default_rng(0)

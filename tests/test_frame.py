@@ -312,6 +312,7 @@ def test_bodies_with_other_hulls_and_contents_share_a_compilation():
     assert (equilibrium.balance._cache_size(), drawing.draw._cache_size()) == before
 
 
+@pytest.mark.slow
 def test_another_resolution_compiles_only_the_drawing():
     body, pose = sts.objects.make(jax.random.key(0), "bottle"), jnp.array([0.0, 0, 0.01, 1, 0, 0, 0])
     sts.sense(SENSOR, body, pose, resolution=(24, 24))

@@ -8,9 +8,8 @@ from benchmarks import depth
 NAMES = [name for name in depth.PROCEDURAL + depth.LOADED + depth.MADE if name != "duckie"]
 
 
-@pytest.mark.parametrize(
-    "shape", [depth.SIZES[0], *(pytest.param(size, marks=pytest.mark.slow) for size in depth.SIZES[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", depth.SIZES)
 def test_depth_equals_embrees(shape):
     found = depth.total(list(depth.measure(NAMES, shape, (2, 1, 1)).values()))
     assert found.interior_beyond_10um <= 0.001 * found.interior

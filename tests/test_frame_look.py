@@ -27,7 +27,9 @@ def at(x, y, z):
     return jnp.array([x, y, z, 1.0, 0, 0, 0], jnp.float32)
 
 
-@pytest.mark.parametrize("resolution", [(64, 64), (97, 53), (200, 200)])
+@pytest.mark.parametrize(
+    "resolution", [(64, 64), *(pytest.param(size, marks=pytest.mark.slow) for size in ((97, 53), (200, 200)))]
+)
 def test_an_object_on_the_pad_darkens_the_skin_around_it(resolution):
     body = from_trimesh(trimesh.creation.cylinder(radius=0.015, height=0.06))
     empty = np.asarray(sense(SENSOR, body, at(0, 0, -1.0), resolution=resolution).visual)

@@ -174,7 +174,7 @@ def test_a_calibrated_lens_rectifies_a_marker_to_its_place_on_the_pad(noisy, ray
     assert errors.max() < 1.0
 
 
-@pytest.mark.parametrize("quarters", [1, 2, 3])
+@pytest.mark.parametrize("quarters", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 def test_a_board_that_lies_on_the_pad_in_another_orientation_gives_the_same_pad(images, rays, printed, quarters):
     turn = Rotation.from_euler("z", quarters * math.pi / 2)
     rotation = (Rotation.from_rotvec(TRUE.rotation) * turn).as_rotvec()
@@ -182,6 +182,7 @@ def test_a_board_that_lies_on_the_pad_in_another_orientation_gives_the_same_pad(
     assert_recovered(calibrate([*images[1:], turned], BOARD, on_pad=10), view_error=0.2, position_error=2e-4)
 
 
+@pytest.mark.slow
 def test_colour_images_give_the_same_lens_and_images_without_the_board_are_left_out(images):
     colour = [np.repeat(image[..., None], 3, axis=-1) for image in images]
     calibration = calibrate([*colour, np.full((480, 640, 3), 90, np.uint8)], BOARD)
@@ -208,7 +209,7 @@ def pad_points():
     return np.stack([x.ravel(), y.ravel(), np.zeros(64)], axis=-1)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
 def test_lenses_of_all_fields_of_view_are_recovered(seed):
     rng = np.random.default_rng(seed)
     width, height = [(640, 480), (1640, 1232)][seed % 2]
@@ -295,6 +296,7 @@ def test_images_with_large_errors_are_named(images, rays, printed):
         calibrate([*images[:4], torn, *images[5:]], BOARD)
 
 
+@pytest.mark.slow
 def test_parallel_boards_are_refused(rays, printed):
     shifts = [
         (0.0, 0.0, 0.103),

@@ -102,7 +102,7 @@ def test_settling_time_of_known_switches_is_that_of_the_last_mixed_frame():
         settling([on], [on], period_s=0.02)
 
 
-@pytest.mark.parametrize("duty", [0.0, 0.25, 0.5, 1.0])
+@pytest.mark.parametrize("duty", [0.0, 0.5, *(pytest.param(duty, marks=pytest.mark.slow) for duty in (0.25, 1.0))])
 def test_stream_has_the_share_of_tactile_images(peer, sensor, duty):
     images = sensor.stream(duty)
     shots = [next(images) for _ in range(12)]

@@ -46,7 +46,7 @@ class Scene:
         raise AssertionError(f"the stage stays {self.state.stage}")
 
 
-@pytest.mark.parametrize("noise", [0.0, 2.0, 12.0])
+@pytest.mark.parametrize("noise", [2.0, *(pytest.param(noise, marks=pytest.mark.slow) for noise in (0.0, 12.0))])
 def test_a_whole_trajectory(noise):
     scene = Scene(noise=noise)
     scene.until(Stage.PLACE)

@@ -89,6 +89,7 @@ def test_the_videos_open_without_the_library(tmp_path, encoding):
         assert not video.read()[0]
 
 
+@pytest.mark.slow
 def test_a_killed_recording_keeps_every_image_that_was_added(tmp_path):
     for attempt, images in enumerate((1, 7, 40)):
         made = tmp_path / str(attempt)

@@ -360,6 +360,7 @@ def test_ends_are_the_frame_of_sense(held):
     assert empty.visual.std() < ends.visual.std()
 
 
+@pytest.mark.slow
 def test_objects_are_released_at_random(held, tmp_path):
     body, _ = held
     scene = twin.ObjectScene(body, resolution=(24, 32), seed=2, motion_rate=2)

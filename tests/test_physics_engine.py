@@ -182,7 +182,14 @@ def test_results_are_independent_of_chunk_thread_and_other_bodies(
         np.testing.assert_array_equal(getattr(other, name), getattr(drops, name)[:12])
 
 
-@pytest.mark.parametrize("scenario", [physics.Freefall(), physics.Inclined(), physics.Perturbed(), physics.Released()])
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        physics.Freefall(),
+        physics.Released(),
+        *(pytest.param(scenario, marks=pytest.mark.slow) for scenario in (physics.Inclined(), physics.Perturbed())),
+    ],
+)
 def test_freezing_a_settled_object_keeps_its_end_and_its_wrench(
     scenario: physics.Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:

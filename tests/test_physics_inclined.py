@@ -109,7 +109,7 @@ def bodies() -> list[objects.Body]:
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "camera", "scissors"])]
 
 
-@pytest.fixture(scope="module", params=["mjx", "mujoco"])
+@pytest.fixture(scope="module", params=[pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
 def slid(bodies: list[objects.Body], request: pytest.FixtureRequest) -> physics.Trajectory:
     varied = dataclasses.replace(SCENARIO, friction=(0.35, 0.75), resting=0.8, tries=1)  # so that many objects slide
     found = physics.simulate(jax.random.key(1), bodies, Sensor(), varied, 8, engine=request.param)

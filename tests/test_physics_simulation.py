@@ -27,7 +27,7 @@ def bodies() -> list[objects.Body]:
     return [objects.make(jax.random.key(i), name) for i, name in enumerate(["bottle", "fork", "webcam", "watch"])]
 
 
-@pytest.fixture(scope="module", params=["mjx", "mujoco"])
+@pytest.fixture(scope="module", params=[pytest.param("mjx", marks=pytest.mark.slow), "mujoco"])
 def engine(request: pytest.FixtureRequest) -> physics.Engine:
     return request.param
 
