@@ -70,7 +70,7 @@ def sense(
 ) -> Frame:
     """Render the images that the sensor takes of one object.
 
-    With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`), and both streams
+    With a wrench, the object sinks and tilts until the gel balances Fz, Mx and My (`tactile.settle`), and the images
     show the object in this balanced pose. Without a wrench, the object stays in the given pose. The images show an
     empty sensor if no part of the object is above the plane of the gel's outer face (z > 0).
 
@@ -192,10 +192,11 @@ def touch(
             largest centred part of the camera's view with the aspect ratio of `imprint`.
 
     Returns:
-        Image in [0, 1]. It equals `Frame.tactile` of the same imprint, except that `sense` samples more finely if the
-        shorter side of the image is below `Sensor.fine_below` pixels. No error is raised if the numbers in a traced
-        `window` or in a traced constant of the sensor are invalid. The image then shows flat skin, and `window` counts
-        as None. For an invalid constant, the image is also rendered with the default values of all traced constants.
+        Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
+        `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
+        `touch`. No error is raised if the numbers in a traced `window` or in a traced constant of the sensor are
+        invalid. The image then shows flat skin, and `window` counts as None. For an invalid constant, the image is also
+        rendered with the default values of all traced constants.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
@@ -251,7 +252,7 @@ def _numbers(name: str, value: Any, wanted: str) -> Array:
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         raise TypeError(
             f"{name} is a {type(value).__name__}, but it must be an array of shape {wanted}. Unpack a tuple of several "
-            "arguments with *, such as sense(sensor, body, *placement)"
+            "arguments with *, as in sense(sensor, body, *placement)"
         )
     try:
         return jnp.asarray(value, float)

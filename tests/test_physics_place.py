@@ -113,9 +113,9 @@ def test_more_shell_or_contents_weigh_more(bodies):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"face": 99}, r"face is 99, .* no such face: the body rests on faces 0 \(the most likely\) to \d+"),
-        ({"face": -1}, r"face is -1, but the body has no such face: the body rests on faces 0"),
-        ({"face": "sideways"}, r"face is 'sideways', but it must be the index of a face or 'upright'"),
+        ({"face": 99}, r"`face` is 99, .* no such face: the body rests on faces 0 \(the most likely\) to \d+"),
+        ({"face": -1}, r"`face` is -1, but the body has no such face: the body rests on faces 0"),
+        ({"face": "sideways"}, r"`face` is 'sideways', but it must be the index of a face or 'upright'"),
         ({"position": (0.2, 0.0)}, r"position is \(0.2, 0.0\) m, .* beyond the pad"),
         ({"position": (0.0, float("nan"))}, "position is .* 2 finite numbers"),
         ({"yaw": float("inf")}, "yaw is inf, but it must be one finite number"),
@@ -131,7 +131,7 @@ def test_errors_name_arguments_of_place_that_are_out_of_range(bodies, changes, m
 
 def test_errors_name_bodies_that_cannot_be_placed(bodies):
     leaning = Rotation.from_euler("x", 30, degrees=True).as_matrix().astype(np.float32)
-    with pytest.raises(ValueError, match=r"face is 'upright', but the body does not stand"):
+    with pytest.raises(ValueError, match=r"`face` is 'upright', but the body does not stand"):
         physics.place(dataclasses.replace(bodies[0], hulls=bodies[0].hulls @ leaning.T), sts.Sensor(), face="upright")
     outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
     with pytest.raises(ValueError, match="the body rests on no face"):

@@ -32,7 +32,7 @@ class Collection:
     num_objects: int = 160  # number of objects
     num_per_object: int = 4  # trajectories per object, each with newly drawn hidden values such as mass and friction
     num_full: int = 20  # number of trajectories with images of all frames (the others: of the first and last frame)
-    num_rendered: int | None = None  # number of trajectories per object with images, from the first one on (None: all)
+    num_rendered: int | None = None  # number of trajectories with images, for each object: the first ones (None: all)
     num_views: int = 0  # additional visual images per object, in initial poses that are not simulated
     symmetries: bool = True  # also render turned and mirrored copies of first and last frames (`scenario.symmetries`)
     resolution: tuple[int, int] = (64, 64)  # height and width of the images (pixels)
@@ -49,7 +49,7 @@ class Collection:
 
     @property
     def rendered_per_object(self) -> int:
-        """Number of trajectories per object that have images."""
+        """Number of trajectories with images, for each object."""
         return self.num_per_object if self.num_rendered is None else self.num_rendered
 
     @property
@@ -104,7 +104,7 @@ class Collection:
 
 
 def class_names(collection: Collection) -> tuple[str, ...]:
-    """Names of the classes of all objects of a collection, such as `bottle`, in the order of the objects."""
+    """Return the class name (such as `bottle`) of each object in a collection, in the order of the objects."""
     if collection.meshes is not None:
         return collection.meshes.labels
     return tuple(collection.categories[i % len(collection.categories)] for i in range(collection.num_objects))

@@ -169,7 +169,9 @@ def save_board(
     *,
     outline: tuple[float, float] = (0.15, 0.15),
 ) -> None:
-    """Save the page of `board_image` in a file that states its resolution, so that a print at 100 % has the true size.
+    """Save the page that `board_image` draws.
+
+    The file also contains the resolution of the page, so that a print at 100 % has the true size.
 
     Args:
         path: Path of the file, ending in .pdf or .png.
@@ -473,8 +475,8 @@ def _check_tilts(poses: NDArray[np.float64]) -> None:
         raise CalibrationError(
             f"the tilts of the board in the images differ by at most {math.degrees(spread):.0f} degrees. To "
             "compute the focal length, two of the images must have tilts that differ by at least "
-            f"{math.degrees(LEAST_TILT):.0f} degrees. Hold the board with tilts of 20 to 40 degrees to different sides "
-            "in some images."
+            f"{math.degrees(LEAST_TILT):.0f} degrees. Hold the board with tilts of 20 to 40 degrees in some images, "
+            "each time towards another side."
         )
 
 

@@ -43,7 +43,7 @@ def find_cameras(root: Path = Path("/")) -> list[FoundCamera]:
     metadata, are left out.
 
     Args:
-        root: Folder that contains the system's folders `dev` and `sys`. Only tests change it.
+        root: Folder that contains the system's folders `dev` and `sys`. Only tests pass another folder.
 
     Returns:
         The cameras, in the order of the numbers in `/dev/video0`, `/dev/video1` and so on.
@@ -66,7 +66,7 @@ def stable_path(device: str, root: Path = Path("/")) -> str:
 
     Args:
         device: Path of the device, such as `/dev/video0`.
-        root: Folder that contains the system's folder `dev`. Only tests change it.
+        root: Folder that contains the system's folder `dev`. Only tests pass another folder.
     """
     target = Path(device).resolve()
     for link in sorted((root / "dev/v4l/by-id").glob("*")):
@@ -76,7 +76,7 @@ def stable_path(device: str, root: Path = Path("/")) -> str:
 
 
 def cameras_found() -> str:
-    """Return a sentence for error messages that lists the cameras of this machine."""
+    """List the cameras of this machine in a sentence for error messages."""
     found = find_cameras()
     if found:
         return f"Cameras found: {', '.join(map(str, found))}."

@@ -340,7 +340,8 @@ def distorted(
         pinhole: The simulated pinhole camera that defines the view, such as `Sensor.camera`.
         image: Rectified image of any size, shape (height, width) or (height, width, channels), uint8. If the
             image and the view have the same aspect ratio, the image must show the whole view, as an image of
-            `sts_jax.sense` does. Otherwise, the image must show the view cropped around the centre of the view.
+            `sts_jax.sense` does. Otherwise, the view is cropped around its centre to the aspect ratio of the
+            image, and the image must show this cropped view.
         outside: Grey value or RGB colour of the raw pixels outside of the view, 0 to 255.
         samples: Number of samples per raw pixel in each direction. Fewer samples are faster. None: as many samples as
             needed to avoid aliasing.

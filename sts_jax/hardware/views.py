@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from sts_jax.hardware.lens import Lens, Pinhole, rectified
 from sts_jax.hardware.recordings import Recordings
 
-Progress = Callable[[int, int], None]  # called with the number of trajectories that are done, and with their total
+Progress = Callable[[int, int], None]  # called with the number of trajectories done so far, and the number of all
 
 
 class SensorView(NamedTuple):
@@ -106,8 +106,8 @@ def recorded_images(
         lens: Lens and pose of the real camera, from `Device.lens`.
         pinhole: The simulated pinhole camera that defines the view, from `Sensor.camera`.
         resolution: Height and width of the rectified images (pixels).
-        progress: Function that is called after each trajectory, with the number of trajectories that are done and with
-            their total.
+        progress: Function that is called after each trajectory, with the number of trajectories done so far and the
+            number of all trajectories.
 
     Returns:
         The rectified images, in the order of the trajectories' numbers.

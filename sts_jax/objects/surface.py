@@ -65,12 +65,15 @@ def proper(path: Path, surface: Surface) -> Surface:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Return whether triangles form a closed surface. `faces` are the indices of their vertices, int (f, 3).
+    """Return whether triangular faces form a closed surface.
 
     The vertex order of a face gives a direction to each edge of the face. A surface counts as closed if, at every edge,
     the two directions occur equally often. A surface of a single part then has no holes, and all of its faces have the
     same orientation. Closed parts that touch and share vertices also count as closed, although more than two faces can
     meet at an edge.
+
+    Args:
+        faces: Vertex indices of each face, int (f, 3).
     """
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1)
     edge = np.minimum(start, end) * (faces.max() + 1) + np.maximum(start, end)

@@ -202,13 +202,13 @@ def _index(faces: StableFaces, face: int | str) -> int:
     numbered = f"the body rests on {numbers}"
     if isinstance(face, str):
         if face != "upright":
-            raise ValueError(f"face is {face!r}, but it must be the index of a face or 'upright': {numbered}")
+            raise ValueError(f"`face` is {face!r}, but it must be the index of a face or 'upright': {numbered}")
         best = int(np.argmax(faces.up[:, 2]))
         if faces.up[best, 2] < math.cos(UPRIGHT):
-            raise ValueError(f"face is 'upright', but the body does not stand with its +z up: {numbered}")
+            raise ValueError(f"`face` is 'upright', but the body does not stand with its +z up: {numbered}")
         return best
     if isinstance(face, bool) or not isinstance(face, int | np.integer) or not 0 <= face < count:
-        raise ValueError(f"face is {face!r}, but the body has no such face: {numbered}")
+        raise ValueError(f"`face` is {face!r}, but the body has no such face: {numbered}")
     return int(face)
 
 
@@ -226,7 +226,7 @@ def _check_numbers(
             wanted = "one finite number" if shape == () else f"{shape[0]} finite numbers"
             raise ValueError(f"{name} is {value!r}, but it must be {wanted}")
     if not 0 <= fill <= 1:
-        raise ValueError(f"fill is {fill}, but a share of the interior's volume must be from 0 to 1")
+        raise ValueError(f"fill is {fill}, but this share of the interior's volume must be from 0 to 1")
     if not shell_scale > 0:
         raise ValueError(f"shell_scale is {shell_scale}, but it must be > 0")
     length = float(np.linalg.norm(np.asarray(up, float)))

@@ -201,8 +201,8 @@ def template(
 ) -> tuple[mujoco.MjModel, mjx.Model, mjx.Data]:
     """Return the scene that MJX uses for all objects: MuJoCo's model, MJX's model and MJX's data.
 
-    The model has small boxes in place of the object. For each box, MJX reserves memory for four contacts with the pad.
-    `collide` computes the contacts of the real object with the pad and the wall.
+    The model has small boxes in place of an object. For each box, MJX reserves memory for four contacts with the pad.
+    The contacts of an object with the pad and the wall come from `collide`, not from the boxes.
 
     Args:
         pad: Size of the pad along x and y (m).

@@ -133,11 +133,11 @@ def train(
             does not use the fields of `config` for Adam, for the learning rate and for the clipping.
         notes: JSON values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
             must have the same notes, because the functions themselves cannot be compared.
-        progress: Function that is called after every step with the number of steps done, their total number, and the
-            latest record of `metrics.jsonl` (empty before the first record).
-        log: Function that is called once for each record, with the step and the values of the record. A resumed
-            training first passes the records from earlier calls of `train` to `log`. Every call of `train` therefore
-            passes all records of the training in order.
+        progress: Function that is called after every step with the number of steps done, the number of all steps,
+            and the latest record of `metrics.jsonl` (empty before the first record).
+        log: Function that is called once for each record, with the step and the values of the record. When a training
+            is resumed, `log` is first called with the records from earlier calls of `train`. In every call of `train`,
+            `log` therefore receives all records of the training, in order.
 
     Returns:
         The trained model.

@@ -72,7 +72,7 @@ def add(folder: Path, name: str) -> None:
 
     Args:
         folder: Folder of the model.
-        name: Name of the file in this folder, such as `blank.npz`. The file is not part of a checkpoint.
+        name: Name of the file in this folder, such as `blank.npz`. The file must not belong to a checkpoint.
 
     Raises:
         OSError: A file cannot be read or written, or the manifest is damaged.

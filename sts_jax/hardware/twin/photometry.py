@@ -76,8 +76,8 @@ class Warp(NamedTuple):
             image: Rendered image in linear light, shape (height, width, 3).
 
         Returns:
-            Raw image of the same data type as `image`, shape (h, w, 3), where (h, w) is the field `size`. Pixels
-            whose view is outside `image` are 0.
+            Raw image of the same data type as `image`, shape (h, w, 3), where (h, w) is the field `size`. Raw
+            pixels that show no part of `image` are 0.
         """
         sampled = cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
         return cv2.resize(sampled, self.size[::-1], interpolation=cv2.INTER_AREA)
