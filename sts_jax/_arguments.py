@@ -63,11 +63,11 @@ def checked_masks(
     Args:
         present: Dictionary from the name of a modality ("visual", "tactile" or "pose") to a Boolean mask of the items
             in the batch. None for no masks.
-        arrays: Inputs that were given, by the name of the modality.
+        arrays: Dictionary from the name of a modality to its input. It contains only the inputs that were given.
         lead: Sizes of the leading axes that all inputs have. Each mask must have this shape.
 
     Returns:
-        Masks by the name of the modality, an empty dictionary if `present` is None.
+        Dictionary from the name of a modality to its mask, empty if `present` is None.
 
     Raises:
         ValueError: `present` is not a dictionary, a mask is for a modality that was not given, or a mask has another

@@ -133,7 +133,7 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
             remedies = ["save it as .npz"] * isinstance(thing, tuple(_KINDS.values()))
             remedies += ["draw it with sts.show(...).savefig(path)"] * (not isinstance(thing, Trajectory))
             raise TypeError(
-                f"thing is a {type(thing).__name__}, but only a Frame or an image can be written to a .png file: "
+                f"`thing` is a {type(thing).__name__}, but only a Frame or an image can be written to a .png file: "
                 f"{', or '.join(remedies)}"
             )
         else:
@@ -143,8 +143,8 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
     elif path.suffix.lower() == ".npz":
         if not isinstance(thing, tuple(_KINDS.values())):
             raise TypeError(
-                f"thing has the type {type(thing).__name__}, but only objects of the types {', '.join(_KINDS)} can be "
-                "written to an .npz file. Write an image to a .png file, and other arrays with np.savez"
+                f"`thing` has the type {type(thing).__name__}, but only objects of the types {', '.join(_KINDS)} can "
+                "be written to an .npz file. Write an image to a .png file, and other arrays with np.savez"
             )
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
         arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}
@@ -216,7 +216,7 @@ def _image(thing: Any) -> np.ndarray:
     """Check that an argument is an RGB image, and return it as floats in [0, 1]."""
     if not isinstance(thing, np.ndarray | jax.Array):
         raise TypeError(
-            f"thing has the type {type(thing).__name__}, but it must be a Frame, or an image as an array "
+            f"`thing` has the type {type(thing).__name__}, but it must be a Frame, or an image as an array "
             "(height, width, 3). sts.show also draws a Body or a Prediction"
         )
     image = np.asarray(thing)

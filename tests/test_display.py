@@ -127,12 +127,12 @@ def test_a_body_is_drawn_from_outside():
     ("path", "thing", "error", "message"),
     [
         ("a.npz", np.zeros((2, 2, 3)), TypeError, "type ndarray, but only .* Trajectory can be written"),
-        ("a.png", 3.0, TypeError, "thing has the type float, but it must be a Frame, or an image"),
+        ("a.png", 3.0, TypeError, "`thing` has the type float, but it must be a Frame, or an image"),
         (
             "a.png",
             BODY,
             TypeError,
-            r"thing is a Body, but .* to a \.png file: save it as \.npz, or draw it with sts\.show",
+            r"`thing` is a Body, but .* to a \.png file: save it as \.npz, or draw it with sts\.show",
         ),
         ("a.png", np.zeros((2, 2)), ValueError, r"shape \(2, 2\)"),
         ("a.png", np.full((2, 2, 3), 2.0), ValueError, r"in \[2.0, 2.0\]"),

@@ -147,7 +147,7 @@ def commissioned(config: Simulated, device: twin.Twin) -> tuple[twin.VirtualSens
         raise ValueError(
             f"{file} is for images of {there.width} x {there.height} pixels and the LED levels {there.levels}, but the "
             f"options give {config.size[0]} x {config.size[1]} pixels and the levels {config.levels}: choose another "
-            "--workdir, or give the options --size and --levels the values of the file"
+            "--workdir, or set --size and --levels to the values in the file"
         )
     settling = hardware.Settling(there.settle_off_s, there.settle_on_s)
     sensor = twin.VirtualSensor(device, levels=config.levels, settling=settling)

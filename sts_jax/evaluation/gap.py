@@ -146,8 +146,8 @@ def energy_distance(
 
     Raises:
         ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 2 trajectories. The error
-            is also raised if the sets share only some of their trajectories, or share all of them but have different
-            numbers of images.
+            is also raised if only some of the trajectories occur in both sets, or if all trajectories occur in both
+            sets but `real` and `simulated` have different lengths.
 
     Source: Szekely and Rizzo (2013), Energy statistics: a class of statistics based on distances.
     """
@@ -197,8 +197,8 @@ def told_apart(
 
     Raises:
         ValueError: A value is not finite, a shape is wrong, or a set has images of fewer than 5 trajectories. The error
-            is also raised if the sets share only some of their trajectories, or share all of them but have different
-            numbers of images.
+            is also raised if only some of the trajectories occur in both sets, or if all trajectories occur in both
+            sets but `real` and `simulated` have different lengths.
         ImportError: scikit-learn is not installed.
     """
     try:
@@ -270,7 +270,7 @@ def _check(real: np.ndarray, simulated: np.ndarray, real_group: np.ndarray, simu
             )
         if group.shape != images.shape[:1]:
             raise ValueError(
-                f"group must have one trajectory number for each of the {len(images)} images of {name}, "
+                f"`group` must contain one trajectory number for each of the {len(images)} images in `{name}`, "
                 f"got shape {group.shape}"
             )
 

@@ -182,8 +182,7 @@ def predict(
     names = tuple(inputs)
     if len(test.object) == 0:
         raise ValueError(
-            "the argument test has 0 trajectories, but at least one is needed: choose a split with held-out "
-            "trajectories"
+            "`test` has 0 trajectories, but at least one is needed: choose a split with held-out trajectories"
         )
 
     def run(pairs: Pairs, num_samples: int) -> Predicted:

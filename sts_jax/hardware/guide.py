@@ -96,8 +96,9 @@ class EmptyPad:
     """The appearance of the empty pad in a visual and a tactile image, and the noise of this appearance.
 
     Each image is divided into 24 rows of 32 blocks, and the tactile image also into 48 rows of 64 small blocks. A block
-    mean is the mean colour of one block. The noise of a block is the standard deviation of its mean colour between
-    images, or 0 if the noise is unknown. All values have the scale of the images, 0 to 255.
+    mean is the mean colour of one block. Each block mean varies from image to image, and the standard deviation of this
+    variation is the noise of the block. An unknown noise is stored as 0. All values have the scale of the images, 0 to
+    255.
     """
 
     visual: Blocks  # block means of the visual image
@@ -150,10 +151,10 @@ def observe(
 def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
     """Measure the appearance of the empty pad, and its noise, from several observations.
 
-    An observation contains the mean colours of blocks of the images, see `observe`. The noise of a block is the
-    standard deviation of its mean colour over the observations. A few observations can underestimate the noise.
-    A noise below the median is therefore raised to the median. The median is taken over all blocks that have the same
-    size and belong to the same image.
+    An observation contains the mean colours of blocks of the images, see `observe`. The mean colour of a block varies
+    from observation to observation, and the standard deviation of this variation is the noise of the block. A few
+    observations can underestimate the noise. A noise below the median is therefore raised to the median. The median is
+    taken over all blocks that have the same size and belong to the same image.
 
     Args:
         observations: At least two observations of the empty pad without movement.

@@ -191,8 +191,8 @@ class Leds:
 
         Raises:
             ValueError: `levels` are not four integers from 0 to 255.
-            LedTimeoutError: No valid answer arrived within the `answer_s` of `connect`. It is unknown whether the
-                lights changed.
+            LedTimeoutError: No valid answer arrived within the time `answer_s` (an argument of `connect`). It is
+                unknown whether the lights changed.
             DisconnectedError: The port vanished or is closed.
             LedError: The controller refused the request or applied other levels.
         """
@@ -212,7 +212,7 @@ class Leds:
             The controller's answer.
 
         Raises:
-            LedTimeoutError: No valid answer arrived within the `answer_s` of `connect`.
+            LedTimeoutError: No valid answer arrived within the time `answer_s` (an argument of `connect`).
             DisconnectedError: The port vanished or is closed.
             LedError: The controller refused the request.
         """
@@ -221,8 +221,8 @@ class Leds:
     def close(self) -> None:
         """Turn the lights off and close the port.
 
-        If the controller does not answer within the `answer_s` of `connect`, the port is closed anyway. The
-        controller's watchdog then turns the lights off. Closing twice is allowed.
+        If the controller does not answer within the time `answer_s` (an argument of `connect`), the port is closed
+        anyway. The controller's watchdog then turns the lights off. Closing twice is allowed.
         """
         if not self._open:
             return

@@ -82,12 +82,13 @@ class _Steps(NamedTuple):
 def compile_body(
     parts: np.ndarray, pad: tuple[float, float], contact: scene.Contact, wall: float = 0.0
 ) -> mujoco.MjModel:
-    """Compile the scene for `roll`: pad, stop wall and object, with a contact point at each vertex of the hull.
+    """Compile the scene for `roll`: pad, stop wall and object, with a contact point at each vertex in `parts`.
 
     MuJoCo's contact sensors in the scene measure the contact forces and the depth of the deepest contact.
 
     Args:
-        parts: n points of each of the p convex parts of the hull, (p, n, 3), in the mesh frame (m).
+        parts: Vertices of the p convex parts that represent the object in collisions, n vertices for each part,
+            (p, n, 3), in the mesh frame (m).
         pad: Size of the pad along x and y (m).
         contact: Contact and solver constants.
         wall: Height of the stop wall (m), 0 for none.

@@ -1,4 +1,4 @@
-"""Interpolation between the corners of the nearest face at each pixel."""
+"""Interpolation between the corners of the face that is visible at each pixel."""
 
 import functools
 import operator
@@ -22,11 +22,11 @@ class Corners(NamedTuple):
 def weights(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> tuple[list[Int[Array, "h w"]], tuple[Float[Array, "h w"], ...]]:
-    """Vertex indices and barycentric weights of the three corners of the nearest face at each pixel.
+    """Vertex indices and barycentric weights of the three corners of the face that is visible at each pixel.
 
     Args:
         corners: Vertices and faces of the object.
-        winner: Index of the nearest face at each pixel. A negative index, for a pixel without a face, gives the corners
+        winner: Index of the visible face at each pixel. A negative index, for a pixel without a face, gives the corners
             of face 0.
         column: Column of each pixel.
         row: Row of each pixel.
@@ -42,7 +42,7 @@ def weights(
 def weighted(
     corners: Corners, winner: Int[Array, "h w"], column: Float[Array, "h w"], row: Float[Array, "h w"]
 ) -> list[Float[Array, "h w"]]:
-    """Multiply `corners.value` at the three corners of the nearest face by the weights of the corners, at each pixel.
+    """For each pixel, multiply `corners.value` at the three corners of the visible face by the corners' weights.
 
     The sum of the three products is the interpolated value. The arguments are those of `weights`.
     """
@@ -53,14 +53,14 @@ def weighted(
 def interpolated(
     corners: Corners, images: tuple[Int[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]
 ) -> Float[Array, "h w"]:
-    """Interpolate the value on the nearest face at each pixel.
+    """For each pixel, interpolate `corners.value` between the three corners of the visible face.
 
     Args:
         corners: Vertices and faces of the object, with the value at each vertex.
-        images: Three arrays: the index of the nearest face at each pixel, the column of each pixel, and the row of each
+        images: Three arrays: the index of the visible face at each pixel, the column of each pixel, and the row of each
             pixel. They are the arguments `winner`, `column` and `row` of the function `weights`.
 
     Returns:
-        Value at each pixel, meaningless at pixels without a face.
+        Interpolated value at each pixel, meaningless at pixels without a face.
     """
     return functools.reduce(operator.add, weighted(corners, *images))

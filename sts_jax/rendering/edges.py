@@ -21,22 +21,23 @@ def with_moving_edges(
 ) -> Float[Array, "h w"]:
     """Return the imprint unchanged, but with a derivative that includes the motion of its edges.
 
-    The depth at a pixel is interpolated on the nearest face. The derivative of this depth ignores edges that move
-    across pixels. The imprint of a flat object with upright walls changes only at such edges. The derivative here is
+    The depth at a pixel is interpolated on the face that is visible there. The derivative of this depth ignores edges
+    that move across pixels. The imprint of a flat object with upright walls changes only at such edges. The derivative
+    here is
 
         d imprint = rate - v . grad imprint
 
-    v is the motion of the visible surface in the image (pixels), and `rate` is the change of the surface's depth below
-    the gel's face (m). The second term is a sum over pairs of neighbouring pixels. For each pair, the difference of the
-    two imprints is multiplied by the component of v along the line from one pixel to the other. This component is taken
-    at the pixel at which the object is nearer to the camera. Each pixel of the pair receives half of the product. The
-    pairs are the micro-edges of Pidhorskyi et al. 2024, "Rasterized Edge Gradients". The derivative is accurate on
-    average over a few pixels.
+    Each pixel shows one point of the object. v is the motion of this point in the image (pixels), and `rate` is the
+    change of the point's depth below the undeformed surface of the gel (m). The second term is a sum over pairs of
+    neighbouring pixels. For each pair, the difference of the two imprints is multiplied by the component of v along the
+    line from one pixel to the other. This component is taken at the pixel at which the object is nearer to the camera.
+    Each pixel of the pair receives half of the product. The pairs are the micro-edges of Pidhorskyi et al. 2024,
+    "Rasterized Edge Gradients". The derivative is accurate on average over a few pixels.
 
     Args:
-        imprint: Depth of the imprint below the gel's face (m).
-        corners: Vertices of the object in the image, with the value 1 / depth (1/m).
-        images: Three images (h, w): the index of the nearest face at each pixel, the column of each pixel, and the row
+        imprint: Depth of the imprint below the undeformed surface of the gel (m).
+        corners: Faces of the object, and for each vertex its position in the image and 1 / depth (1/m).
+        images: Three images (h, w): the index of the visible face at each pixel, the column of each pixel, and the row
             of each pixel.
         depth: Depth of the object from the pinhole (m), `inf` where there is no object.
         on_pad: True for pixels whose rays pass through the pad.

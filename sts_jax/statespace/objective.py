@@ -80,7 +80,7 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
     """Combine the estimates from all inputs of each item: multiply the standard normal prior by the Gaussians.
 
     Args:
-        found: Gaussian estimate from each input by name, from `experts`.
+        found: Result of `experts`, a dictionary from the name of each input to the Gaussian estimate from this input.
         counts: A mask for each name in `found`, `(n,)`. True means that the item has the input.
 
     Returns:
@@ -91,7 +91,12 @@ def fuse(found: dict[str, Gaussian], counts: dict[str, Bool[Array, "n"]]) -> Gau
 
 
 def of_state(belief: Gaussian) -> Gaussian:
-    """Remove the appearance code from a belief, `(n, code + look)`. The result has only the state code, `(n, code)`."""
+    """Remove the appearance code from a belief. The result is a belief about the state code alone, `(n, code)`.
+
+    Args:
+        belief: Gaussian over the state code, of length `code`, and the appearance code, of length `look`. The shape is
+            `(n, code + look)`.
+    """
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
 

@@ -91,7 +91,7 @@ def turn(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[A
 
 
 def turn_back(angle: Float[Array, "*#n 2"], vector: Float[Array, "*#n 2"]) -> Float[Array, "*#n 2"]:
-    """Rotate vectors (x, y) by the angles with the opposite sign. This is the inverse of `turn`."""
+    """Rotate vectors (x, y) as `turn` does, but in the opposite direction. This is the inverse of `turn`."""
     return turn(angle * jnp.array([1.0, -1.0]), vector)
 
 
@@ -113,7 +113,7 @@ def turn_code(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Flo
 
 
 def turn_code_back(angle: Float[Array, "*#n 2"], code: Float[Array, "*#n 12"]) -> Float[Array, "*#n 12"]:
-    """Compute pose codes after a rotation by the angles with the opposite sign. This is the inverse of `turn_code`."""
+    """Rotate pose codes as `turn_code` does, but in the opposite direction. This is the inverse of `turn_code`."""
     return turn_code(angle * jnp.array([1.0, -1.0]), code)
 
 

@@ -18,7 +18,8 @@ class Hand(AutomaticPerson):
     would. If `hardware.collect` detects no contact while a pose is held, the hand continues with the pose of the next
     trajectory, and the session skips the number of the current trajectory.
 
-    A trajectory has the same number in the session and in the scene if the scene starts with the session's next number
+    The session and the scene each give every trajectory a number. The two numbers of a trajectory are equal if the
+    scene starts to count at the number of the session's next trajectory
     (`ObjectScene(first=hardware.next_recording(folder))`).
     """
 
