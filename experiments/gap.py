@@ -182,8 +182,8 @@ def load(config: Config) -> tuple[Side, Side]:
     common = np.intersect1d(real.images.group, simulated.images.group)
     if not len(common):
         raise ValueError(
-            f"{config.real} and {config.simulated} have no trajectory number in common: give --match none if they show "
-            "the same object in other poses"
+            f"{config.real} and {config.simulated} have no trajectory number in common: if they show the same object "
+            "in other poses, give --match none"
         )
     return real.of(common), simulated.of(common)
 

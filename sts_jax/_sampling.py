@@ -1,4 +1,6 @@
-"""Bilinear interpolation of images at points given by column and row (pixels). Pixel centres have whole numbers.
+"""Bilinear interpolation of images at points given by column and row (pixels).
+
+The column and the row are whole numbers at the centre of a pixel.
 
 There is one function for each pattern of access: `bilinear` for any points of one image, `bilinear_batch` for many
 points in each of several small images with channels, and `shifted` for the same offset from every pixel. A point
@@ -19,8 +21,8 @@ def bilinear(
     Args:
         image: Values of the pixels. There may be any number of axes *c for channels. If `wrap` is False, the image must
             have at least 2x2 pixels.
-        column: Columns of the points (pixels, where the centres of pixels have whole numbers).
-        row: Rows of the points (pixels, where the centres of pixels have whole numbers).
+        column: Columns of the points (pixels). The column is a whole number at the centre of a pixel.
+        row: Rows of the points (pixels). The row is a whole number at the centre of a pixel.
         wrap: If True, the image repeats beyond its border. If False, a point outside has the value of the nearest point
             inside.
 
@@ -47,8 +49,8 @@ def bilinear_batch(
 
     Args:
         images: Images with c channels, at least 2x2 pixels each.
-        column: Columns of the points in each image (pixels, where the centres of pixels have whole numbers).
-        row: Rows of the points in each image (pixels, where the centres of pixels have whole numbers).
+        column: Columns of the points in each image (pixels). The column is a whole number at the centre of a pixel.
+        row: Rows of the points in each image (pixels). The row is a whole number at the centre of a pixel.
 
     Returns:
         Values at the points. A point outside its image has the value of the nearest point inside.

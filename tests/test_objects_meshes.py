@@ -259,11 +259,11 @@ def test_hull_gap_is_the_error_of_a_hull_of_64_vertices(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"mass": -0.1}, "mass must be a positive"),
-        ({"mass": 0.0}, "mass must be a positive"),
-        ({"mass": float("nan")}, "mass must be a positive"),
-        ({"longest_side": 0.0}, "longest_side must be a positive"),
-        ({"longest_side": -0.1}, "longest_side must be a positive"),
+        ({"mass": -0.1}, "`mass` must be a positive"),
+        ({"mass": 0.0}, "`mass` must be a positive"),
+        ({"mass": float("nan")}, "`mass` must be a positive"),
+        ({"longest_side": 0.0}, "`longest_side` must be a positive"),
+        ({"longest_side": -0.1}, "`longest_side` must be a positive"),
         ({"longest_side": 0.2}, "the pad is 0.15 m"),
         ({"longest_side": 0.004}, "longest_side is 0.004 m, but an object must be at least 0.005 m"),
         ({"scale": 0.001}, r"longest side is 0\.1 mm, but it must be at least 5 mm: .*longest_side \(in metres\)"),
@@ -271,8 +271,8 @@ def test_hull_gap_is_the_error_of_a_hull_of_64_vertices(tmp_path):
         ({"category": -2}, "category is -2, but it must be from 0 to 7"),
         ({"category": "mouse"}, r"category is 'mouse', but .*CATEGORIES\.index\('mouse'\)"),
         ({"category": 1.5}, "category is 1.5, but it must be from 0 to 7"),
-        ({"mass": True}, "mass must be a positive number of kilograms, got True"),
-        ({"longest_side": "10 cm"}, "longest_side must be a positive number of metres, got '10 cm'"),
+        ({"mass": True}, "`mass` must be a positive number of kilograms, got True"),
+        ({"longest_side": "10 cm"}, "`longest_side` must be a positive number of metres, got '10 cm'"),
     ],
 )
 def test_arguments_out_of_range_are_refused(box, arguments, message):
@@ -283,12 +283,12 @@ def test_arguments_out_of_range_are_refused(box, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"scale": 0.0}, "scale must be a positive"),
-        ({"largest": -1.0}, "largest must be a positive"),
+        ({"scale": 0.0}, "`scale` must be a positive"),
+        ({"largest": -1.0}, "`largest` must be a positive"),
         ({"largest": 0.2}, r"the pad is 0\.15 m"),
-        ({"density": 0.0}, "density must be a positive"),
+        ({"density": 0.0}, "`density` must be a positive"),
         ({"scale": 1.0, "longest_side": 0.1}, "not both"),
-        ({"faces": 2}, "faces must be a whole number, at least 4"),
+        ({"faces": 2}, "`faces` must be a whole number >= 4"),
         ({"up": (0.0, 0.0, 0.0)}, r"up must not be \(0, 0, 0\)"),
         ({"up": (0.0, 1.0, 0.0)}, "must not be parallel"),
         ({"up": "z", "front": (0.0, -1.0, 0.0)}, "direction of three numbers"),
@@ -382,7 +382,7 @@ def test_too_many_faces_are_refused(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("faces", [10.5, 3, True, "100"])
 def test_an_invalid_number_of_faces_is_refused(tmp_path, faces):
-    with pytest.raises(ValueError, match=rf"faces must be a whole number, at least 4, got {faces!r}"):
+    with pytest.raises(ValueError, match=rf"`faces` must be a whole number >= 4, got {faces!r}"):
         inspect.unwrap(objects.load)(tmp_path / "none.stl", faces=faces)
 
 

@@ -123,7 +123,7 @@ def changed(params, path, change):
 
 @pytest.mark.parametrize("drawn", [0, 3])
 def test_number_of_rendered_samples_is_checked(model, empty, drawn):
-    with pytest.raises(ValueError, match=rf"drawn must be from 1 to num \(2\), got {drawn}"):
+    with pytest.raises(ValueError, match=rf"`drawn` must be from 1 to `num` \(2\), got {drawn}"):
         statespace.sample(*model, jax.random.key(0), {}, {}, empty, num=2, drawn=drawn)
 
 

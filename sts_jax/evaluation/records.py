@@ -88,8 +88,8 @@ class Metric:
     digits: int = 3  # number of decimals in the table
     factor: float = 1.0  # value in the table divided by the value in the summary (SI units), such as 1e3 for mm
     heading: str = ""  # heading of the column in the table (default: the name, with spaces)
-    # Function that returns the metric as a function of the weights of the items, `(n,)`. It returns None if the
-    # predictor does not predict the quantity.
+    # Function that returns a second function or None. The second function computes the metric from the weights of the
+    # items, `(n,)`. None means that the predictor does not predict the quantity.
     statistic: Callable[[Judged], Statistic | None] | None = None
     interval: bool = True  # true if the table shows the interval
     column: bool = True  # true if the complete table has the metric (summaries always have it)
@@ -121,7 +121,7 @@ class Metric:
         return f"{heading} ({self.unit})" if self.unit else heading
 
     def of(self, judged: Judged) -> Statistic | None:
-        """Return the metric of one predictor as a function of the weights of the items, `(n,)`.
+        """Return a function that computes the metric of one predictor from the weights of the items, `(n,)`.
 
         Args:
             judged: The errors of the predictor and of the constant baseline, and the true trajectories (items).

@@ -20,7 +20,7 @@ class LedError(OSError):
 
 
 class PortNotFoundError(LedError):
-    """Raised if a port does not exist, or if no port has the wanted controller. The message lists other ports."""
+    """Raised if a port does not exist, or if no port has the wanted controller. The message lists the ports found."""
 
 
 class PortPermissionError(LedError):

@@ -12,7 +12,7 @@ Stream = Literal["visual", "tactile"]
 
 
 class LightError(RuntimeError):
-    """No image of the requested stream could be taken in time with the lights in the right state."""
+    """An image of the requested stream, with the lights in the right state, could not be taken in time."""
 
 
 class NotStillError(TimeoutError):

@@ -176,7 +176,7 @@ def _check_arguments(
         if value is not None and not (
             np.asarray(value).dtype.kind in "iuf" and np.ndim(value) == 0 and np.isfinite(value) and value > 0
         ):
-            raise ValueError(f"{path}: the argument {name} must be a positive number of {unit}, got {value!r}")
+            raise ValueError(f"{path}: the argument `{name}` must be a positive number of {unit}, got {value!r}")
     for name, value in (("longest_side", longest_side), ("largest", largest)):
         if value is not None and value > PAD:
             raise ValueError(f"{path}: {name} is {value} m, but the pad is {PAD} m wide: give at most {PAD}")
@@ -192,7 +192,7 @@ def _check_arguments(
     if longest_side is not None and scale is not None:
         raise ValueError(f"{path}: give longest_side or scale, not both")
     if faces is not None and (isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4):
-        raise ValueError(f"{path}: the argument faces must be a whole number, at least 4, got {faces!r}")
+        raise ValueError(f"{path}: the argument `faces` must be a whole number >= 4, got {faces!r}")
 
 
 def _attitude(
@@ -202,8 +202,8 @@ def _attitude(
     if isinstance(up, str):
         if up not in AXES or front is not None:
             raise ValueError(
-                f"{path}: up is {up!r} and front is {front}, which is not allowed: pass 'x', 'y' or 'z' as up and omit "
-                "front, or pass a direction of three numbers as up, with or without front"
+                f"{path}: `up` is {up!r} and `front` is {front}, but this combination is not allowed: pass 'x', 'y' or "
+                "'z' as `up` and omit `front`, or pass a direction of three numbers as `up`, with or without `front`"
             )
         return rotation(*AXES[up])
     try:

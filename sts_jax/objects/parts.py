@@ -68,7 +68,7 @@ def convex_parts(
 def decompose(body: Body) -> Body:
     """Replace the collision hull of a body by several convex parts.
 
-    Several parts fit a shape that is not convex, such as scissors or a bowl, more closely than a single hull.
+    A shape that is not convex, such as scissors or a bowl, is approximated better by several parts than by one hull.
 
     Args:
         body: One body.

@@ -123,9 +123,9 @@ def hidden_sky(
         hidden = max_z Y_z slice_z X_z^T
 
     Y_z slice_z X_z^T is a product of matrices, and the maximum over the slices is taken in each cell. slice_z is the
-    share of each cell that the slice covers. X_z[i, j] is the share of the sky that is hidden, as seen from the centre
-    of column i, by a strip over column j at the height z. Y_z is the same matrix for rows instead of columns. Quadratic
-    splines interpolate between the cells.
+    share of each cell that the slice covers. X_z[i, j] is the share of the sky that a strip over column j at the height
+    z hides from the centre of column i. Y_z is the same matrix for rows instead of columns. Quadratic splines
+    interpolate between the cells.
 
     Args:
         heights: Heights of the object's underside above the gel's face (m), on a uniform grid of r rows and c columns
@@ -251,8 +251,8 @@ def shade(
     2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.
     3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        background, `empty`, replaces the rest.
-    4. Milky skin: the share `1 - milk` of the result is transmitted. The background without the object's shadow is
-       multiplied by `milk * (1 - hidden)` and added.
+    4. Milky skin: the share `1 - milk` of the result is transmitted. The light that the background would have
+       without the object's shadow is multiplied by `milk * (1 - hidden)` and added.
 
     Args:
         room: Constants of the external light.

@@ -44,7 +44,8 @@ class Trajectory(NamedTuple):
         """The outcome of each trajectory. `Outcome.FELL_OFF` prints as "fell off".
 
         Raises:
-            ValueError: An outcome is not a member of `Outcome`. Use `Scenario.named` instead.
+            ValueError: The field `outcome` has a number that no member of `Outcome` has. A scenario can define its own
+                outcomes, and `Scenario.named` returns their names.
         """
         return tuple(Outcome(int(number)) for number in np.ravel(self.outcome))
 

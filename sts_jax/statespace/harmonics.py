@@ -14,7 +14,10 @@ from jaxtyping import Array, Float
 
 
 def number(degree: int) -> int:
-    """The number of spherical harmonics of the degrees 0 to `degree`. A function has one coefficient per harmonic."""
+    """The number of spherical harmonics of the degrees 0 to `degree`.
+
+    A function on the sphere that is a sum of these harmonics has one coefficient for each harmonic.
+    """
     return (degree + 1) ** 2
 
 

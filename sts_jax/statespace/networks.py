@@ -105,10 +105,15 @@ class Config:
                 "must be 0 or at least 2 * vectors, because each vector has two numbers"
             )
         if self.traits < TINT:
-            raise ValueError(f"traits is {self.traits}, but it must be >= {TINT}: the first {TINT} are the mean colour")
+            raise ValueError(
+                f"traits is {self.traits}, but it must be >= {TINT}, because the first {TINT} traits describe the mean "
+                "colour of the object"
+            )
         for name in ("drawn", "drawn_first"):
             if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, but this share of a batch must be > 0 and <= 1")
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, but it must be > 0 and <= 1, because it is a share of a batch"
+                )
 
     @property
     def look(self) -> int:
@@ -118,8 +123,9 @@ class Config:
     def to_json(self) -> dict[str, Any]:
         """The fields by name, in values that `json.dumps` accepts.
 
-        The field `vectors` is left out if it has its default value 1. Older versions did not save this field, and the
-        configuration of a resumed training must equal the saved configuration.
+        The field `vectors` is left out if it has its default value 1. Older versions saved configurations without this
+        field. If the field were not left out, the result would differ from such a configuration, and a training of an
+        older version could not be resumed.
         """
         values = dataclasses.asdict(self)
         return {name: value for name, value in values.items() if (name, value) != ("vectors", 1)}
@@ -181,8 +187,9 @@ class _ResidualDense(nnx.Module):
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
     """Split appearance codes into traits and functions on the unit sphere.
 
-    Traits are numbers that do not depend on the object's rotation. Functions assign a number to each direction and
-    rotate with the object.
+    Traits are numbers that do not depend on the object's rotation. A function assigns a number to each direction. If
+    the object rotates, the functions rotate with the object. The coefficients of functions in the mesh frame then stay
+    the same. The coefficients of functions in the sensor frame change.
 
     Args:
         config: Configuration of the model. An appearance code consists of `config.traits` traits, `config.own`
@@ -486,7 +493,7 @@ def _on_canvas(
 
 
 class Model(nnx.Module):
-    """The networks of a state-space model: a transition, a decoder, and an encoder for each image among the inputs."""
+    """The networks of a state-space model: a transition, a decoder, and an encoder for each kind of input image."""
 
     def __init__(self, config: Config, rngs: nnx.Rngs) -> None:
         self.config = config

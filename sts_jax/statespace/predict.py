@@ -46,9 +46,9 @@ def sample(
         graphdef: Definition of the model, from `init`.
         params: Parameters of the model.
         key: Random key for the samples.
-        inputs: One or more inputs of n items, by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1]
-            with the side `Config.input_size`, pose codes `pose` `(n, 12)` and true state codes `state` `(n, code)`.
-            Inputs other than `state` must be in the model's `Config.inputs`.
+        inputs: One or more inputs of n items, by name. `visual` and `tactile` are images in [0, 1],
+            `(n, size, size, 3)`, where size is `Config.input_size`. `pose` contains pose codes, `(n, 12)`. `state`
+            contains true state codes, `(n, code)`. Inputs other than `state` must be in the model's `Config.inputs`.
         present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input. Values of other items
             have no influence and may be NaN.
         empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].
@@ -68,7 +68,7 @@ def sample(
         ValueError: `drawn` is out of range.
     """
     if not 1 <= drawn <= num:
-        raise ValueError(f"drawn must be from 1 to num ({num}), got {drawn}")
+        raise ValueError(f"`drawn` must be from 1 to `num` ({num}), got {drawn}")
     model = nnx.merge(graphdef, params)
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)

@@ -24,17 +24,16 @@ def side_by_side(
 ) -> None:
     """Draw real and simulated images of the visual and the tactile stream side by side.
 
-    If both images of a row show the same object in the same pose, the figure also shows their difference. The
-    difference is the real minus the simulated image, averaged over the colour channels. Red pixels are brighter in the
-    real image.
+    If `matched` is True, the figure also shows a difference for each row and each stream. The difference is the real
+    minus the simulated image, averaged over the colour channels. Red pixels are brighter in the real image.
 
     Args:
         path: The PNG file to write.
         real: Real images of both streams. Image i is drawn in row i.
         simulated: Simulated images of both streams, of the same shape as the real images.
         labels: Labels of the rows, one for each image.
-        matched: True if both images of a row show the same object in the same pose. The figure then also shows their
-            difference.
+        matched: True if the real and the simulated images of each row show the same object in the same pose. The
+            figure then also shows the differences.
         title: Title of the figure.
         names: Titles of the columns of real and simulated images.
     """
