@@ -85,7 +85,10 @@ def check(config: Config) -> None:
             f"--ruler is {config.ruler:g} mm, but it must be 80 to 120 mm: measure the ruler on the printed page"
         )
     if config.board_images is not None and not config.board_images.is_dir():
-        raise FileNotFoundError(f"--board-images is {config.board_images}, but this is not a folder: give another one")
+        raise FileNotFoundError(
+            f"--board-images is {config.board_images}, but this is not a folder: give a folder with pictures of the "
+            "board"
+        )
     output.make_folder(config.out)
 
 

@@ -42,7 +42,9 @@ def enable_compilation_cache(folder: str | os.PathLike[str] | None = None) -> Pa
         if not folder:
             return None
     if folder is not None and not os.fspath(folder):
-        raise ValueError("the argument folder is an empty string: give a path, such as '.' for the current directory.")
+        raise ValueError(
+            "the argument `folder` is an empty string: give a path, such as '.' for the current directory."
+        )
     path = cache_folder() / processor() if folder is None else Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)

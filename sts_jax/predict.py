@@ -68,9 +68,9 @@ class Predictor:
 
         Args:
             folder: Folder of a trained model, such as `runs/freefall/models/mvae`, or the name of a model that comes
-                with the library, such as `freefall`. A folder is the `workdir` of a training, or was written by `save`.
-                If the current directory has a folder of the given name that contains `config.json`, the model in this
-                folder is loaded.
+                with the library, such as `freefall`. The folder must be the `workdir` of a training or a folder that
+                `save` wrote. If a name is given, and the current directory has a folder of this name that contains
+                `config.json`, the model in this folder is loaded.
             resolution: Height and width of the images that you will pass (pixels). If given, a model that was trained
                 at another resolution raises an error.
             crop: View of the images that you will pass: True for the square around the object, False for the whole pad.
@@ -341,10 +341,13 @@ class Predictor:
         width = self.model.config.condition
         array = None if value is None else _arguments.checked_array("condition", value, f"{width} numbers in SI units")
         shape = None if array is None else array.shape
-        if shape != (None if width == 0 else (*lead, width)):
-            given = "is missing" if shape is None else f"has shape {shape}"
-            wanted = f"needs shape {(*lead, width)}, in SI units" if width else "accepts no condition: leave it out"
-            raise ValueError(f"condition {given}, but {self.name} {wanted}.")
+        if width == 0 and shape is not None:
+            raise ValueError(
+                f"condition has shape {shape}, but {self.name} accepts no condition: leave out the argument condition."
+            )
+        if width != 0 and shape != (*lead, width):
+            given = "condition is missing" if shape is None else f"condition has shape {shape}"
+            raise ValueError(f"{given}, but {self.name} needs shape {(*lead, width)}: give numbers in SI units.")
         if array is None:
             return None, None
         if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):

@@ -129,8 +129,8 @@ def _make_shard(
     left_out += failed
     if trajectory is None:
         raise ValueError(
-            f"{folder}: no object of shard {index} can be simulated, for example {left_out[-1]}: use other objects or "
-            "another scenario"
+            f"{folder}: no object of shard {index} can be simulated: use other objects or another scenario. One of the "
+            f'errors is "{left_out[-1]}"'
         )
     members, bodies = np.array(list(found)), list(found.values())
     frames = _frames_of(collection, members, trajectory)

@@ -25,7 +25,8 @@ _CLOSE = 1e-6  # m, least distance in the weights of the geometric median, which
 class ImageError(NamedTuple):
     """Errors of n predicted images. Each error is a sum over all pixels of an image, or over the pixels of a mask.
 
-    The excess is the cross-entropy minus the entropy of the true image. It is 0 for a perfect prediction.
+    The field `excess` is the cross-entropy of each predicted image minus the entropy of the true image. A perfect
+    prediction has an excess of 0.
     """
 
     bce: np.ndarray  # (n,): binary cross-entropy, summed over pixels and channels (nats)
@@ -302,8 +303,8 @@ def calibration_error(
 
     The items are divided into bins by the probability of their likeliest outcome. The accuracy of a bin is the share of
     its items whose likeliest outcome is the true one. The confidence of a bin is the mean probability of the likeliest
-    outcome of its items. The error is the mean of |accuracy - confidence| over the bins. The weight of a bin is the
-    sum of the weights of its items.
+    outcome of its items. The error is the weighted mean of |accuracy - confidence| over the bins. The weight of a
+    bin is the sum of the weights of its items.
 
     Args:
         confidence: Probability of the likeliest outcome of each item, `(n,)`.

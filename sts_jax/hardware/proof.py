@@ -141,7 +141,7 @@ class ProvenFrames:
         Later frames are compared with these two images to find out whether the lights are off or on.
 
         Args:
-            settling: Times for which frames are discarded after a switch of the lights.
+            settling: Settling times. After each switch of the lights, frames are discarded for the settling time.
 
         Raises:
             NoContrastError: The lights do not change the image.
@@ -167,8 +167,8 @@ class ProvenFrames:
         The first image is of the stream for which the lights are already set, so a pair needs only one switch.
 
         Args:
-            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the
-                duration of the reconnection is added.
+            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost during the call,
+                the deadline is extended by the duration of the reconnection.
 
         Returns:
             The two images.
@@ -195,8 +195,8 @@ class ProvenFrames:
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).
-            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost meanwhile, the
-                duration of the reconnection is added.
+            deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost during the call,
+                the deadline is extended by the duration of the reconnection.
             after_s: Earliest arrival time of the frame on the same clock (s).
             then: Stream for which the lights are set after the frame. None: the lights do not change.
 

@@ -122,7 +122,8 @@ class Session:
         Args:
             folder: Folder of the session. The folder is locked until `close`.
             origin: Identity of the sensor. An existing session must have the same origin.
-            settling: Settling times of the sensor's lights, which are stored with each pair. None: not stored.
+            settling: Settling times of the sensor's lights. The times are stored with each pair of images. None:
+                not stored.
 
         Returns:
             The open session. Its next trajectory gets the largest existing number plus 1, or 0 if there are no

@@ -22,9 +22,10 @@ class NoContrastError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class Settling:
-    """Times for which frames are discarded after the LED controller has acknowledged a switch of the lights.
+    """The two settling times: one after the lights are switched off, and one after the lights are switched on.
 
-    Frames that arrive during this time may still show the former lights.
+    A settling time begins when the LED controller acknowledges the switch of the lights. Frames that arrive during the
+    settling time are discarded, because these frames may still show the lights as they were before the switch.
 
     Raises:
         ValueError: A time is not between 0 and 60 s.
@@ -42,7 +43,10 @@ class Settling:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Switch:
-    """The frames after the lights were switched on or off. The final frame must not show the former lighting."""
+    """The frames that arrive after the lights are switched on or off.
+
+    The last of these frames must no longer show the lights as they were before the switch.
+    """
 
     delays_s: Float[np.ndarray, "n"]  # time from the acknowledgement to the arrival of each frame (s)
     thumbnails: Float[np.ndarray, "n 24 32 3"]  # thumbnail of each frame, 0 to 255
@@ -129,10 +133,10 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
     """Compute the settling times from the frames after several switches of the lights.
 
     The `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if its
-    `light_share` differs by at most 0.02 from the `light_share` of the final frame in the same `Switch`. The delay of a
+    `light_share` differs by at most 0.02 from the `light_share` of the last frame in the same `Switch`. The delay of a
     frame is its time of arrival after the controller's acknowledgement. The settling time is the largest delay of a
-    frame that is not settled, plus one period of the camera. The period is added because later switches can occur at
-    other moments of the exposure.
+    frame that is not settled, plus one period of the camera. The period is added because a switch after the
+    measurement can occur at another moment of the camera's exposure than the measured switches.
 
     Args:
         on: Switches from off to on. The scene must be at rest.
@@ -156,7 +160,7 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
     """Return the time from the acknowledgement of a switch to the arrival of the last frame that is not settled (s).
 
-    A frame is settled if its `light_share` differs by at most 0.02 from the `light_share` of the final frame in
+    A frame is settled if its `light_share` differs by at most 0.02 from the `light_share` of the last frame in
     `switch`. If all frames are settled, the result is 0. The result is never negative.
 
     Args:

@@ -153,8 +153,8 @@ class STS:
             FileNotFoundError: There is no such file.
             OSError: The file cannot be read or is not JSON.
             SensorFileError: The file is damaged, or has no description of a camera and lights.
-            WrongDeviceError: The camera is not the one of the file. `connect` raises the same error if the controller
-                is not the one of the file.
+            WrongDeviceError: The camera is not the camera that the file names. `connect` raises the same error if the
+                LED controller is not the controller that the file names.
             ValueError: A time is not positive and finite.
         """
         device = Device.load(path)
@@ -236,7 +236,7 @@ class STS:
                 given. Subclasses name the cause.
             NoContrastError: The lights do not change the image.
             LightError: The settling times could not be measured, because the image keeps changing.
-            WrongDeviceError: The controller is not the one of the sensor file.
+            WrongDeviceError: The LED controller is not the controller that the sensor file names.
             ValueError: `warmup_s` is negative or not finite.
         """
         if self._leds is None:
@@ -286,8 +286,8 @@ class STS:
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
-                is lost meanwhile, the time of the reconnection is added. The last request to the controller may exceed
-                the limit.
+                is lost during the wait, the limit is extended by the duration of the reconnection. The last request to
+                the controller may exceed the limit.
 
         Returns:
             The two images.

@@ -148,7 +148,7 @@ def read(collection: Library, index: int) -> Entry:
     about repairs of the mesh, are returned as notes instead.
 
     Args:
-        collection: Library from `library`.
+        collection: Library that the function `library` returned.
         index: Index of the item in `collection.items`.
 
     Returns:
@@ -175,7 +175,7 @@ def bodies(collection: Library, indices: Iterable[int] | None = None) -> tuple[l
     """Load several items as bodies, and skip items that cannot be loaded.
 
     Args:
-        collection: Library from `library`.
+        collection: Library that the function `library` returned.
         indices: Indices of the items in `collection.items`. None selects all items.
 
     Returns:
@@ -198,7 +198,7 @@ def survey(collection: Library, *, progress: Callable[[str], None] | None = None
     """Load every item once, to find the items that cannot be loaded and to describe all items in a listing.
 
     Args:
-        collection: Library from `library`.
+        collection: Library that the function `library` returned.
         progress: Function that is called after each item with the text line that describes the item. None for no calls.
 
     Returns:

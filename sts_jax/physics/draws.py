@@ -20,9 +20,10 @@ _FURTHER = 2**32 - 1  # `starts` folds it into the key. `simulate` folds in the 
 
 
 class Starts(NamedTuple):
-    """n random starts of one or more bodies. A start is an initial pose with hidden properties.
+    """Random starts of one or more bodies. A start is an initial pose with hidden properties.
 
-    All starts of the first body come first, then all starts of the second body, and so on.
+    The length n is the number of starts of all bodies together. All starts of the first body come first,
+    then all starts of the second body, and so on.
     """
 
     pose: Float[Array, "n 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.

@@ -102,7 +102,8 @@ def restore(folder: Path, like: State) -> State | None:
 
     Args:
         folder: Folder of the model.
-        like: State with the structure, shapes and dtypes of the result. The result of `jax.eval_shape` is sufficient.
+        like: State with the structure, shapes and dtypes of the state to read. The leaves may be abstract arrays, such
+            as those from `jax.eval_shape`.
 
     Returns:
         The state in the checkpoint, or None if the folder has no checkpoint.
@@ -140,7 +141,8 @@ def read(path: Path, like: State) -> State:
 
     Args:
         path: Folder of the checkpoint.
-        like: State with the structure, shapes and dtypes of the result. The result of `jax.eval_shape` is sufficient.
+        like: State with the structure, shapes and dtypes of the state to read. The leaves may be abstract arrays, such
+            as those from `jax.eval_shape`.
 
     Returns:
         The state in the checkpoint.

@@ -16,14 +16,14 @@ _OUTSIDE = -2.0  # coordinate of a raw pixel that lies outside the rendered view
 def lens_warp(lens: Lens, pinhole: Pinhole, resolution: tuple[int, int], *, samples: int | None = None) -> Warp:
     """Compute the mapping from a rendered image to the raw image of a fisheye lens.
 
-    Raw pixels whose view is outside the rendered image are black.
+    Raw pixels that correspond to no point of the rendered image are black.
 
     Args:
         lens: Fisheye camera whose raw image is wanted.
         pinhole: Pinhole camera of the rendered view, such as `sts_jax.Sensor().camera`.
         resolution: (height, width) of the rendered image (pixels).
-        samples: Number of samples along each axis of a raw pixel, >= 1. The value of the pixel is their mean. None:
-            the number that avoids aliasing, but at most 3.
+        samples: Number of samples along each axis of a raw pixel, >= 1. The value of the pixel is the mean of its
+            samples. None: the number that avoids aliasing, but at most 3.
 
     Returns:
         Mapping, for the argument `warp` of `Twin` or `Blender`.
