@@ -70,7 +70,7 @@ def summarise(
     statistics = {name: _statistics(scores, name, scored[name], test, metrics) for name in names}
 
     def numbers(weight: np.ndarray) -> np.ndarray:
-        """Compute all metrics for some weights of the items. A metric that a predictor does not have is NaN.
+        """Compute all metrics with the given weights of the items. A metric that a predictor does not have is NaN.
 
         Args:
             weight: Weights of the items, `(n,)`.

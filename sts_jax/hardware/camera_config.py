@@ -28,7 +28,7 @@ class CameraConfig:
     height: int | None = 1232  # height of the images (pixels), None: the height that the source sends
     fps: float | None = None  # rate of a device, or playback rate of a video file (frames per second), None: unchanged
     fourcc: str | None = None  # pixel format of a device, such as "MJPG", None: the driver's
-    lock: bool = True  # turn off automatic exposure, white balance and focus of a device after the warm-up
+    lock: bool = True  # turn off a device's automatic control of exposure, white balance and focus after the warm-up
     exposure: float | None = None  # exposure in the driver's unit (V4L2: 0.1 ms), None: its value after the warm-up
     gain: float | None = None  # gain in the driver's unit, None: unchanged
     white_balance: float | None = None  # colour temperature (K), None: its value after the warm-up
@@ -81,12 +81,12 @@ class CameraConfig:
 
     @property
     def public(self) -> str:
-        """The source without the user name and password of a URL."""
+        """The source as text. If the source is a URL, the user name and the password are left out."""
         return re.sub(r"(?<=://)[^/@]*@", "", str(self.target))
 
     @property
     def name(self) -> str:
-        """The name of the source in messages. The user name and the password of a URL are replaced by ***."""
+        """The name that messages use for the source. The user name and the password in a URL are replaced by ***."""
         if isinstance(self.target, int):
             return f"camera {self.target}"
         return re.sub(r"(?<=://)[^/@]*@", "***@", self.target)

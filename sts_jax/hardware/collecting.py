@@ -92,9 +92,10 @@ class AutomaticPerson:
         self._stage = view.stage
 
     def action(self) -> Action | None:
-        """Return `Action.CONFIRM` if the last call of `show` received a view in the stage `REVIEW`, else None.
+        """Return `Action.CONFIRM` in the stage `REVIEW`, and None in every other stage.
 
-        In this stage, a recorded trajectory is confirmed or discarded.
+        The last call of `show` has stored the stage. In the stage `REVIEW`, a recorded trajectory is confirmed or
+        discarded.
         """
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 

@@ -102,7 +102,7 @@ class Grabber:
         return not self._thread.is_alive()
 
     def lock_settings(self, timeout_s: float) -> list[str]:
-        """Turn the automatic exposure, white balance and focus off, so that these settings keep their current values.
+        """Turn off the automatic control of exposure, white balance and focus, and keep the current values.
 
         The settings are locked when the next frame has arrived. Then all frames in the queue are discarded.
 

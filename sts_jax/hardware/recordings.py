@@ -304,7 +304,7 @@ def next_recording(folder: str | os.PathLike) -> int:
         folder: Folder of the session.
 
     Returns:
-        The largest number of all existing trajectories plus 1. Discarded trajectories count too. If there is no
+        The highest trajectory number in the session, plus 1. Discarded trajectories count too. If there is no
         trajectory or no session, the result is 0.
     """
     return max((number for _, number, _ in _numbered(Path(folder))), default=-1) + 1

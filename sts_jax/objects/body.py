@@ -120,7 +120,10 @@ def size_class(count: int, classes: tuple[int, ...]) -> int:
 
 
 def pad(array: np.ndarray, size: int, value: np.ndarray | float) -> np.ndarray:
-    """Append rows to an array until it has `size` rows. `value` is the appended row, or a number that fills it."""
+    """Append rows to an array until the array has `size` rows.
+
+    `value` is either the row to append, or a number for all elements of the appended rows.
+    """
     padding = np.broadcast_to(np.asarray(value, array.dtype), (size - len(array), *array.shape[1:]))
     return np.concatenate([array, padding])
 

@@ -107,9 +107,9 @@ class Released(Scenario):
         preferred. If no random edge is of this kind, for example for a cylinder on its side, the object is tilted about
         another edge.
 
-        Two faces meet at a preferred edge, and the object stands on the narrower face. In most cases, the object turns
-        by less than 45 degrees if it returns to the narrower face, and by more than 45 degrees if it topples onto the
-        wider face. `outcome` uses this difference.
+        If the edge is a preferred one, the object stands on the narrower of the two faces that meet at the edge. In
+        most cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than
+        45 degrees if it topples onto the wider face. The method `outcome` uses this difference.
         """
         candidates, beyond, skew, radius, angle, share = jax.random.split(key, 6)
         keys = jax.random.split(candidates, self.tries)

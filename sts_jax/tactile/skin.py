@@ -46,7 +46,7 @@ class Lights:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Leds:
-    """Near internal lights. Each light is a point at a finite distance, and there may be any number m of lights.
+    """Lights inside the sensor, modelled as points at a finite distance. There may be any number m of lights.
 
     By default (our choice), a red, a green, a blue and a white LED shine at a grazing angle into the four edges of the
     pad. They are as bright as possible without clipped pixels in the image of the untouched pad.
@@ -151,16 +151,16 @@ def shadows(
     along u. Elevations are angles above the gel's plane (rad), seen from x. The arctangent is the largest elevation of
     other skin. e is the elevation of the light's lower edge, and e + penumbra is the elevation of its upper edge.
 
-    A light in the gel's plane, as in the paper, has e = 0. The direction of such a light is perpendicular to the
-    normals of flat skin and of the tops of pressed parts, so these receive none of the light. The shadows of such a
-    light are visible only on slopes behind other pressed parts. A shadow is partial where the elevation of these other
-    parts is below `penumbra`.
+    A light in the gel's plane, as in the paper, has e = 0. Such a light does not illuminate flat skin or the
+    tops of pressed parts, because the normals there are perpendicular to the direction of the light. The shadows of
+    such a light are visible only where one pressed part casts a shadow on a slope of another pressed part. The shadow
+    is partial where the elevation of the part that casts the shadow is below `penumbra`.
 
     Args:
         skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the depth at x with the
             depth at the distance `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a part narrower than a
             step may cast no shadow there.
-        lights: Far or near lights. Skin behind a near light does not hide it.
+        lights: Far lights (`Lights`) or near lights (`Leds`). Skin behind a near light does not hide this light.
         depth: Depth of the skin below the gel's undeformed face (m). Skin outside the image casts no shadow.
         window: Part of the gel's face in the image: left, top, width, height (m).
 
@@ -227,7 +227,7 @@ def phong(
 
     Args:
         phong: Constants of the skin's reflectance.
-        lights: Far or near lights. Directions of far lights may have any length > 0.
+        lights: Far lights (`Lights`) or near lights (`Leds`). Directions of far lights may have any length > 0.
         normals: Unit normals towards the camera.
         points: Points of the skin in the sensor frame (m). Only near lights use them.
         shares: Share of each light that reaches each point, from `shadows`. None for no shadows.

@@ -58,8 +58,9 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: Keyword arguments `views` and `falls`. Each contains indices into the first axis of the arrays in
-                the field of the same name. If an argument is not given, its field is left out of the batch.
+            further: Row indices for the arrays in the fields `views` and `falls`, passed as the keyword arguments
+                `views` and `falls`. A row is an entry along the first axis. If an argument is not given, the field of
+                the same name is left out of the batch.
 
         Returns:
             The selected arrays by name of the field. The field named `empty` is included as a whole.

@@ -1,4 +1,7 @@
-"""The parts of a training that differ between `mvae` and `statespace` models: initialisation, loss, check of arrays."""
+"""The parts of a training that differ between `mvae` and `statespace` models.
+
+These parts are the initialisation of the model, the loss, and the check of the training set.
+"""
 
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
@@ -50,7 +53,7 @@ class Loss(Protocol):
 
 
 class Learner(NamedTuple):
-    """The functions that train one model: initialisation, loss and check of the training set."""
+    """The functions that train one model. They initialise the model, compute the loss, and check the training set."""
 
     config: Config  # configuration of the model
     # Takes a random key. Returns the definition of the model, its parameters and its running batch statistics
@@ -62,8 +65,8 @@ class Learner(NamedTuple):
 def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tuple[str, ...] = ()) -> Learner:
     """Make the learner of a model.
 
-    A learner has the functions that train a model: initialisation, loss and check of the training set. The loss is
-    `mvae.loss` or `statespace.loss`, depending on the type of the model.
+    A learner has the functions that train a model. They initialise the model, compute the loss, and check the training
+    set. The loss is `mvae.loss` or `statespace.loss`, depending on the type of the model.
 
     Args:
         model: Configuration of the model.
@@ -144,7 +147,8 @@ def _check_state(model: statespace.Config, arrays: Arrays) -> None:
         if not np.issubdtype(outcome.dtype, np.integer) or outcome.min() < 0 or outcome.max() >= model.outcomes:
             raise ValueError(
                 f"`outcome` has the type {outcome.dtype} and values from {outcome.min()} to {outcome.max()}, but the "
-                f"model needs integers from 0 to {model.outcomes - 1}: give such indices, or a model with more outcomes"
+                f"model needs integers from 0 to {model.outcomes - 1}: give integers in this range, or a model with "
+                "more outcomes"
             )
     _check_condition(model.condition, arrays)
 

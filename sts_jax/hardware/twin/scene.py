@@ -72,21 +72,21 @@ class Scene(abc.ABC):
 
         Args:
             seen: State of the scene, as `at` returns it.
-            blender: The twin's `Blender`, which mixes the two images into camera frames. `Blender.ends` converts the
-                rendered images to linear light, and applies lens distortion and vignetting.
+            blender: The twin's object of the class `Blender`, which mixes the two images into camera frames. The method
+                `Blender.ends` converts the rendered images to linear light, and applies lens distortion and vignetting.
 
         Returns:
             The converted images.
         """
 
     def prepare(self, command: str, blender: Blender) -> None:  # noqa: B027, few scenes need it
-        """Render the images that a command will need, so that later calls of `ends` return at once.
+        """Render the images that a command will need, so that later calls of `Scene.ends` return at once.
 
         This method may be called from any thread.
 
         Args:
             command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            blender: The twin's `Blender` object, which converts the rendered images in its method `ends`.
+            blender: The twin's object of the class `Blender`. The method `Blender.ends` converts the rendered images.
         """
 
     def command(self, command: str, time_s: float) -> None:
@@ -101,8 +101,8 @@ class Scene(abc.ABC):
                 than in the previous call.
         """
         raise ValueError(
-            f"command is {command!r}, but a {type(self).__name__} does not change: use a scene with an object, such as "
-            "ObjectScene"
+            f"command is {command!r}, but this scene takes no commands, because a {type(self).__name__} does not "
+            "change: use a scene with an object, such as ObjectScene"
         )
 
     def start(self, blender: Blender) -> None:  # noqa: B027, few scenes need it
@@ -112,7 +112,7 @@ class Scene(abc.ABC):
         need the thread.
 
         Args:
-            blender: The twin's `Blender` object, which converts the rendered images in its method `ends`.
+            blender: The twin's object of the class `Blender`. The method `Blender.ends` converts the rendered images.
         """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
@@ -138,7 +138,10 @@ class Picture(Scene):
         return Seen(Phase.STILL, 0, 0, None)
 
     def ends(self, seen: Seen, blender: Blender) -> Ends:
-        """Return the constant images, see `Scene.ends`."""
+        """Return the two images that were passed to `Picture`, converted by the method `Blender.ends`.
+
+        See `Scene.ends` for the arguments. The images do not depend on `seen`.
+        """
         del seen
         if self._ends is None or self._ends[0] is not blender:
             self._ends = blender, blender.ends(*self._images)
@@ -233,7 +236,7 @@ class ObjectScene(Scene):
 
     @property
     def scenario(self) -> physics.Scenario:
-        """The scenario of the trajectories."""
+        """The scenario whose trajectories the object follows."""
         return self._scenario
 
     def outcome(self, trajectory: int) -> str:
