@@ -121,10 +121,12 @@ class Metric:
         return f"{heading} ({self.unit})" if self.unit else heading
 
     def of(self, judged: Judged) -> Statistic | None:
-        """Return a function that computes the metric of one predictor from the weights of the items, `(n,)`.
+        """Return a function that computes the metric of one predictor.
+
+        The argument of the function is the weight of each trajectory in the metric, `(n,)`.
 
         Args:
-            judged: The errors of the predictor and of the constant baseline, and the true trajectories (items).
+            judged: The errors of the predictor and of the constant baseline, and the n true trajectories.
 
         Returns:
             The function, or None if the predictor does not predict the quantity that the metric measures.

@@ -86,7 +86,8 @@ class Perturbed(Scenario):
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
         """Draw one start. The object stands with its +z up.
 
-        The condition is a random acceleration of the pad along x and y (m/s^2), and its duration (s).
+        The field `condition` of the result has three random numbers: the acceleration of the pad along x and y (m/s^2),
+        and the duration of this acceleration (s).
 
         See `Scenario.start` for the arguments.
         """
