@@ -111,13 +111,13 @@ def release(device: twin.Twin) -> None:
     """Let the object go, and wait until it is at rest.
 
     Raises:
-        AssertionError: The object still moves after `LONGEST_S`.
+        AssertionError: `LONGEST_S` after the release, the object is still moving.
     """
     device.command("release")
     until_s = device.now_s + LONGEST_S
     while device.state.phase != twin.Phase.STILL:
         if device.now_s > until_s:
-            raise AssertionError(f"the object of the twin still moves {LONGEST_S} s after its release")
+            raise AssertionError(f"{LONGEST_S} s after the command 'release', the twin's object is still moving")
         device.step(0.1)
 
 

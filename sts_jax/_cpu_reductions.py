@@ -41,7 +41,7 @@ def cumsum(counts: Array) -> Int[Array, "n"]:
 def flatnonzero(flags: Bool[Array, "n"]) -> Int[Array, "n"]:
     """Indices of the true flags in ascending order.
 
-    The result has n elements, like `flags`. The indices come first, and all remaining elements are n.
+    The result has n elements, like `flags`. The indices come first, and every element after them has the value n.
     """
     size = len(flags)
     place = jnp.where(flags, cumsum(flags) - 1, size)

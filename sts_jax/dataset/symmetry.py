@@ -1,6 +1,7 @@
 """Symmetries of the pad: mirror images and quarter turns of poses, wrenches and conditions.
 
-Symmetry s first mirrors (y becomes -y) if s >= 4, and then turns by s % 4 quarter turns about z. 0 is the identity.
+Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates about the z axis by `90 * (s % 4)` degrees.
+Symmetry 0 is the identity.
 """
 
 import math
@@ -18,8 +19,8 @@ def turn(pose: Float[Array, "*n 7"], symmetry: int) -> Float[Array, "*n 7"]:
 
     Args:
         pose: Pose of the object (its mesh frame) in the sensor frame: position (m) and quaternion (w, x, y, z).
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
-            s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates
+            about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
     """
     if symmetry >= 4:
         pose = pose * jnp.array([1.0, -1, 1, 1, -1, 1, -1])
@@ -34,8 +35,8 @@ def turn_wrench(wrench: Float[Array, "*n 6"], symmetry: int) -> Float[Array, "*n
 
     Args:
         wrench: Force (N) and moment about the sensor's origin (N m).
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
-            s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates
+            about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
     """
     if symmetry >= 4:
         wrench = wrench * jnp.array([1.0, -1, 1, -1, 1, -1])
@@ -52,8 +53,8 @@ def turn_condition(condition: Float[Array, "*n c"], symmetry: int, vectors: int 
     Args:
         condition: The numbers of each condition. Vectors (x, y) in the plane of the pad come first. They are followed
             by scalars, which do not change.
-        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates by
-            s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
+        symmetry: Number of the symmetry, 0 to 7. Symmetry s first mirrors (y becomes -y) if s >= 4, and then rotates
+            about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
         vectors: Number of vectors at the beginning of the condition.
     """
     if condition.shape[-1] == 0:

@@ -64,7 +64,8 @@ def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = N
 
     Args:
         error: Errors of the predictor for n items.
-        constant: Errors of the reference prediction for the same items. It is usually the mean training image.
+        constant: Errors of the reference prediction for the same items. The reference prediction is usually the mean
+            training image.
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
@@ -76,15 +77,15 @@ def skill(error: ImageError, constant: ImageError, weight: np.ndarray | None = N
 
 
 def mean_per_pixel(values: np.ndarray, count: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Divide the sum of an error over all items (predicted images) by the sum of their numbers of pixels.
+    """Add up the errors of all items (predicted images), and divide the sum by the total number of pixels in all items.
 
     Args:
-        values: Errors of the items, each summed over its pixels, `(n,)`.
+        values: Errors of the items, `(n,)`. The error of an item is a sum over the pixels of this item.
         count: Number of pixels of each item times the number of channels (`ImageError.pixels`), `(n,)`.
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
-        The mean, or NaN if the weighted number of pixels is 0.
+        The mean error per pixel, or NaN if the weighted number of pixels is 0.
     """
     w = np.ones(len(values)) if weight is None else weight
     total = float((w * count).sum())

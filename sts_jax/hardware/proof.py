@@ -36,8 +36,9 @@ class ProvenFrames:
     """Switches the lights of a connected sensor, and selects frames for which the state of the lights is proven.
 
     The lights are off in the visual stream and on in the tactile stream. The class stores the controller's
-    answer to the last switch of the lights, the last frame before this switch, and the number of frames that show the
-    effect of the switch. Only one thread may take images. Other threads may only call `stop`.
+    answer to the last switch of the lights, and the last frame before this switch. After the switch, the class counts
+    successive frames that show the new state of the lights, up to a count of two. Only one thread may take images.
+    Other threads may only call `stop`.
     """
 
     def __init__(
@@ -190,8 +191,9 @@ class ProvenFrames:
         """Take an image of one stream.
 
         After the frame has arrived, a request is sent to the controller. The controller's answer must confirm that the
-        lights did not change between the switch to `stream` and this request. If `then` requires a switch from the
-        visual to the tactile stream, this switch is the request. Otherwise, the request switches no lights.
+        lights did not change between the switch to `stream` and this request. If `stream` is "visual" and `then` is
+        "tactile", the request itself switches the lights on. In all other cases, the request does not change the
+        lights. If `stream` is "tactile" and `then` is "visual", a second request switches the lights off.
 
         Args:
             stream: Stream of the image, "visual" (lights off) or "tactile" (lights on).

@@ -184,8 +184,8 @@ def infer(
     if unknown or not inputs:
         raise ValueError(
             f"`inputs` has the names {list(inputs)} and `present` has the names {list(present or {})}, but both may "
-            f"only have names of the model's modalities {list(model.config.names)}: use these names, and give at least "
-            "one input"
+            f"only have names of the model's modalities {list(model.config.names)}: use only the names "
+            "of these modalities, and give at least one input"
         )
     absent = tuple(name for name in model.config.names if name not in inputs)
     batch = len(next(iter(inputs.values())))
@@ -257,12 +257,15 @@ def _check(
     if asked not in ("all", "own"):
         raise ValueError(f"`asked` is {asked!r}, but it must be 'all' or 'own'")
     if set(absent) - set(config.names):
-        raise ValueError(f"`absent` is {absent}, but the model has only the modalities {config.names}: use these names")
+        raise ValueError(
+            f"`absent` is {absent}, but the model has only the modalities {config.names}: use only "
+            "the names of these modalities"
+        )
     unknown = sorted(set(given) - set(config.names))
     if unknown:
         raise ValueError(
             f"`inputs`, `present` or `target_present` has the names {unknown}, but the model has only the modalities "
-            f"{config.names}: use these names"
+            f"{config.names}: use only the names of these modalities"
         )
     if set(targets) != set(config.names):
         raise ValueError(

@@ -40,8 +40,9 @@ def solid_moments(
 def surface_moments(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "f 10"]:
     """Compute the area moments of triangles, for shells with a mass per area.
 
-    Let a triangle have the corners r_i, the sum of corners s and the area A. Its first moments (integral of the
-    position r) are A s / 3. Its second moments (integral of r r^T) are A (s s^T + sum_i r_i r_i^T) / 12.
+    Let r_i be the corners of a triangle, let s = sum_i r_i, and let A be the area of the triangle. The first moments of
+    the triangle (integral of the position r) are A s / 3. The second moments (integral of r r^T) are
+    A (s s^T + sum_i r_i r_i^T) / 12.
 
     Args:
         triangles: Corners of the triangles (m).

@@ -98,9 +98,9 @@ def underside(
         present: False if there is no object.
 
     Returns:
-        Two height maps (m). The first contains only faces that are low enough to press on the gel. The second contains
-        all faces, because every face blocks light that falls on the skin from above. Each map is `inf` at cells
-        where it contains no face.
+        Two height maps (m). The first map contains only those faces of the object that are low enough to press on the
+        gel. The second map contains all faces of the object, because each of them blocks light that falls on the
+        gel from above. Each map is `inf` at cells where the map contains no face.
     """
     rows, columns = gel.cells
     across, down, height = (points[:, k] for k in range(3))

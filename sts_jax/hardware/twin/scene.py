@@ -49,8 +49,8 @@ class Scene(abc.ABC):
     """Base class of the scenes in front of the twin's camera.
 
     A subclass defines two methods. `at` returns the state of the scene at a given time. `ends` returns two images of
-    the scene in a given state: one with the LEDs off, and one with the LEDs at full power. A scene that can change also
-    defines `command`. The other methods are optional. `Twin` never calls `at` and `command` at the same time.
+    the scene in a given state: one with the LEDs off, and one with the LEDs at full power. A scene that takes commands
+    also defines `command`. The other methods are optional. `Twin` never calls `at` and `command` at the same time.
     """
 
     exposure: float = 1.0  # exposure of the visual stream divided by that of the tactile stream (`Room.exposure`)
@@ -72,7 +72,7 @@ class Scene(abc.ABC):
 
         Args:
             seen: State of the scene, as `at` returns it.
-            blender: The twin's object of the class `Blender`, which mixes the two images into camera frames. The method
+            blender: The twin's `Blender` instance, which mixes the two images into camera frames. The method
                 `Blender.ends` converts the rendered images to linear light, and applies lens distortion and vignetting.
 
         Returns:
@@ -86,7 +86,7 @@ class Scene(abc.ABC):
 
         Args:
             command: `hold` holds an object on the pad, `release` lets it go, and `clear` takes it away.
-            blender: The twin's object of the class `Blender`. The method `Blender.ends` converts the rendered images.
+            blender: The twin's `Blender` instance. The method `Blender.ends` converts the rendered images.
         """
 
     def command(self, command: str, time_s: float) -> None:
@@ -112,7 +112,7 @@ class Scene(abc.ABC):
         need the thread.
 
         Args:
-            blender: The twin's object of the class `Blender`. The method `Blender.ends` converts the rendered images.
+            blender: The twin's `Blender` instance. The method `Blender.ends` converts the rendered images.
         """
 
     def close(self) -> None:  # noqa: B027, few scenes need it
@@ -322,7 +322,7 @@ class ObjectScene(Scene):
         self._wake.set()
 
     def start(self, blender: Blender) -> None:
-        """Start a thread that renders the empty pad, the current trajectory and the next one in advance."""
+        """Start a thread that renders images in advance: the empty pad, the current and the next trajectory."""
         if self._thread is None:
             self._stop.clear()
             self._wake.set()
