@@ -370,8 +370,9 @@ def kill(bench: Bench, count: Count) -> None:
         _until(lambda: time.monotonic() > wait_s and lights.off_after(0.0) is None, 60)
         if process.poll() is not None or lights.off_after(0.0) is not None:
             raise RuntimeError(
-                "the reading program must be killed while a light is on, but no light turned on in time or the program "
-                f"ended early: the program's exit status is {process.poll()} (None if it still runs)"
+                "the benchmark waits until a light is on and then kills the program that reads the sensor, but no "
+                "light turned on in time, or the program ended early: the program's exit status is "
+                f"{process.poll()} (None if it still runs)"
             )
         process.send_signal(signal.SIGKILL)
         process.wait()

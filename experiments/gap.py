@@ -38,7 +38,8 @@ class Config:
     sensor: Path | None = None  # sensor file of the real images. None: the images are rectified already
     simulated_sensor: Path | None = None  # sensor file of a simulated session. None: its images are rectified already
     # how the trajectories of both folders correspond. number: those of equal number show the same object in the same
-    # poses, and the others are ignored. none: both folders show the same object and scenario, but in other poses
+    # poses, and the others are ignored. none: both folders show the same object and scenario, but the poses in the
+    # two folders differ
     match: Literal["number", "none"] = "number"
     # height and width to which the images are reduced before the comparison (pixels). None: those of the dataset,
     # or 240 x 320 for two sessions
@@ -182,8 +183,8 @@ def load(config: Config) -> tuple[Side, Side]:
     common = np.intersect1d(real.images.group, simulated.images.group)
     if not len(common):
         raise ValueError(
-            f"{config.real} and {config.simulated} have no trajectory number in common: if they show the same object "
-            "in other poses, give --match none"
+            f"{config.real} and {config.simulated} have no trajectory number in common: if both folders show the same "
+            "object, but the poses in the two folders differ, give --match none"
         )
     return real.of(common), simulated.of(common)
 

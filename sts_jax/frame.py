@@ -97,8 +97,8 @@ def sense(
         crop: If True, the images show only a window around the object, with the aspect ratio of `resolution`.
         moving_edges: If True, the derivative of the tactile image with respect to the pose includes the motion of the
             imprint's edges across pixels. This derivative serves to fit poses. Its mean over a few neighbouring pixels
-            is accurate, but its value at a single pixel may not be. If False, the derivative ignores moving edges. The
-            images are the same in both cases.
+            is accurate, but its value at a single pixel can be inaccurate. If False, the derivative ignores moving
+            edges. The images are the same in both cases.
 
     Returns:
         The images, with the pose that is drawn and the pressure on the gel.
@@ -195,8 +195,8 @@ def touch(
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
         `touch`. No error is raised if the numbers in a traced `window` or in a traced constant of the sensor are
-        invalid. The image then shows flat skin, and `window` counts as None. For an invalid constant, the image is also
-        rendered with the default values of all traced constants.
+        invalid. The image then shows flat skin, and `window` counts as None. If a constant of the sensor is invalid,
+        the default values of all traced constants are used.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.

@@ -347,7 +347,9 @@ class Predictor:
             )
         if width != 0 and shape != (*lead, width):
             given = "condition is missing" if shape is None else f"condition has shape {shape}"
-            raise ValueError(f"{given}, but {self.name} needs shape {(*lead, width)}: give numbers in SI units.")
+            raise ValueError(
+                f"{given}, but {self.name} needs shape {(*lead, width)}: give a condition of this shape, in SI units."
+            )
         if array is None:
             return None, None
         if not (jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)):

@@ -61,7 +61,7 @@ class RecordedTrajectory:
 class Entry(NamedTuple):
     """A trajectory in the result of `list_recordings`: its number, state, time and note.
 
-    The state, `standing`, is "confirmed", "unconfirmed", "incomplete" or "discarded".
+    The field `standing` holds the state of the trajectory: "confirmed", "unconfirmed", "incomplete" or "discarded".
     """
 
     number: int  # number of the trajectory in its session

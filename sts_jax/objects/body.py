@@ -133,8 +133,8 @@ def check_category(category: object) -> None:
     number = np.asarray(category)
     if number.shape or number.dtype.kind not in "iu" or not -1 <= number < len(CATEGORIES):
         raise ValueError(
-            f"category is {category!r}, but it must be from 0 to {len(CATEGORIES) - 1}, an index into "
-            "objects.CATEGORIES such as CATEGORIES.index('mouse'), or -1 for an object of no category"
+            f"category is {category!r}, but it must be -1 (an object of no category) or an index into "
+            f"objects.CATEGORIES (0 to {len(CATEGORIES) - 1}), such as CATEGORIES.index('mouse')"
         )
 
 
@@ -179,7 +179,7 @@ def _sizes(body: Body) -> str:
 
 
 def mirror(body: Body) -> Body:
-    """Mirror a body, with or without leading axes, so that y becomes -y in the mesh frame."""
+    """Mirror a body, or every body in a result of `stack`, so that y becomes -y in the mesh frame."""
     flip = jnp.array([1.0, -1, 1])
     corners = jnp.array([0, 2, 1])  # so that faces stay counter-clockwise from outside
     return dataclasses.replace(
@@ -257,11 +257,11 @@ def fill_moments(
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
     def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        """Compute the liquid below the height `level` (m) along `up`, as tetrahedra with a common reference point.
+        """Compute the liquid below the height `level` (m) along `up`, as tetrahedra with one common corner.
 
         Returns:
-            Signed volume of each tetrahedron, its other three corners relative to the reference point, the reference
-            point, and the total volume.
+            Signed volume of each tetrahedron, vectors from the common corner to the other three corners of each
+            tetrahedron, the common corner, and the volume of the liquid.
         """
         # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
         # adds the whole triangle and subtracts the piece at the corner above.

@@ -49,12 +49,13 @@ def library(
     """List the objects of a folder without opening a mesh.
 
     If the folder or one of its direct sub-folders contains ShapeNetSem's table metadata.csv, the table lists the
-    objects. Its column `unit` defines the size of an object, and the columns `up` and `front` define its orientation.
-    The column `category` defines its class, which is one of CATEGORIES, such as "bottle". The mesh of an object is
-    expected at models-OBJ/models/ID.obj with the object's id as ID, and its images in models-textures/textures.
+    objects. The table's column `unit` defines the size of an object. The columns `up` and `front` define the object's
+    orientation. The column `category` defines the object's class, which is one of CATEGORIES, such as "bottle". The
+    mesh of an object is expected at models-OBJ/models/ID.obj with the object's id as ID. The images for the mesh are
+    expected in models-textures/textures.
 
-    In any other folder, every mesh file is an object. Its class is the name of the first sub-folder of its path. The
-    class of a file directly in the folder is the name of the folder.
+    In any other folder, every mesh file is an object. The object's class is the name of the first sub-folder in the
+    path of the file. The class of a file directly in the folder is the name of the folder.
 
     Args:
         folder: Folder of the objects.

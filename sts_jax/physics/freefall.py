@@ -22,8 +22,8 @@ class Freefall(Scenario):
     fall to the pad: `(frames - 1) / rate >= sqrt(2 height / g) + 0.2 s`, with g = 9.81 m/s^2. `check` raises an error
     for shorter trajectories. By default a trajectory lasts 1.9 s. Few objects still move at its end.
 
-    Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
-    section "Data Collection".
+    The random values of each trajectory, such as the friction, are drawn uniformly from the ranges that the fields of
+    this class define. Source: the See-Through-your-Skin paper, section "Data Collection".
     """
 
     symmetries = tuple(range(8))

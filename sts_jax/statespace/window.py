@@ -89,7 +89,8 @@ def cut(images: Float[Array, "n size size c"], window: Window, side: int) -> Flo
         side: Side of the results (pixels).
 
     Returns:
-        Images of the windows. The column index increases along the long axis of the silhouette.
+        Images of the windows. `locate` aligns each window with the silhouette of the object. The column index
+        increases along the long axis of this silhouette.
     """
     fine = 2 * side
     grid = (jnp.arange(fine) + 0.5) / fine - 0.5

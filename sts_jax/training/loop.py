@@ -129,8 +129,9 @@ def train(
             `Preprocessing` p. They are stored in `config.json`.
         loss: Loss that replaces the loss from `training.learner`, or None. `targets` and `absent` are not passed to the
             given loss.
-        optimiser: Optimiser that replaces Adam (the optimiser from `training.optimiser`), or None. A given optimiser
-            does not use the fields of `config` for Adam, for the learning rate and for the clipping.
+        optimiser: Optimiser that replaces Adam (the optimiser from `training.optimiser`), or None. If an
+            optimiser is given, the fields of `config` that define Adam, the learning rate and the clipping have no
+            effect.
         notes: JSON values that name the given loss and optimiser. They are stored in `config.json`. A resumed training
             must have the same notes, because the functions themselves cannot be compared.
         progress: Function that is called after every step with the number of steps done, the number of all steps,

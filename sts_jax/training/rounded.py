@@ -21,8 +21,8 @@ def write(path: Path, arrays: dict[str, ArrayLike]) -> None:
     """Write arrays to a compressed file. float32 arrays with two or more axes are rounded, all others are unchanged.
 
     The rounded values are multiples of a step. Values with the same index on the last axis (one output channel of a
-    kernel) have the same step. The step is the root mean square of the values divided by 128, or the largest
-    magnitude of the values divided by 32767 if this is larger.
+    kernel) have the same step. The step is the larger of r / 128 and m / 32767, where r is the root mean
+    square and m is the largest magnitude of these values.
 
     Args:
         path: File to write, with the suffix `.npz`.
