@@ -59,8 +59,8 @@ class Sensor:
           objects are drawn. All objects that press on the gel are therefore drawn.
         - `gel.max_depth`, the largest depth of the imprint, is at most `gel.thickness`.
         - Every light has one row in `colors` and one in `directions` or `positions`. No direction is zero.
-        - No internal light lies outside the skin, which is opaque: z <= 0 in every row of `directions` (`Lights`) or
-          `positions` (`Leds`).
+        - Every internal light is on the camera's side of the opaque skin. This means z <= 0 in every row of
+          `directions` (`Lights`) or `positions` (`Leds`).
         - LEDs do not lie in the gel. They may lie beside the gel, where their light enters through its edges. They may
           also lie behind the pinhole, because the camera casts no shadow.
 

@@ -179,7 +179,7 @@ def symmetries_of(collection: Collection) -> tuple[int, ...]:
 
     Returns:
         Numbers of the symmetries, from 0 to 7. Symmetry s first mirrors the object (y becomes -y) if s >= 4. It then
-        rotates the object by s % 4 quarter turns about the z axis. Symmetry 0 is the identity.
+        rotates the object about the z axis by `90 * (s % 4)` degrees. Symmetry 0 is the identity.
     """
     return collection.scenario.symmetries if collection.symmetries else (0,)
 

@@ -104,7 +104,7 @@ class Grabber:
     def lock_settings(self, timeout_s: float) -> list[str]:
         """Turn off the automatic control of exposure, white balance and focus, and keep the current values.
 
-        The settings are locked when the next frame has arrived. Then all frames in the queue are discarded.
+        The method waits for the next frame, locks the settings, and then discards all frames in the queue.
 
         Args:
             timeout_s: Longest wait for the next frame (s).
@@ -124,7 +124,7 @@ class Grabber:
             return list(self.refused)
 
     def set_exposure(self, value: float, timeout_s: float) -> float | None:
-        """Set the exposure when the next frame has arrived.
+        """Wait for the next frame, then set the exposure.
 
         Args:
             value: Exposure in the driver's unit (V4L2: 0.1 ms).
@@ -150,7 +150,10 @@ class Grabber:
 
     @property
     def held(self) -> dict[str, float]:
-        """The fixed settings of the device, such as {"exposure": 200.0}, by their field names in `CameraConfig`."""
+        """The settings that are locked to a value, such as {"exposure": 200.0}.
+
+        The keys are field names of `CameraConfig`.
+        """
         with self._changed:
             return dict(self._held)
 

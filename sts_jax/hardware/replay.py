@@ -244,9 +244,10 @@ class Replay:
         """Iterate over the images in the order of the recording.
 
         Args:
-            duty: Share of tactile images, 0 to 1. `duty` and `dwell` determine the stream of each returned image, as
-                in `STS.stream`. Recorded images of the other stream are skipped. None: return all recorded images.
-            dwell: Number of successive images of the same stream, >= 1. It has no effect if `duty` is None.
+            duty: Share of tactile images, 0 to 1. `duty` and `dwell` determine whether the next returned image is
+                visual or tactile, as in `STS.stream`. Recorded images of the other kind are skipped. None: return all
+                recorded images.
+            dwell: Number of successive images of the same kind, >= 1. It has no effect if `duty` is None.
 
         Returns:
             An iterator of images. Each step waits until its image is available. At the end of the recording, it raises
@@ -255,7 +256,7 @@ class Replay:
         Raises:
             ValueError: An argument is out of range.
             CameraNotConnectedError: The replay is not connected.
-            CameraError: The recording has images of one stream only, but `duty` requires the other stream.
+            CameraError: The recording has only visual or only tactile images, but `duty` requires the other kind.
         """
         self._opened()
         if duty is None:

@@ -65,9 +65,9 @@ class Background:
 
 @dataclasses.dataclass(frozen=True)
 class Device:
-    """The description of a real sensor, which `python -m experiments.commission` measures and stores in a sensor file.
+    """The description of a real sensor: the camera, the LED controller, the lens and the measured settings.
 
-    It describes the camera, the LED controller, the lens and the measured settings.
+    `python -m experiments.commission` measures the sensor and stores the description in a sensor file.
 
     Raises:
         ValueError: A field is out of range.

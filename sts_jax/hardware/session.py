@@ -39,10 +39,10 @@ class Origin:
 
     @classmethod
     def of(cls, sensor: STS) -> "Origin":
-        """Return the origin of a sensor.
+        """Return the identity of a sensor: the camera, the LED controller, the image size and the LED duty cycles.
 
         Args:
-            sensor: Connected sensor. The size of the images is read from one of its frames.
+            sensor: Connected sensor. The method reads one frame to find the image size.
 
         Raises:
             CameraError: The camera sends no frame.
@@ -245,7 +245,7 @@ class Session:
         self._add(_Job(f"the confirmation of trajectory {number}", write, number))
 
     def discard(self, number: int) -> None:
-        """Move a trajectory to the folder `discarded` in the background. Nothing is deleted.
+        """Move a trajectory to the folder `discarded`, in a background thread. Nothing is deleted.
 
         Args:
             number: Number of the trajectory. If no image pair of this trajectory was saved, nothing happens.

@@ -193,9 +193,10 @@ def housing(
 ) -> Float[Array, "*n"]:
     """Compute the brightness of the sensor's housing, which the camera sees beside the pad.
 
-    The housing has a dark wall at each edge of the pad, perpendicular to the skin, on the side of the camera. A camera
-    ray that passes beside the pad ends at a wall. The brightness of a wall decreases with the distance t from the skin:
-    `rim exp(-t / rim_depth)`. `rim` and `rim_depth` (m) are constants of the room.
+    The housing has a dark wall at each edge of the pad. Each wall is perpendicular to the gel's outer face and extends
+    towards the camera. A camera ray that passes beside the pad ends at a wall. The brightness of a wall decreases with
+    the distance t from the plane of the gel's outer face: `rim exp(-t / rim_depth)`. `rim` and `rim_depth` (m) are
+    constants of the room.
 
     Args:
         room: Constants of the external light.

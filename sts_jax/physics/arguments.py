@@ -13,7 +13,7 @@ from sts_jax.sensor import Sensor
 
 
 def listed(body: Any) -> list[Any]:
-    """Return one body or a sequence of bodies as a list. The items are not checked."""
+    """Convert one body, or a sequence of bodies, to a list. The items are not checked."""
     return list(body) if isinstance(body, Sequence) and not isinstance(body, str) else [body]
 
 
@@ -69,8 +69,8 @@ def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
     other = sorted(set(outcome.tolist()) - set(known))
     if other:
         raise ValueError(
-            f"scenario.outcome returns {other[0]}, but the numbers of scenario.outcomes are {known}: add an outcome "
-            f"with the number {other[0]}"
+            f"scenario.outcome returns {other[0]}, but the members of scenario.outcomes have the values {known}: "
+            f"add a member with the value {other[0]}"
         )
 
 

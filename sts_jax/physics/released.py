@@ -150,10 +150,10 @@ class Released(Scenario):
         - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
-        `start` places an object on an edge between two of its faces. The object is usually tilted by less than 45
-        degrees from its pose on the narrower face. If the two faces meet at a right angle, the object turns by more
-        than 45 degrees to reach the wider face. An object that has turned by less than 45 degrees has therefore
-        returned to the narrower face.
+        `start` places an object on an edge between two of its faces. An object that stands on the narrower face has a
+        tilt of 0. On the edge, the tilt is usually less than 45 degrees. If the two faces meet at a right angle, the
+        object turns by more than 45 degrees to reach the wider face. An object that has turned by less than 45 degrees
+        has therefore returned to the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

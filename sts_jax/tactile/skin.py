@@ -230,7 +230,7 @@ def phong(
         lights: Far lights (`Lights`) or near lights (`Leds`). Directions of far lights may have any length > 0.
         normals: Unit normals towards the camera.
         points: Points of the skin in the sensor frame (m). Only near lights use them.
-        shares: Share of each light that reaches each point, from `shadows`. None for no shadows.
+        shares: Share of each light that reaches each point, as returned by the function `shadows`. None for no shadows.
 
     Returns:
         Image of the skin, not clipped.

@@ -104,7 +104,7 @@ class CameraThread:
 class WebServer(http.server.ThreadingHTTPServer):
     """The HTTP server of a twin.
 
-    The server sends the camera stream and the twin's state. It receives commands and requests to simulate faults.
+    The server sends the camera stream and the twin's state. A client can send a command, or request a simulated fault.
     """
 
     daemon_threads = False  # `server_close` waits for the threads of all connections
