@@ -67,9 +67,9 @@ def image_summary(
     prediction.
 
     Args:
-        predictions: Dictionary from the name of each predictor to its predictions of the last images in `test`. The
-            dictionary must contain the predictors of `image_baselines`. A stream that a predictor does not predict is
-            None.
+        predictions: Dictionary from the name of each predictor to its predictions of the last image of each trajectory.
+            The dictionary must contain the predictors of `image_baselines`. A stream that a predictor does not predict
+            is None.
         test: The held-out trajectories.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.

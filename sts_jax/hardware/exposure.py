@@ -45,8 +45,8 @@ def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
     percentile of these values. The search also stops if the driver does not change the exposure any more.
 
     Args:
-        camera: Connected camera whose driver can set the exposure. Before the call, switch the sensor's lights on to
-            choose the exposure of the tactile stream, or off to choose that of the visual stream.
+        camera: Connected camera whose driver can set the exposure. Before the call, switch the sensor's lights on
+            for the exposure of the tactile stream, or off for the exposure of the visual stream.
         longest: Largest allowed exposure, in the unit of the driver. An exposure that is longer than the time between
             two frames lowers the frame rate.
 

@@ -140,7 +140,8 @@ def _group(name: str) -> str:
 def users_of(name: str) -> list[str]:
     """Return the processes that have opened a device, as texts such as "process 123 (python)".
 
-    Only processes whose open files this user can read are listed. The list is empty on other systems than Linux.
+    The list contains only processes whose open files the current user is allowed to see. On other systems than
+    Linux, the list is empty.
 
     Args:
         name: Path of the device, such as `/dev/ttyACM0`.

@@ -208,7 +208,7 @@ class STS:
 
     @property
     def settling(self) -> Settling:
-        """The settling times: how long frames are discarded after the lights are switched off or on.
+        """The settling times, for which frames are discarded after the lights are switched off or on.
 
         Raises:
             CameraNotConnectedError: No settling times were given, and `connect` has not measured them yet.

@@ -70,7 +70,8 @@ def step(
         optimiser: Optimiser that made `state` (default: the optimiser from `training.optimiser`).
 
     Returns:
-        The state after the step, with the same structure and dtypes, and the parts of the loss before the step.
+        Two values, the new state and the parts of the loss. The new state has the structure and the dtypes of `state`.
+        The loss is computed with the parameters before the step.
 
     Raises:
         ValueError: The loss function returns no part with the name `loss`.
