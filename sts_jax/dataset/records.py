@@ -162,7 +162,9 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def write_images(path: Path, frames: Iterable[tuple[np.ndarray, ...]]) -> None:
-    """Write images to an array_record file, one record per frame. The file is written as a whole or not at all.
+    """Write images to an array_record file, as a whole or not at all.
+
+    A record of the file contains the images of one frame, one image of each kind.
 
     Args:
         path: The file.

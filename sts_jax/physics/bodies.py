@@ -50,7 +50,7 @@ def check_bodies(bodies: Sequence[Any]) -> None:
             raise BodyError(
                 i,
                 f"hulls has shape {body.hulls.shape}, but it must be (p, n, 3) with p = {parts} convex parts of "
-                f"n = {points} points: make the body with objects.make or objects.load, and pass several bodies as a "
+                f"n = {points} points: make the body with objects.make or objects.load. For several bodies, pass a "
                 "sequence",
             )
         if not np.isfinite(body.hulls).all():
