@@ -143,8 +143,8 @@ def save(path: str | os.PathLike[str], thing: Frame | Body | Trajectory | ArrayL
     elif path.suffix.lower() == ".npz":
         if not isinstance(thing, tuple(_KINDS.values())):
             raise TypeError(
-                f"`thing` has the type {type(thing).__name__}, but only objects of the types {', '.join(_KINDS)} can "
-                "be written to an .npz file. Write an image to a .png file, and other arrays with np.savez"
+                f"`thing` has the type {type(thing).__name__}, but `save` can write only objects of the types "
+                f"{', '.join(_KINDS)} to an .npz file. Write an image to a .png file, and other arrays with np.savez"
             )
         leaves, _ = jax.tree_util.tree_flatten_with_path(thing)
         arrays = {jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf) for key, leaf in leaves}

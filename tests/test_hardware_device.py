@@ -311,7 +311,7 @@ def test_an_error_in_the_thread_reaches_the_caller(peer):
 
 def test_wait_until_still(peer, sensor):
     peer.camera.numbered, peer.camera.moving = False, True
-    with pytest.raises(hardware.NotStillError, match=r"no period of 0\.3 s without movement within 0\.8 s"):
+    with pytest.raises(hardware.NotStillError, match=r"within 0\.8 s, there was no period of 0\.3 s without movement"):
         sensor.wait_until_still(0.8, window_s=0.3)
     threading.Timer(0.4, lambda: setattr(peer.camera, "moving", False)).start()
     shot = sensor.wait_until_still(20, window_s=0.3)

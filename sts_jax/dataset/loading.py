@@ -48,7 +48,10 @@ class Ends(NamedTuple):
 
 
 class Views(NamedTuple):
-    """m views, in memory. A view is a visual image of an object in a random initial pose, without a trajectory."""
+    """The m views of a dataset, in memory.
+
+    A view is a visual image of an object in a random initial pose, without a trajectory.
+    """
 
     visual: np.ndarray  # uint8 (m, height, width, 3): images of the visual stream
     pose: np.ndarray  # float32 (m, 7): mesh frame in the sensor frame, position (m) and quaternion

@@ -43,8 +43,8 @@ def shares(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarray:
     """Estimate the probabilities of outcomes from samples.
 
     Each item has k samples, and there are c possible outcomes. The probability of an outcome is
-    `(count + 1 / c) / (k + 1)`, where `count` is the number of the item's samples with this outcome. No probability is
-    therefore 0.
+    `(count + 1 / c) / (k + 1)`, where `count` is the number of the item's samples with this outcome. All
+    probabilities are therefore above 0.
 
     Args:
         outcome: Outcomes of k samples for each of n items, int `(k, n)`. Each is the value of a member of `outcomes`.

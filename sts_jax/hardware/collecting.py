@@ -88,7 +88,7 @@ class AutomaticPerson:
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store the stage of the view. The result of `action` depends on this stage."""
+        """Store `view.stage`, on which the result of `action` depends."""
         self._stage = view.stage
 
     def action(self) -> Action | None:

@@ -93,7 +93,8 @@ class ProvenFrames:
     def measure_settling(self, switches: int, watch_s: float) -> Settling:
         """Measure the settling times, and use them from now on.
 
-        A settling time is the time after a switch of the lights during which frames may still show the former lights.
+        After the lights are switched on or off, frames may still show their previous state for a short time. This time
+        is the settling time.
 
         Args:
             switches: Number of switches of the lights in each direction, off to on and on to off.

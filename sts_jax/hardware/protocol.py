@@ -79,7 +79,7 @@ class Ping:
 class Watch:
     """Request to set the watchdog's period. The reply is a `Watching` message.
 
-    The watchdog turns the lights off if the controller receives no request for this period.
+    The watchdog turns the lights off if the controller receives no request during this period.
     """
 
     sequence: int

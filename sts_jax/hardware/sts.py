@@ -59,7 +59,8 @@ class STS:
       changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
     - It is not identical to the frame before. Identical frames are allowed if `CameraConfig.frozen_after_s` is None.
-    - It is not black. Black frames are allowed if the last image of the same stream was black, or if there was none.
+    - It is not black. Black frames are allowed if the last image of the same stream was black, or if this
+      is the first image of the stream.
 
     All other frames are discarded. Only one thread may use a sensor at a time.
     """
@@ -220,7 +221,8 @@ class STS:
     def connect(self, warmup_s: float = 1.0) -> "STS":
         """Open the camera and the LED controller, and measure the settling times unless they were given.
 
-        A settling time is the time after a switch of the lights during which frames may still show the former lights.
+        After the lights are switched on or off, frames may still show their previous state for a short time. This time
+        is the settling time.
         Even if the settling times were given, the lights are switched on and off. This provides one image of each
         stream, with which later images are compared.
 
@@ -518,9 +520,9 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"there was no period of {window_s:g} s without movement within {timeout_s:g} s. The last image and an image "
-        f"before it differ by up to {change:.0f} of 255 in one block (allowed: at most {allowed:.0f}). Keep the scene "
-        "at rest, raise timeout_s, or check whether the light of the room changes."
+        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The block that changed most "
+        f"differs by {change:.0f} of 255 between the last image and an earlier one (allowed: at most {allowed:.0f}). "
+        "Keep the scene at rest, raise timeout_s, or check whether the light of the room changes."
     )
 
 

@@ -19,8 +19,8 @@ def held_wrench(gel: tactile.Gel, body: Body, pose: Float[np.ndarray, "7"], forc
     The hand balances all moments, so the object keeps its orientation. The object sinks until the pressure of the gel
     carries `force`. The pressure in a cell of the gel's grid is `p = k max(0, d - h)`. Here k is `gel.stiffness`, d is
     the depth of the object's lowest point, and h is the height of the object's underside above this point. The moment
-    follows from the pressures of all cells. If `sense` receives `pose` and the returned wrench, the object sinks to the
-    same depth d.
+    follows from the pressures of all cells. The function `sts_jax.sense`, called with `pose` and
+    the returned wrench, finds the same depth d.
 
     A sharp corner would sink deeper than the gel allows (`Gel.max_depth`). The object then stops just before this
     depth, and the returned force is smaller than `force`.

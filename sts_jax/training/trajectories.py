@@ -53,7 +53,7 @@ def image_arrays(
         visual: First and last visual image of each trajectory, for example from `hardware.recorded_images`.
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
-        preprocessing: Preprocessing with the test that finds contacts in tactile images, see `touch_of_noisy_images`.
+        preprocessing: Preprocessing that detects contacts in tactile images, as in `touch_of_noisy_images`.
             If the first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
             `tactile`.
         blank: Tactile image of the empty sensor.

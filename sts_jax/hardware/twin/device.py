@@ -343,7 +343,7 @@ class Twin:
         """
         if self._clock is not None:
             raise RuntimeError(
-                "`step`, `capture`, `set` and `ping` need a twin on its virtual clock, but this twin is served on the "
+                "`step`, `capture`, `set` and `ping` need a twin on its virtual clock, but this twin runs on the "
                 "real clock: read its images through hardware.STS, or make a new Twin"
             )
         if not 0 <= seconds < math.inf:

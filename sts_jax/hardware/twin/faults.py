@@ -56,7 +56,7 @@ class Queue:
         self._waiting: list[Fault] = []
 
     def add(self, fault: Fault) -> None:
-        """Append a fault `fault.count` times."""
+        """Append a fault to the queue. `fault.count` is the number of copies that are appended."""
         self._waiting += [fault] * fault.count
 
     def take(self, *kinds: str) -> Fault | None:
