@@ -108,7 +108,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
         missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(
-                f"{table}: the table lacks the columns {', '.join(missing)} of ShapeNetSem: download it again"
+                f"{table}: the table lacks the columns {', '.join(missing)} of ShapeNetSem: download the table again"
             )
         try:
             rows = list(reader)
@@ -116,7 +116,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
             raise ValueError(f"{table}: the file cannot be read as a table ({error}): download it again") from error
         if not any("rest" in row for row in rows):
             return rows
-    raise ValueError(f"{table}: some rows of the table have more cells than the header has columns: download it again")
+    raise ValueError(f"{table}: some rows have more cells than the header has columns: download the table again")
 
 
 def _item(row: dict[str, str], path: Path, name: str, label: str, images: Path | None) -> Item:
