@@ -48,7 +48,7 @@ class Ends(NamedTuple):
 
 
 class Views(NamedTuple):
-    """The m views of a dataset, in memory.
+    """Views of a dataset, in memory. The number of views is m.
 
     A view is a visual image of an object in a random initial pose, without a trajectory.
     """

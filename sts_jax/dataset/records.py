@@ -120,7 +120,10 @@ def read_shard(path: Path, identity: Identity) -> dict[str, np.ndarray]:
     """
     small = path.with_suffix(".npz")
     arrays = read_arrays(small)
-    again = f"delete {small.name} and {path.name}, and start the collection again, which makes only the missing shards"
+    again = (
+        f"delete {small.name} and {path.name}, then start the collection again. The collection makes only the missing "
+        "shards"
+    )
     names = {f"identity/{name}" for name in (*Identity._fields, "images")}
     lacking = sorted((names | ARRAYS) - set(arrays))
     if lacking:
@@ -208,8 +211,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # np.load raises errors of five types for damaged files
         raise DamagedFileError(
-            f"{path} is damaged ({error}): delete it, and start the collection again, which makes only the missing "
-            "shards."
+            f"{path} is damaged ({error}): delete the file, then start the collection again. The collection makes only "
+            "the missing shards."
         ) from error
 
 
@@ -265,8 +268,8 @@ def _read_records(path: Path, indices: np.ndarray, total: int) -> np.ndarray:
     if not path.is_file():
         raise _missing(path)
     again = (
-        f"delete it and {path.with_suffix('.npz').name}, and start the collection again, which makes only the missing "
-        "shards"
+        f"delete {path.name} and {path.with_suffix('.npz').name}, then start the collection again. The collection "
+        "makes only the missing shards"
     )
     try:
         reader = ArrayRecordReader(str(path))

@@ -61,7 +61,7 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
     """Compute the frequencies of the outcomes among training trajectories.
 
     There are n trajectories and c possible outcomes. The frequency of an outcome is `(count + 1 / c) / (n + 1)`, where
-    `count` is the number of trajectories with this outcome. No frequency is therefore 0.
+    `count` is the number of trajectories with this outcome. All frequencies are therefore above 0.
 
     Args:
         outcome: Outcome of each trajectory, the value of a member of `outcomes`, int `(n,)`.

@@ -88,7 +88,7 @@ class AutomaticPerson:
         self._stage = Stage.CLEAR
 
     def show(self, view: View) -> None:
-        """Store `view.stage`, on which the result of `action` depends."""
+        """Store `view.stage`, the current stage of the guide. The result of `action` depends on this stage."""
         self._stage = view.stage
 
     def action(self) -> Action | None:

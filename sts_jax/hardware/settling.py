@@ -135,8 +135,8 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
     The `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if its
     `light_share` differs by at most 0.02 from the `light_share` of the last frame in the same `Switch`. The delay of a
     frame is its time of arrival after the controller's acknowledgement. The settling time is the largest delay of a
-    frame that is not settled, plus one period of the camera. The period is added because later switches of
-    the lights can occur at other moments of the camera's exposure.
+    frame that is not settled, plus one period of the camera. The period is added because the measured switches do not
+    cover every moment of the camera's exposure at which a switch can occur.
 
     Args:
         on: Switches from off to on. The scene must be at rest.

@@ -53,14 +53,14 @@ class STS:
     lights were in the right state during the whole exposure. A frame of the camera must meet all of these conditions:
 
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
-      lights. Earlier frames may show the former lights.
+      lights. Earlier frames may show the previous state of the lights.
     - Two successive frames since the switch have shown the effect of the new lights.
     - After the frame arrived, the controller answered the next request. This answer shows that the lights have not
       changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
     - It is not identical to the frame before. Identical frames are allowed if `CameraConfig.frozen_after_s` is None.
-    - It is not black. Black frames are allowed if the last image of the same stream was black, or if this
-      is the first image of the stream.
+    - It is not black. Black frames are allowed if the last image of the same stream was black, or if no
+      image of this stream has been returned since `connect`.
 
     All other frames are discarded. Only one thread may use a sensor at a time.
     """
@@ -221,10 +221,9 @@ class STS:
     def connect(self, warmup_s: float = 1.0) -> "STS":
         """Open the camera and the LED controller, and measure the settling times unless they were given.
 
-        After the lights are switched on or off, frames may still show their previous state for a short time. This time
-        is the settling time.
-        Even if the settling times were given, the lights are switched on and off. This provides one image of each
-        stream, with which later images are compared.
+        After the lights are switched on or off, frames may still show the previous state of the lights for a short
+        time. This time is the settling time. Even if the settling times were given, `connect` switches the lights on
+        and off. This provides one image of each stream, with which later images are compared.
 
         Args:
             warmup_s: Time for the camera's automatic exposure and white balance to settle before they are locked (s).
@@ -390,7 +389,7 @@ class STS:
             The last image of the period in which the view was still.
 
         Raises:
-            NotStillError: There was no period of `window_s` without movement within `timeout_s`.
+            NotStillError: Within `timeout_s`, there was no period of `window_s` without movement.
             LightError, LedError, CameraError: The causes are those of `read`.
         """
         self._stop_background()
@@ -400,9 +399,10 @@ class STS:
         """Measure the settling times, and use them from now on. The scene must be at rest.
 
         The lights are switched several times in each direction, and the frames after each switch are compared. The
-        first frames may still show the former lights, fully or partly. The delay of a frame is the time from the
-        controller's acknowledgement of the switch to the arrival of the frame. The settling time is the largest delay
-        of all frames that still show the former lights fully or partly, plus the time between two frames.
+        first frames may still show the previous state of the lights, fully or partly. The delay of a frame is the time
+        from the controller's acknowledgement of the switch to the arrival of the frame. The settling time is the
+        largest delay of all frames that still show the previous state fully or partly, plus the time between two
+        frames.
 
         Args:
             switches: Number of switches of the lights in each direction, off to on and on to off.
@@ -503,7 +503,7 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         window_s: Time during which the view must not change (s).
 
     Raises:
-        NotStillError: There was no period of `window_s` without movement within `timeout_s`, or there are no more
+        NotStillError: Within `timeout_s`, there was no period of `window_s` without movement, or there are no more
             images.
     """
     started_s: float | None = None

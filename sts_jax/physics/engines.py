@@ -162,8 +162,9 @@ def in_mjx(setup: Setup, starts: Start, hidden: Hidden, chunk: int) -> Run:
         chunk: Largest number of trajectories in a call of the returned function.
 
     Returns:
-        Function that takes the indices of at most `chunk` trajectories and returns their results. In one call, the
-            hulls of all bodies must have arrays of the same shapes.
+        Function that takes the indices of at most `chunk` trajectories and returns their results. Within one call,
+            the bodies of these trajectories must have hulls whose arrays have the same shapes. The shapes may differ
+            between calls.
 
     Raises:
         BodyError: The mass properties or the friction of a body are out of range.

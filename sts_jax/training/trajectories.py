@@ -24,15 +24,15 @@ def frame_arrays(
     Args:
         pairs: First and last frames of trajectories, from `dataset.Dataset.pairs`.
         modalities: Modalities of the model, one or more of `visual`, `tactile` and `pose`.
-        preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images. If the
+        preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images. If the
             first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
             `tactile`.
         blank: Tactile image of the empty sensor, uint8 `(height, width, 3)`, from `dataset.empty_frame`.
 
     Returns:
-        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that no sample
-        has as an input. If `tactile` is a modality and no first frame shows a contact, `absent` is `("tactile",)`, and
-        the arrays have no input `tactile`. Otherwise `absent` is empty.
+        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that are
+        missing from the inputs of every sample. If `tactile` is a modality and no first frame shows a contact, `absent`
+        is `("tactile",)`, and the arrays have no input `tactile`. Otherwise `absent` is empty.
     """
     code = np.asarray(preprocessing.encode_pose(jnp.asarray(pairs.pose)))
     found = {"visual": pairs.visual, "tactile": pairs.tactile, "pose": code}
@@ -53,15 +53,15 @@ def image_arrays(
         visual: First and last visual image of each trajectory, for example from `hardware.recorded_images`.
         tactile: First and last tactile image of each trajectory.
         modalities: Modalities of the model, one or both of `visual` and `tactile`.
-        preprocessing: Preprocessing that detects contacts in tactile images, as in `touch_of_noisy_images`.
-            If the first tactile image of a trajectory shows no contact, the trajectory gives a sample without the input
-            `tactile`.
+        preprocessing: Preprocessing that detects contacts in tactile images. For images of a real camera, use the
+            result of `touch_of_noisy_images`. If the first tactile image of a trajectory shows no contact, the
+            trajectory gives a sample without the input `tactile`.
         blank: Tactile image of the empty sensor.
 
     Returns:
-        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that no sample
-        has as an input. If `tactile` is a modality and no first image shows a contact, `absent` is `("tactile",)`, and
-        the arrays have no input `tactile`. Otherwise `absent` is empty.
+        The arrays, and the preprocessing with a new value of `absent`. This field names the modalities that are
+        missing from the inputs of every sample. If `tactile` is a modality and no first image shows a contact, `absent`
+        is `("tactile",)`, and the arrays have no input `tactile`. Otherwise `absent` is empty.
 
     Raises:
         ValueError: `modalities` is empty or has a name other than `visual` and `tactile`, or the images are not uint8
@@ -134,7 +134,7 @@ def state_arrays(
             `model.input_size` pixels on each side.
         model: Configuration of the model, from `state_model`.
         scenario: Scenario of the trajectories.
-        preprocessing: Encoding of poses and conditions, and the test that finds contacts in tactile images.
+        preprocessing: Preprocessing that encodes poses and conditions, and detects contacts in tactile images.
         empty: `visual` and `tactile` image of the empty sensor, from `dataset.empty_frame`, uint8 `(size, size, 3)`.
             The size is `model.input_size`.
         views: Rendered visual images of objects in initial poses, from `dataset.Dataset.views`. The motion of these
@@ -241,9 +241,9 @@ def state_model(
         image_size: Side length of the predicted images (pixels). It must divide the side length of the input images.
 
     Returns:
-        The configuration, and the preprocessing with a new value of `absent`. This field names the modalities that no
-        sample has as an input. If no first frame shows a contact, `tactile` is not an input of the model, and `absent`
-        is `("tactile",)`. Otherwise `absent` is empty.
+        The configuration, and the preprocessing with a new value of `absent`. This field names the modalities that are
+        missing from the inputs of every sample. If no first frame shows a contact, `tactile` is not an input of the
+        model, and `absent` is `("tactile",)`. Otherwise `absent` is empty.
 
     Raises:
         ValueError: The images are not square or are cropped, or their side length is not a multiple of `image_size`.
