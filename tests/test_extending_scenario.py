@@ -128,7 +128,10 @@ def test_a_bottle_that_is_pushed_hard_goes_farther(page):
             {"quantities": (physics.Quantity("a", "s", 1.0), physics.Quantity("b", "m", 1.0, vector=True))},
             "scenario.quantities has the order a, b, but vectors must come before scalars: move the vectors",
         ),
-        ({"outcomes": (physics.Outcome.FELL_OFF,)}, r"scenario\.outcome returns 10\d, but the numbers .* are \[1\]"),
+        (
+            {"outcomes": (physics.Outcome.FELL_OFF,)},
+            r"scenario\.outcome returns 10\d, but the members .* have the values \[1\]",
+        ),
     ],
 )
 def test_mistakes_in_a_scenario_are_named(page, changes, match):

@@ -97,7 +97,7 @@ def test_other_types_than_arrays_of_numbers_raise_an_error():
     cases = [
         (
             lambda: sense(SENSOR, BODY, sts.physics.rest.Placement(POSE, WRENCH)),
-            r"pose is a Placement, .* with \*, such as",
+            r"pose is a Placement, .* with \*, as in",
         ),
         (lambda: sense(SENSOR, BODY, None), r"pose is None, but it must be an array of shape \(7,\)"),
         (lambda: sense(SENSOR, BODY, POSE, "heavy"), r"wrench is 'heavy', but it must be an array of shape \(6,\)"),

@@ -45,7 +45,7 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
 
 
 def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
-    """The certainty of each object's rotation: 0 if the rotation is unknown, 0.8 to 1 if the rotation is known exactly.
+    """The certainty of each object's rotation, from 0 (unknown) to a value between 0.8 and 1 (known exactly).
 
     The columns of a rotation matrix are the mesh axes, which have a length of 1. If the rotation is uncertain, the
     mean of its possible matrices has shorter columns. The certainty is the length of the longest projection of a column
