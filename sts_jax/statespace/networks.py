@@ -29,7 +29,7 @@ INPUTS = (*IMAGES, "pose")  # names of all inputs that a model can have
 UNKNOWN_LOG_VAR = 30.0  # log variance of numbers that an input does not determine: their precision is almost 0
 _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
-_CONTRAST = 20.0  # factor of the logits in an image with sharp outlines
+_CONTRAST = 40.0  # factor of the logits in an image with sharp outlines
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
 # from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH.
