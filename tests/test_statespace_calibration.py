@@ -176,6 +176,7 @@ def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
     np.testing.assert_array_equal(copy.model.calibration.variance, 4)
 
 
+@pytest.mark.slow
 def test_same_trajectories_are_not_fitted_again(calibrated, monkeypatch):
     written = (calibrated / "calibration.json").read_bytes()
     monkeypatch.setattr(statespace, "fit_calibration", None)  # a call would fail
@@ -185,6 +186,7 @@ def test_same_trajectories_are_not_fitted_again(calibrated, monkeypatch):
         training.calibrate(calibrated, arrays(condition=np.ones((NUMBER, 3), np.float32)))
 
 
+@pytest.mark.slow
 def test_calibration_of_another_model_is_not_used(calibrated, tmp_path):
     state_model(mask_blank_touch=False).save(tmp_path / "other")
     shutil.copy(calibrated / "calibration.json", tmp_path / "other")
@@ -192,6 +194,7 @@ def test_calibration_of_another_model_is_not_used(calibrated, tmp_path):
     assert training.load(tmp_path / "other").calibration is None
 
 
+@pytest.mark.slow
 def test_damaged_calibration_is_named(calibrated):
     path = calibrated / "calibration.json"
     whole = path.read_text()

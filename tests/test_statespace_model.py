@@ -387,6 +387,7 @@ def test_views_and_falls_change_only_their_parts_of_the_loss(loss, batch, comple
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_views_have_the_weight_of_other_first_moments(loss, complete):
     """Each of three views and of the pictures that count has the same share of the squared error."""
 
