@@ -116,8 +116,8 @@ class Args:
         known = STUDIES[self.scenario].parts
         if unknown := [part for part in self.parts if part not in known]:
             raise ValueError(
-                f"each positional argument (a part of the report) must be one of {', '.join(known)} for --scenario "
-                f"{self.scenario}, got {', '.join(unknown)}"
+                "each positional argument names a part of the report, and must be one of "
+                f"{', '.join(known)} for --scenario {self.scenario}, got {', '.join(unknown)}"
             )
         unused = [f"--{name}" for name in ("objects", "again", "keep") if getattr(self, name) is not None]
         if self.soaked is not None and unused:

@@ -4,7 +4,8 @@
 
 The held-out objects of an experiment are few, so its table has wide intervals for the metrics of the outcome. This
 command draws new objects from the distribution of the experiment, and simulates and renders four trajectories of each.
-It prints metrics of the shipped model, and the share of the outcome's log loss that touch removes.
+It prints metrics of the shipped model, the share of the outcome's log loss that touch removes, and metrics of 16
+samples of each prediction, such as their sharpness.
 
 The calibration error of few trajectories is above 0 even if the probabilities are exact. The command therefore also
 draws outcomes from the model's own probabilities, and prints the calibration error for these outcomes.
@@ -29,7 +30,8 @@ EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbe
 PER_OBJECT = 4  # trajectories of each object
 REFERENCE = 0.2  # share of the objects that define the constant baseline and the frequencies of the outcomes
 METRICS = {metric.name: metric for metric in evaluation.METRICS}
-COLUMNS = (  # without the metrics that need samples
+NUM_SAMPLES = 16  # samples of each prediction
+COLUMNS = (
     evaluation.Column("visual skill", (METRICS["visual_skill"],)),
     evaluation.Column("tactile skill", (METRICS["tactile_skill"],)),
     evaluation.Column("position on pad (mm)", (METRICS["position_on_pad"],)),
@@ -37,6 +39,12 @@ COLUMNS = (  # without the metrics that need samples
     evaluation.Column("log loss (nats)", (METRICS["outcome_log_loss"],)),
     evaluation.Column("calibration error", (METRICS["outcome_calibration_error"],)),
     evaluation.Column("ROC area of falling off", (METRICS["fell_off_auc"],)),
+)
+SAMPLE_COLUMNS = (  # columns of the table of the samples
+    evaluation.Column(f"visual skill, best of {NUM_SAMPLES}", (METRICS["visual_skill_best"],)),
+    evaluation.Column("sharpness", (METRICS["sharpness"],)),
+    evaluation.Column("energy score (mm)", (METRICS["energy"],)),
+    evaluation.Column(f"coverage of {100 * evaluation.metrics.LEVEL:g} %", (METRICS["coverage"],)),
 )
 DRAWS = 200  # number of times that outcomes are drawn from the probabilities
 
@@ -78,7 +86,7 @@ def if_calibrated(confidence: np.ndarray, *, draws: int = DRAWS, seed: int = 0) 
 
 
 def main(args: Args) -> str:
-    """Simulate the trajectories, and return the table of the metrics.
+    """Simulate the trajectories, and return a table of the main metrics and a table of the metrics of the samples.
 
     Raises:
         ValueError: There are fewer than 5 objects, or the work directory has the trajectories of other options.
@@ -104,7 +112,9 @@ def main(args: Args) -> str:
     with Bar() as bar:
         for number, (given_by, subset) in enumerate(subsets.items()):
             bar("predict", number, len(subsets), given_by)
-            scores[given_by] = judge(evaluation.predict(predictor, subset, given, scenario), test)
+            scores[given_by] = judge(
+                evaluation.predict(predictor, subset, given, scenario, num_samples=NUM_SAMPLES), test
+            )
     notes = [
         f"Outcomes drawn from the model's probabilities {title}: calibration error {if_calibrated(own.confidence):.3f}."
         for title, own in scores.items()
@@ -119,7 +129,10 @@ def main(args: Args) -> str:
         )
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
     title = f"{args.model}: the shipped model on new objects (seed {args.seed})"
-    return evaluation.table(summary, title=title, notes=notes, columns=COLUMNS)
+    main_table = evaluation.table(summary, title=title, notes=notes, columns=COLUMNS)
+    title = f"{args.model}: {NUM_SAMPLES} samples of each prediction"
+    sample_table = evaluation.table(summary, title=title, rows=[*subsets], columns=SAMPLE_COLUMNS)
+    return f"{main_table}\n{sample_table}"
 
 
 if __name__ == "__main__":

@@ -194,9 +194,9 @@ def touch(
     Returns:
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
-        `touch`. No error is raised if the numbers in a traced `window` or in a traced constant of the sensor are
-        invalid. The image then shows flat skin, and `window` counts as None. If a constant of the sensor is invalid,
-        the default values of all traced constants are used.
+        `touch`. If a number in a traced `window` or in a traced constant of the sensor is invalid, no error is raised.
+        Instead, the image shows flat skin, and `window` counts as None. If a constant of the sensor is invalid, the
+        default values of all traced constants are used.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.
@@ -284,7 +284,8 @@ def _check_light(light: Any) -> None:
         raise TypeError(f"light is {light!r}, but it must be one number from 0 (visual) to 1 (tactile)")
     if jnp.ndim(light):
         raise ValueError(
-            f"light has the shape {jnp.shape(light)}, but it must be one number. For several levels use jax.vmap"
+            f"light has the shape {jnp.shape(light)}, but it must be one number. For several values of light, use "
+            "jax.vmap"
         )
     if known and not 0 <= np.asarray(light) <= 1:
         raise ValueError(f"light is {light}, but it must be from 0 (visual) to 1 (tactile)")

@@ -128,7 +128,7 @@ def predict_samples(
     shape: tuple[int, ...] = (),
     calibration: statespace.Calibration | None = None,
 ) -> Prediction:
-    """Predict with a state-space model, from samples of the final pose and of the images.
+    """Predict with a state-space model, which draws samples of the final pose and of the images.
 
     The predicted images are means over `num_samples` samples, or over 16 samples if `num_samples` is 0. The predicted
     position is the geometric median of at least 256 sampled positions. The predicted orientation is taken from one
@@ -215,7 +215,8 @@ def completed(
         names: Names of all inputs of the model.
         resolution: Height and width of the images (pixels).
         inputs: Inputs that are given, by name.
-        present: Masks that are given, by name. A given input without a mask is used for all items of the batch.
+        present: Masks that are given, by name. If an input is given without a mask, its mask is True for all items of
+            the batch.
         lead: Sizes of the leading axes of the inputs.
 
     Returns:

@@ -33,4 +33,11 @@ def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     assert "32 held-out trajectories of 8 objects" in text
     assert "| from visual and tactile |" in text
     assert "Touch removes" in text
+    samples = text.split("# released: 16 samples of each prediction")[1]
+    row = next(line for line in samples.splitlines() if line.startswith("| from all inputs |"))
+    best, sharpness, energy, coverage = (float(cell.split()[0]) for cell in row.split("|")[2:-1])
+    assert best > 0.4
+    assert 0.5 < sharpness < 1.5
+    assert 0 < energy < 100
+    assert 0 < coverage <= 1
     assert shipped.main(args) == text  # the trajectories are reused

@@ -190,7 +190,7 @@ class Dataset:
                 trajectories. `ends` accepts all of them.
 
         Raises:
-            ValueError: `part` is another name.
+            ValueError: `part` is not `train`, `validation` or `test`.
         """
         found = np.flatnonzero(np.isin(self.trajectory["body"], self._part(part)))
         return found[np.isin(found, self.rendered())] if rendered else found
@@ -233,7 +233,7 @@ class Dataset:
             The images and poses of the views. The arrays are empty if the collection has `num_views=0`.
 
         Raises:
-            ValueError: `part` is another name.
+            ValueError: `part` is not `train`, `validation` or `test`.
             FileNotFoundError: A shard is missing.
             DamagedFileError: A shard is damaged. The message names it.
         """

@@ -249,7 +249,8 @@ def read_views(path: Path, indices: np.ndarray, *, resolution: tuple[int, int], 
 
     Args:
         path: The `.array_record` file.
-        indices: Indices of the records of the views in the file, int `(n,)`. Views are stored after the frames.
+        indices: Indices of the views among all records of the file, int `(n,)`. The file contains all frames first,
+            then the views.
         resolution: Height and width of every image (pixels).
         total: Number of records (frames and views) that the file must contain.
 

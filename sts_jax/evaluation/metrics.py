@@ -255,8 +255,8 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
     Args:
         probability: Probabilities of c outcomes for n items, `(n, c)`.
         label: Index of the column of `probability` that belongs to the true outcome of each item, int `(n,)`.
-        floor: Smallest probability that is used (default: 0.001). Smaller probabilities are raised to it, so that no
-            single item dominates the mean.
+        floor: Smallest probability that is used (default: 0.001). Smaller probabilities are replaced by `floor`, so
+            that no single item dominates the mean.
 
     Returns:
         Log losses (nats), `(n,)`.
@@ -265,7 +265,7 @@ def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -
 
 
 class Reliability(NamedTuple):
-    """Comparison of the probability of the likeliest outcome with the frequency at which it is the true outcome.
+    """Comparison of the probability of the likeliest outcome with the frequency at which this outcome is true.
 
     The items (held-out trajectories) are divided into bins by this probability.
     """

@@ -64,7 +64,7 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
     `count` is the number of trajectories with this outcome. All frequencies are therefore above 0.
 
     Args:
-        outcome: Outcome of each trajectory, the value of a member of `outcomes`, int `(n,)`.
+        outcome: Outcome of each trajectory as the value of a member of `outcomes`, int `(n,)`.
         outcomes: The c outcomes of the scenario, `scenario.outcomes`.
 
     Returns:

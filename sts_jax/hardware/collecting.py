@@ -94,8 +94,8 @@ class AutomaticPerson:
     def action(self) -> Action | None:
         """Return `Action.CONFIRM` in the stage `REVIEW`, and None in every other stage.
 
-        The last call of `show` has stored the stage. In the stage `REVIEW`, a recorded trajectory is confirmed or
-        discarded.
+        The stage is that of the view that `show` received last. In the stage `REVIEW`, a recorded trajectory is
+        confirmed or discarded.
         """
         return Action.CONFIRM if self._stage is Stage.REVIEW else None
 

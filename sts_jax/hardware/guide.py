@@ -183,8 +183,8 @@ def known_pad(visual: UInt8[np.ndarray, "height width 3"], tactile: UInt8[np.nda
     """Make an `EmptyPad` from the images of the empty pad in a sensor file.
 
     `Device.background` reads these images. The noise in the result is 0, because noise cannot be measured from a single
-    image. If the noise is 0, `has_contact` uses an estimate of the noise from the image that it tests. Before each
-    trajectory, `step` measures the noise.
+    image. If the noise is 0, `has_contact` uses an estimate of the noise from the image that it tests. Later, `step`
+    measures the noise before each trajectory, and the measured value replaces the 0.
 
     Args:
         visual: Raw image of the empty pad without light, RGB.

@@ -93,8 +93,8 @@ class ProvenFrames:
     def measure_settling(self, switches: int, watch_s: float) -> Settling:
         """Measure the settling times, and use them from now on.
 
-        After the lights are switched on or off, frames may still show their previous state for a short time. This time
-        is the settling time.
+        After the lights are switched on or off, frames may still show the previous state of the lights for a short
+        time. This time is the settling time.
 
         Args:
             switches: Number of switches of the lights in each direction, off to on and on to off.
@@ -157,7 +157,7 @@ class ProvenFrames:
         slowest_s = max(found.visual_s, found.tactile_s)
         if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image still changes {slowest_s:.2f} s after a switch of the lights, but frames were collected "
+                f"the image still changes {slowest_s:.2f} s after the lights were switched, but frames were collected "
                 f"for only {watch_s:.2f} s: keep the scene at rest and lock the camera's exposure. If the lights "
                 "are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
             )
@@ -166,7 +166,8 @@ class ProvenFrames:
     def pair(self, deadline: float) -> Pair:
         """Take a visual and a tactile image. The frames of both images arrive after the start of this call.
 
-        The first image is of the stream for which the lights are already set, so a pair needs only one switch.
+        The first image is of the stream for which the lights are already set, so the lights are switched only once for
+        a pair.
 
         Args:
             deadline: Latest time on the clock `time.monotonic` (s). If the LED controller is lost during the call,

@@ -45,7 +45,7 @@ class Settling:
 class Switch:
     """The frames that arrive after the lights are switched on or off.
 
-    The last of these frames must no longer show the lights as they were before the switch.
+    There must be enough frames that the last one shows the lights fully switched.
     """
 
     delays_s: Float[np.ndarray, "n"]  # time from the acknowledgement to the arrival of each frame (s)
@@ -107,10 +107,10 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
     """Return how far the lights had been switched on or off when an image was taken: 0 means not yet, 1 means fully.
 
-    The result is the median of `(look - before) / change` over the thumbnail values that the switch of the lights
-    changes clearly. Because of the median, an object that moves in less than half of the view has no influence. A
-    change is visible if its size is at least 0.5 (of 255). A visible change is clear if its size is at least a quarter
-    of the median size of the visible changes.
+    The result is the median of `(look - before) / change` over all thumbnail values for which `change` is clear.
+    Because of the median, an object that moves in less than half of the view has no influence. A `change` is visible if
+    its size is at least 0.5 (of 255). A visible change is clear if its size is at least a quarter of the median size of
+    the visible changes.
 
     Args:
         look: Thumbnail of the image.
@@ -135,8 +135,8 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
     The `light_share` of a frame is 0 if the lights are off and 1 if they are on. A frame is settled if its
     `light_share` differs by at most 0.02 from the `light_share` of the last frame in the same `Switch`. The delay of a
     frame is its time of arrival after the controller's acknowledgement. The settling time is the largest delay of a
-    frame that is not settled, plus one period of the camera. The period is added because the measured switches do not
-    cover every moment of the camera's exposure at which a switch can occur.
+    frame that is not settled, plus one period of the camera. The period is added because a switch can occur at any time
+    within the exposure of a frame, and the measured switches occurred at only a few such times.
 
     Args:
         on: Switches from off to on. The scene must be at rest.

@@ -23,8 +23,8 @@ class NotStillError(TimeoutError):
 class Shot:
     """An image of one stream, with the times between which the lights did not change.
 
-    Between the times `before.acknowledged_s` and `until_s`, the lights did not change, and the frame arrived. The frame
-    arrived at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the lights.
+    The lights did not change between the times `before.acknowledged_s` and `until_s`. The frame arrived between these
+    times, at least one settling time after `before.acknowledged_s`, so it does not show earlier levels of the lights.
     """
 
     image: UInt8[np.ndarray, "height width 3"]  # RGB, raw and uncropped, read-only

@@ -175,7 +175,7 @@ class STS:
 
     @property
     def device(self) -> Device | None:
-        """The description of the camera, the lights and the lens in the sensor file.
+        """The content of the sensor file: a description of the camera, the lights and the lens.
 
         None if the sensor was not made by `from_file`.
         """
@@ -520,8 +520,9 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The block that changed most "
-        f"differs by {change:.0f} of 255 between the last image and an earlier one (allowed: at most {allowed:.0f}). "
+        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The part of the image that "
+        f"changed most differs by {change:.0f} of 255 between the last image and an earlier image (allowed: at most "
+        f"{allowed:.0f}). "
         "Keep the scene at rest, raise timeout_s, or check whether the light of the room changes."
     )
 

@@ -110,10 +110,10 @@ def loss(
         beta: Weight of the divergence of the posterior from the prior.
         asked: Modalities that are predicted for each subset. `all` predicts all modalities. `own` predicts only the
             members of the subset, as in the paper's code.
-        absent: Names of modalities that no sample has as an input.
+        absent: Names of modalities that are not inputs of any sample.
 
     Returns:
-        A tuple `(loss, (stats, terms))` with the loss, the new running batch statistics, and the parts of the loss.
+        A tuple `(loss, (stats, terms))` with the loss, the new running batch statistics, and the terms of the loss.
 
     Raises:
         ValueError: The name of a modality is unknown, `asked` is unknown, a target is missing, or `condition` has

@@ -93,7 +93,7 @@ def library(
     if up is not None and up not in AXES:
         raise ValueError(f"{folder}: up must be 'x', 'y' or 'z', got {up!r}")
     if isinstance(faces, bool) or not isinstance(faces, int | np.integer) or faces < 4:
-        raise ValueError(f"{folder}: the argument faces must be a whole number, at least 4, got {faces!r}")
+        raise ValueError(f"{folder}: faces must be a whole number, at least 4, got {faces!r}")
     root = shapenet.find_root(folder)
     items, skipped = _walked(folder) if root is None else shapenet.items(root)
     if not items:

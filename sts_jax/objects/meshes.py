@@ -267,8 +267,8 @@ def _check_file(path: Path) -> None:
     number = int.from_bytes(head[80:84], "little")  # triangles of 50 bytes each
     if size < 84 + 50 * number or size < 84:
         raise ValueError(
-            f"{path}: the file is truncated or not an STL. It has {size:,} bytes, but a binary STL of {number:,} "
-            f"triangles has {84 + 50 * number:,} bytes: replace it"
+            f"{path}: the file is truncated or not an STL. Its header announces {number:,} triangles, which need "
+            f"{84 + 50 * number:,} bytes, but the file has {size:,} bytes: replace the file"
         )
 
 

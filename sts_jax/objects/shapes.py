@@ -172,7 +172,8 @@ def lathe(profile: Sequence[tuple[Number, Number]], color: Painted, *, num: int 
 
     Args:
         profile: Points (radius, z) of the surface (mm). A band of the surface connects each point to the next one.
-        color: One colour (3,) for the whole surface, one for each band, or `num` for each band, in linear light.
+        color: One colour (3,) for the whole surface, one colour for each band, or `num` colours for each band, in
+            linear light.
         num: Number of points around the axis.
         kind: Keyword arguments of `loft`: `ends`, `closed`, `density` and `interior`.
     """

@@ -117,8 +117,8 @@ def hidden_sky(
 
     The share that a half-plane at the height z hides from a point is `f(d) = (1 - d / sqrt(d^2 + z^2)) / 2`. Here d is
     the horizontal distance from the point to the edge of the half-plane, and d is negative if the half-plane extends
-    over the point. A strip is the difference of two half-planes, so it hides the difference of their shares. The shares
-    are computed on a grid of about 30 x 30 cells:
+    over the point. A strip between two parallel lines is the difference of two half-planes, and it hides the difference
+    of their shares. The shares are computed on a grid of about 30 x 30 cells:
 
         hidden = max_z Y_z slice_z X_z^T
 
@@ -252,8 +252,8 @@ def shade(
     2. Contact shade: the share `crease * hidden * exp(-height / crease_height)` of this light is lost.
     3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        background, `empty`, replaces the rest.
-    4. Milky skin: the share `1 - milk` of the result is transmitted. The light that the background would have
-       without the object's shadow is multiplied by `milk * (1 - hidden)` and added.
+    4. Milky skin: the share `1 - milk` of the result is transmitted. The skin adds `milk * (1 - hidden)` times the
+       light of the background without the object's shadow.
 
     Args:
         room: Constants of the external light.

@@ -33,7 +33,7 @@ SKIN = 0.001  # m, points up to this height above the deepest one can be contact
 
 
 class Hull(NamedTuple):
-    """The p convex parts of an object in the mesh frame, as arrays of h vertices, e edges and f triangular faces.
+    """The p convex parts of an object in the mesh frame. Each part has h vertices, e edges and f triangular faces.
 
     If a part has fewer than h vertices, the last vertex of the part is repeated, so that all parts have arrays of the
     same size. The same holds for parts with fewer than e edges or f faces. The last axis of each array runs over the

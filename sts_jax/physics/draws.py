@@ -43,7 +43,7 @@ def draw(
 ) -> tuple[Start, Hidden]:
     """Draw the starts and the hidden properties of n trajectories.
 
-    A draw depends on `key`, on its entries of `body`, `nth` and `attempt`, and on the geometry of its body. It does not
+    Draw i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of its body. It does not
     depend on the other draws.
 
     Args:

@@ -138,7 +138,7 @@ def place(
         body: One body.
         sensor: Sensor whose `gel.size` is the size of the pad.
         face: Index of a face in the result of `stable_faces` for the same `fill`, `shell_scale` and `up`. Face 0 is the
-            most likely one. "upright" is the face on which the body's +z points up.
+            most likely one. "upright" is the face on which the body rests with its +z axis up.
         yaw: Rotation about the sensor's z axis (rad). At 0, the +z axis of a lying body points to the top of the image.
             If the body stands upright or upside down, its -y axis points there instead.
         position: x and y of the centre of the body's extent (m).

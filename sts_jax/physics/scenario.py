@@ -158,7 +158,8 @@ class Scenario(abc.ABC):
 
         Args:
             time: Time at which the step begins (s), 0 at frame 0.
-            condition: Known numbers of a trajectory in SI units, (c,). The attribute `quantities` describes them.
+            condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
+                `quantities` describes them.
         """
 
     @abc.abstractmethod
@@ -174,7 +175,8 @@ class Scenario(abc.ABC):
         """Return the velocity of the object on its release, by default 0.
 
         Args:
-            condition: Known numbers of a trajectory in SI units, (c,). The attribute `quantities` describes them.
+            condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
+                `quantities` describes them.
 
         Returns:
             Velocity of the mesh frame's origin (m/s) and angular velocity (rad/s), (6,), in the sensor frame.
@@ -189,7 +191,8 @@ class Scenario(abc.ABC):
         part of `velocity`.
 
         Args:
-            condition: Known numbers of a trajectory in SI units, (c,). The attribute `quantities` describes them.
+            condition: Known quantities of the trajectory in SI units, such as an acceleration, (c,). The attribute
+                `quantities` describes them.
 
         Returns:
             Velocity along x and y, (2,) (m/s).

@@ -120,7 +120,8 @@ def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact,
     MuJoCo finds the contacts of the mesh. The object has placeholder mass properties, which `set_rigid` replaces.
 
     Args:
-        parts: n points of each of the p convex parts that collide, (p, n, 3), in the mesh frame (m).
+        parts: Points of the convex parts with which the object collides, (p, n, 3), for p parts with n points each, in
+            the mesh frame (m).
         pad: Size of the pad along x and y (m).
         contact: Contact and solver constants.
         wall: Height of the stop wall (m), 0 for none.

@@ -154,7 +154,10 @@ class FinalPose(NamedTuple):
 
 
 class Layers(NamedTuple):
-    """Outlines, colours and tactile changes of n rendered objects. `compose` adds the images of the empty sensor."""
+    """Outlines and colours of n rendered objects, and the changes that the objects cause in the tactile images.
+
+    `compose` adds the images of the empty sensor.
+    """
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
     colour: Float[Array, "n size size 3"]  # colour of the object, [0, 1]
@@ -192,8 +195,8 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
     the same. The coefficients of functions in the sensor frame change.
 
     Args:
-        config: Configuration of the model. An appearance code consists of `config.traits` traits, `config.own`
-            functions of a direction in the mesh frame, and `config.shown` functions of a direction in the sensor frame.
+        config: Configuration of the model. Its fields give the numbers of traits (`traits`), of functions of a
+            direction in the mesh frame (`own`), and of functions of a direction in the sensor frame (`shown`).
         look: Appearance codes of n items.
 
     Returns:

@@ -209,16 +209,17 @@ def loss(
         inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1] with the
             side `input_size`, and pose codes `pose` `(n, 12)`.
         targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
-            `image_size`, state codes `state` of the first frame `(n, code)`, pose codes `pose` of the last frame
-            `(n, 12)`, and indices `outcome` into the outcomes of the scenario `(n,)`.
+            `image_size`. State codes `state` of the first frames, `(n, code)`, and pose codes `pose` of the last
+            frames, `(n, 12)`. Indices `outcome` of the outcomes in the scenario's outcomes, `(n,)`.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
             in all items. Each item must have at least one input. Values of items whose mask is False have no influence
             and may be NaN.
         condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
             `training.Preprocessing.encode_condition`. None if the model has no condition.
-        views: First frames without a trajectory: images `visual` `(m, size, size, 3)` in [0, 1] with the side
-            `input_size`, and state codes `state` `(m, code)`. The model must have the input `visual`.
+        views: Objects in initial poses that do not belong to a trajectory: images `visual` `(m, size, size, 3)` in
+            [0, 1] with the side `input_size`, and state codes `state` `(m, code)`. The model must have the input
+            `visual`.
         falls: Trajectories without images: `state`, `pose` and `outcome` as in `targets` and, if the model has a
             condition, `condition`.
         beta: Weight of the divergence of the appearance code.

@@ -45,7 +45,7 @@ def heading(code: Float[Array, "*n 12"]) -> Float[Array, "*n 2"]:
 
 
 def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
-    """The certainty of each object's rotation, from 0 (unknown) to a value between 0.8 and 1 (known exactly).
+    """The certainty of each object's rotation. It is 0 for an unknown rotation, and at least 0.8 for a known rotation.
 
     The columns of a rotation matrix are the mesh axes, which have a length of 1. If the rotation is uncertain, the
     mean of its possible matrices has shorter columns. The certainty is the length of the longest projection of a column
@@ -62,7 +62,7 @@ def certainty(code: Float[Array, "*n 12"]) -> Float[Array, "*n"]:
 
 
 def matrix(code: Float[Array, "*n 12"]) -> Float[Array, "*n 3 3"]:
-    """The matrix in each pose code. If the code is a mean of pose codes, the matrix is a mean of rotation matrices."""
+    """The rotation matrix that each pose code contains. For a mean of pose codes, it is a mean of rotation matrices."""
     return code[..., 3:].reshape(*code.shape[:-1], 3, 3)
 
 

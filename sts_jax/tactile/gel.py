@@ -99,7 +99,7 @@ def indent(gel: Gel, heights: Float[Array, "r c"]) -> Equilibrium:
 
 
 def settle(gel: Gel, heights: Float[Array, "r c"], wrench: Float[Array, "6"]) -> Equilibrium:
-    """Find the equilibrium of an object: the depth and tilts at which the gel balances Fz, Mx and My of the wrench.
+    """Find the equilibrium of an object: the depth and tilts at which the gel's pressure has the given Fz, Mx and My.
 
     The gel is a grid of cells, and each cell is an independent spring. Let h be the height of the object above the cell
     whose centre has the coordinates x and y. The object sinks by d. It also turns by a small angle a about the x axis,

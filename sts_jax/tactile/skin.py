@@ -48,8 +48,8 @@ class Lights:
 class Leds:
     """Lights inside the sensor, modelled as points at a finite distance. There may be any number m of lights.
 
-    By default (our choice), a red, a green, a blue and a white LED shine at a grazing angle into the four edges of the
-    pad. They are as bright as possible without clipped pixels in the image of the untouched pad.
+    By default, a red, a green, a blue and a white LED shine at a grazing angle into the four edges of the pad. They are
+    as bright as possible without clipped pixels in the image of the untouched pad.
     """
 
     # Positions in the sensor frame (m). Defaults: 30 mm beyond the pad's left, right, top and bottom edge, 3 mm below
@@ -158,8 +158,8 @@ def shadows(
 
     Args:
         skin: Constants of the shadows: number of steps n, reach and penumbra. Step k compares the depth at x with the
-            depth at the distance `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a part narrower than a
-            step may cast no shadow there.
+            depth at the distance `t = shadow_reach (k / n)^2`. Steps are longer far from x, so a distant part that is
+            narrower than a step may cast no shadow on x.
         lights: Far lights (`Lights`) or near lights (`Leds`). Skin behind a near light does not hide this light.
         depth: Depth of the skin below the gel's undeformed face (m). Skin outside the image casts no shadow.
         window: Part of the gel's face in the image: left, top, width, height (m).

@@ -72,7 +72,7 @@ def learner(model: Config, *, targets: Literal["all", "own"] = "all", absent: tu
         model: Configuration of the model.
         targets: Modalities to predict from each subset of the inputs. `all` means every modality. `own` means only the
             modalities in the subset. Ignored for state-space models.
-        absent: Names of modalities that no sample has as an input. Ignored for state-space models.
+        absent: Names of modalities that are not inputs of any sample. Ignored for state-space models.
 
     Returns:
         The learner.

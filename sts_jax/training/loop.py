@@ -122,7 +122,7 @@ def train(
         model: Configuration of the model.
         arrays: Training set.
         workdir: Folder of the model, for `config.json`, `metrics.jsonl`, `checkpoints/` and `manifest.json`.
-        absent: For `mvae` models: names of modalities that no sample has as an input. `arrays.inputs` need not have
+        absent: For `mvae` models: names of modalities that are not inputs of any sample. `arrays.inputs` need not have
             them.
         targets: For `mvae` models: modalities to predict from each subset of the inputs. `all` means every modality.
             `own` means only the modalities in the subset.

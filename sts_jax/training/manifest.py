@@ -45,8 +45,8 @@ def read(folder: Path) -> Manifest | None:
 def write(folder: Path, step: int | None) -> Manifest:
     """Write `manifest.json`, which names the current checkpoint and contains the checksums of the model's files.
 
-    The checksums of `config.json` and `blank.npz` are copied from the previous manifest. A later check therefore still
-    finds earlier damage to these two files.
+    The checksums of `config.json` and `blank.npz` are copied from the previous manifest. If one of these two files is
+    damaged already, this function therefore does not hide the damage from later checks.
 
     Args:
         folder: Folder of the model.

@@ -18,10 +18,10 @@ def mean(step: int, recent: list[Terms]) -> Record:
 
     Args:
         step: Number of steps done.
-        recent: Parts of the loss in each step since the previous record.
+        recent: Terms of the loss in each step since the previous record.
 
     Returns:
-        The step, and the mean of each part.
+        The step, and the mean of each term.
     """
     return {"step": step, **jax.tree.map(lambda *x: float(np.mean(x)), *recent)}
 

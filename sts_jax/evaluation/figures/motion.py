@@ -36,7 +36,7 @@ def strip(
 ) -> None:
     """Draw one trajectory over time: a view from outside, both streams, and the wrench of the pad on the object.
 
-    The images are above two plots, the force and its moment about the sensor's origin.
+    Two plots below the images show the force and its moment about the sensor's origin.
 
     Args:
         path: The PNG file to write.

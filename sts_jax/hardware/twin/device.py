@@ -168,7 +168,7 @@ class Twin:
         if self._virtual_s:
             raise RuntimeError(
                 f"the virtual clock of this Twin has advanced to {self._virtual_s} s, but a twin must be served before "
-                "its clock advances: make a new Twin to serve it"
+                "its clock advances: make a new Twin, and serve it first"
             )
         self._clock = clock
         self._boot(clock())
@@ -198,7 +198,7 @@ class Twin:
         return self.state
 
     def operate(self) -> None:
-        """Hold or release the object if the randomly chosen time for this has come.
+        """Hold or release the object when a randomly chosen time is reached.
 
         The argument `release_every` of `Twin` is the mean time for which an object is held plus the mean time for which
         it then rests (s). If this argument is None, this method does nothing. `step` and `Served` call this method

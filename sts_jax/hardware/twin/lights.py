@@ -102,7 +102,7 @@ class LightHistory:
         """Delete the changes of the LED levels up to the time `before_s`, except the latest of these changes.
 
         The latest of these changes is kept, because it determines the brightness at the time `before_s`. After this
-        call, the argument `start_s` of `over` must be at least `before_s`.
+        call, the method `over` needs a `start_s` of at least `before_s`.
 
         Args:
             before_s: Time (s), on the same clock as the argument `time_s` of `set`.

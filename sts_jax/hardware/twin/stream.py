@@ -59,8 +59,8 @@ class CameraThread:
             index: Number of the frame that the client received last, or -1.
 
         Returns:
-            The newest frame after `index` whose time of delivery has come. If there is none, the first frame after
-            `index`, whose time of delivery is still to come. If there is no frame after `index`, None.
+            The newest of the frames after `index` that are due for delivery. If no frame after `index` is due yet, the
+            first frame after `index`. If no frame after `index` exists, None.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
