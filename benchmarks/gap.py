@@ -95,8 +95,8 @@ def read_pair(device: twin.Twin) -> tuple[hardware.Pair, tuple[float, ...]]:
         truth, image = device.capture()
         if not truth.lowest == truth.highest == light:
             raise AssertionError(
-                f"the light during the exposure of the {stream} frame must be constant at {light} of its full "
-                f"brightness, got {truth.lowest} to {truth.highest}"
+                f"during the whole exposure of the {stream} frame, the relative brightness of the light must be "
+                f"{light}, got {truth.lowest} to {truth.highest}"
             )
         after = device.ping()
         shots.append(hardware.Shot(image, stream, device.now_s, truth.index, 1, before, after.sent_s))
@@ -314,7 +314,8 @@ def main(args: Args) -> None:
     """
     if args.trajectories < 2 * gap.FOLDS:
         raise ValueError(
-            f"--trajectories must be >= {2 * gap.FOLDS}, so that two halves can be compared, got {args.trajectories}"
+            f"--trajectories must be >= {2 * gap.FOLDS}, so that two halves of the trajectories can be compared, "
+            f"got {args.trajectories}"
         )
     height, width = args.resolution
     if min(args.resolution) < gap.LEAST_SIDE or not math.isclose(width / height, SIZE[1] / SIZE[0]):

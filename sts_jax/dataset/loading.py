@@ -91,7 +91,7 @@ def reduced_images(images: dict[str, np.ndarray], size: int) -> dict[str, np.nda
     """Reduce square images to a lower resolution. Each new pixel is the mean of a square block of pixels.
 
     Args:
-        images: Arrays of images by name, uint8 `(*n, side, side, channels)`, with any number of leading axes n.
+        images: Arrays of images by name, uint8 `(*n, side, side, channels)`. They may have any leading axes `*n`.
         size: New side length of the images (pixels). It must divide the present side length.
 
     Returns:

@@ -250,7 +250,7 @@ def centre(samples: np.ndarray, *, iterations: int = 100) -> np.ndarray:
 
 
 def log_loss(probability: np.ndarray, label: np.ndarray, floor: float = FLOOR) -> np.ndarray:
-    """Compute minus the logarithm of the true outcomes' probabilities.
+    """Compute the negative logarithms of the probabilities of the true outcomes.
 
     Args:
         probability: Probabilities of c outcomes for n items, `(n, c)`.

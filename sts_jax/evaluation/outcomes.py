@@ -76,7 +76,7 @@ def frequency(outcome: np.ndarray, outcomes: Sequence[enum.IntEnum]) -> np.ndarr
 def outcome_of_image(
     visual: np.ndarray, blank: np.ndarray, threshold: float, stays: int = int(physics.Outcome.RESTS)
 ) -> np.ndarray:
-    """Determine from the last visual images whether the objects fell off.
+    """Determine from the last visual image of each trajectory whether the object fell off.
 
     The outcome is `FELL_OFF` if the image shows no object. Otherwise, it is always `stays`, because only poses
     distinguish the outcomes of objects that stay on the pad.

@@ -27,7 +27,8 @@ def baselines(scenario: physics.Scenario, train: Pairs, test: Pairs) -> dict[str
       between the conditions is divided by the variance of the conditions in the training set. The two distances
       therefore have the same weight.
     - The rule "rests below its start" keeps x, y and the orientation of the first pose. The predicted height is the
-      median last height of the training objects that stay on the pad. The rule predicts no images.
+      median of the heights of the training objects in their last frames, without the objects that leave the pad. The
+      rule predicts no images.
 
     Args:
         scenario: The scenario of the trajectories.

@@ -230,7 +230,7 @@ def calibrate(
 
     In one image, the board must lie on the outer face of the gel pad, with the printed side towards the camera. The
     board must be centred on the pad, with its edges parallel to the edges of the pad. Any edge of the board may be at
-    the top of the image. In the other images, the board must have different distances, positions and tilts.
+    the top of the image. Among the other images, the distance, position and tilt of the board must vary.
 
     The calibration fits the parameters of the lens and the pose of the board in each image. For each corner, it
     compares the pixel at which the corner was found with the pixel to which the fitted lens projects the corner. The

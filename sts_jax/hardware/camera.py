@@ -45,9 +45,9 @@ class Camera:
     def connect(self, warmup_s: float = 1.0) -> "Camera":
         """Open the camera, and wait until its automatic exposure and white balance have settled.
 
-        If the source is a V4L2 device and `CameraConfig.lock` is True, the call then locks the settings: it turns
-        automatic exposure, white balance and focus off, and discards all earlier frames. A video file starts at its
-        first frame, without a wait. The call lasts at most `warmup_s` plus four times `CameraConfig.timeout_s`.
+        If the source is a V4L2 device and `CameraConfig.lock` is True, the call then locks the settings: it turns off
+        the automatic control of exposure, white balance and focus, and discards all earlier frames. A video file starts
+        at its first frame, without a wait. The call lasts at most `warmup_s` plus four times `CameraConfig.timeout_s`.
 
         Args:
             warmup_s: Time for the automatic exposure and white balance to settle (s).

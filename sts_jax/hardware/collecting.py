@@ -94,7 +94,7 @@ class AutomaticPerson:
     def action(self) -> Action | None:
         """Return `Action.CONFIRM` in the stage `REVIEW`, and None in every other stage.
 
-        The stage is that of the view that `show` received last. In the stage `REVIEW`, a recorded trajectory is
+        The stage is the stage of the latest view that `show` received. In the stage `REVIEW`, a recorded trajectory is
         confirmed or discarded.
         """
         return Action.CONFIRM if self._stage is Stage.REVIEW else None

@@ -40,9 +40,9 @@ def brightness(image: UInt8[np.ndarray, "height width 3"]) -> float:
 def choose_exposure(camera: Camera, *, longest: float) -> Exposed:
     """Set the exposure of a camera so that its images are bright but not saturated.
 
-    The exposure is adjusted, in at most 10 attempts, until the brightness of an image is between 175 and 225. The
-    brightness is the 99th percentile of the largest colour values of the pixels (0 to 255). The search also stops if
-    the driver does not change the exposure any more.
+    The exposure is adjusted, in at most 10 attempts, until the brightness of an image is between 175 and 225. To
+    compute the brightness, the largest of the three colour values of each pixel is taken. The brightness is the 99th
+    percentile of these values (0 to 255). The search also stops if the driver does not change the exposure any more.
 
     Args:
         camera: Connected camera whose driver can set the exposure. Before the call, switch the sensor's lights on

@@ -105,8 +105,8 @@ class ProvenFrames:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image was still changing when the last frames after a switch arrived, in each of three
-                attempts.
+            LightError: In each of three attempts, the image was still changing in the last frames that were collected
+                after the lights were switched.
         """
         for _ in range(_ATTEMPTS - 1):
             with contextlib.suppress(LightError):
@@ -157,9 +157,9 @@ class ProvenFrames:
         slowest_s = max(found.visual_s, found.tactile_s)
         if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image still changes {slowest_s:.2f} s after the lights were switched, but frames were collected "
-                f"for only {watch_s:.2f} s: keep the scene at rest and lock the camera's exposure. If the lights "
-                "are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
+                f"the image was still changing {slowest_s:.2f} s after the lights were switched, at the end of the "
+                f"{watch_s:.2f} s in which frames were collected: keep the scene at rest and lock the camera's "
+                "exposure. If the lights are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
             )
         return found
 

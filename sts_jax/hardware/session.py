@@ -158,7 +158,7 @@ class Session:
 
     @property
     def waiting(self) -> int:
-        """Number of pairs, confirmations and other changes that are not on disk yet."""
+        """Number of changes, such as new pairs of images and confirmations, that are not on disk yet."""
         with self._changed:
             return len(self._jobs)
 

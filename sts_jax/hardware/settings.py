@@ -51,7 +51,7 @@ class Refusal:
 
 
 def asked(config: CameraConfig) -> dict[str, float]:
-    """Return `exposure`, `gain`, `white_balance` and `focus` of a configuration by name, except those that are None."""
+    """Return the camera settings that a configuration fixes: exposure, gain, white balance or focus, by field name."""
     values = {setting.field: getattr(config, setting.field) for setting in _SETTINGS}
     return {field: value for field, value in values.items() if value is not None}
 

@@ -24,8 +24,8 @@ class NoContrastError(RuntimeError):
 class Settling:
     """The two settling times: one after the lights are switched off, and one after the lights are switched on.
 
-    A settling time begins when the LED controller acknowledges the switch of the lights. Frames that arrive during the
-    settling time are discarded, because these frames may still show the lights as they were before the switch.
+    A settling time begins when the LED controller acknowledges that it has switched the lights. Frames that arrive
+    during the settling time are discarded, because these frames may still show the previous state of the lights.
 
     Raises:
         ValueError: A time is not between 0 and 60 s.
@@ -45,7 +45,7 @@ class Settling:
 class Switch:
     """The frames that arrive after the lights are switched on or off.
 
-    There must be enough frames that the last one shows the lights fully switched.
+    The last frame must arrive so late that the lights no longer change.
     """
 
     delays_s: Float[np.ndarray, "n"]  # time from the acknowledgement to the arrival of each frame (s)
@@ -107,10 +107,10 @@ def light_share(look: Thumbnail, dark: Thumbnail, lit: Thumbnail) -> float:
 def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> float:
     """Return how far the lights had been switched on or off when an image was taken: 0 means not yet, 1 means fully.
 
-    The result is the median of `(look - before) / change` over all thumbnail values for which `change` is clear.
-    Because of the median, an object that moves in less than half of the view has no influence. A `change` is visible if
-    its size is at least 0.5 (of 255). A visible change is clear if its size is at least a quarter of the median size of
-    the visible changes.
+    A thumbnail value counts as visible if its change has a magnitude of at least 0.5 (of 255). It counts as clear if
+    this magnitude is also at least a quarter of the median magnitude of the visible values. The result is the median of
+    `(look - before) / change` over the clear values. Because of the median, an object that moves in less than half of
+    the view has no influence.
 
     Args:
         look: Thumbnail of the image.

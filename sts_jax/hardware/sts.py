@@ -209,7 +209,7 @@ class STS:
 
     @property
     def settling(self) -> Settling:
-        """The settling times, for which frames are discarded after the lights are switched off or on.
+        """The settling times: for how long frames are discarded after the lights are switched off or on.
 
         Raises:
             CameraNotConnectedError: No settling times were given, and `connect` has not measured them yet.
@@ -469,7 +469,7 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
     Args:
         duty: Share of tactile images, 0 to 1. After each group of `dwell` images, the share of tactile images so far
             is as close to `duty` as possible.
-        dwell: Number of successive images of one stream in a group, >= 1.
+        dwell: Number of successive images in a group, >= 1. All images of a group are of the same stream.
 
     Returns:
         The iterator, whose items are "visual" or "tactile".
@@ -520,8 +520,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The part of the image that "
-        f"changed most differs by {change:.0f} of 255 between the last image and an earlier image (allowed: at most "
+        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The largest change of a part "
+        f"of the image is {change:.0f} of 255, between the last image and an earlier image (allowed: at most "
         f"{allowed:.0f}). "
         "Keep the scene at rest, raise timeout_s, or check whether the light of the room changes."
     )

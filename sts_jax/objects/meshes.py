@@ -325,7 +325,7 @@ def _body(
         fault = "encloses no volume" if closed else "is not closed"
         if strict:
             raise ValueError(
-                f"{path}: the mesh {fault}: close it, or give strict=False to use the volume of its convex hull"
+                f"{path}: the mesh {fault}: repair the mesh, or give strict=False to use the volume of its convex hull"
             )
         if holds:
             warnings.warn(

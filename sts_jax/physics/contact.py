@@ -33,11 +33,12 @@ SKIN = 0.001  # m, points up to this height above the deepest one can be contact
 
 
 class Hull(NamedTuple):
-    """The p convex parts of an object in the mesh frame. Each part has h vertices, e edges and f triangular faces.
+    """The p convex parts of an object in the mesh frame.
 
-    If a part has fewer than h vertices, the last vertex of the part is repeated, so that all parts have arrays of the
-    same size. The same holds for parts with fewer than e edges or f faces. The last axis of each array runs over the
-    vertices, edges or faces of a part, because XLA vectorises along the last axis.
+    The arrays of each part have room for h vertices, e edges and f triangular faces. If a part has fewer than h
+    vertices, the last vertex of the part is repeated, so that all parts have arrays of the same size. The same holds
+    for parts with fewer than e edges or f faces. The last axis of each array runs over the vertices, edges or faces of
+    a part, because XLA vectorises along the last axis.
     """
 
     vertices: Float[Array | np.ndarray, "*n 3 p h"]  # m

@@ -22,8 +22,8 @@ _FURTHER = 2**32 - 1  # `starts` folds it into the key. `simulate` folds in the 
 class Starts(NamedTuple):
     """Random starts of one or more bodies. A start is an initial pose with hidden properties.
 
-    The length n is the number of starts of all bodies together. All starts of the first body come first,
-    then all starts of the second body, and so on.
+    Each array has the length n, which is the number of starts of all bodies together. All starts of the first body come
+    first, then all starts of the second body, and so on.
     """
 
     pose: Float[Array, "n 7"]  # Mesh frame in the sensor frame: position (m) and quaternion with w >= 0.
@@ -43,8 +43,8 @@ def draw(
 ) -> tuple[Start, Hidden]:
     """Draw the starts and the hidden properties of n trajectories.
 
-    Draw i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of its body. It does not
-    depend on the other draws.
+    The draw with index i depends on `key`, on `body[i]`, `nth[i]` and `attempt[i]`, and on the geometry of its body. It
+    does not depend on the other draws.
 
     Args:
         key: Key of all draws.

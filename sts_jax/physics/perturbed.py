@@ -84,7 +84,7 @@ class Perturbed(Scenario):
         check_range("duration", self.duration, positive=False)
 
     def start(self, key: PRNGKeyArray, shape: Shape, pad: tuple[float, float]) -> Start:
-        """Draw one start. The object stands with its +z up.
+        """Draw the start of one trajectory at random. The object stands with its +z up.
 
         The field `condition` of the result has three random numbers: the acceleration of the pad along x and y (m/s^2),
         and the duration of this acceleration (s).

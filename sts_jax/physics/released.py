@@ -105,7 +105,7 @@ class Released(Scenario):
         The object stands on a stable face and is tilted about an edge of this face. The edge is chosen from random
         edges (the field `tries` is their number). Edges at which the object balances at a tilt of 15 to 45 degrees are
         preferred. If no random edge is of this kind, for example for a cylinder on its side, the object is tilted about
-        one of the others.
+        one of the random edges all the same.
 
         If the edge is a preferred one, the object stands on the narrower of the two faces that meet at the edge. In
         most cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than
@@ -150,9 +150,10 @@ class Released(Scenario):
         - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
-        `start` places an object on an edge between two of its faces. From the narrower face, it is usually tilted by
-        less than 45 degrees. If the two faces meet at a right angle, it is then more than 45 degrees away from the
-        wider face. An object that has turned by less than 45 degrees has therefore returned to the narrower face.
+        `start` places an object on an edge between two of its faces. The angle between the narrower face and the pad is
+        usually less than 45 degrees. If the two faces meet at a right angle, the angle between the wider face and the
+        pad is then more than 45 degrees. An object that has turned by less than 45 degrees has therefore returned to
+        the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

@@ -353,9 +353,9 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
 
     Args:
         scenario: Scenario to copy. Its other fields stay the same.
-        name: Name of the variant. "default" changes nothing. "off" hides nothing: every value is the middle of its
-            range, and contents settle at the object's base. "wide-friction" draws friction from 0.3 to 0.9.
-            "off-centre" lets contents settle in any direction, as `Inclined` does by default.
+        name: Name of the variant. "default" changes nothing. "off" fixes each hidden property at the middle of its
+            range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9. With
+            "off-centre", the contents lie at any side of the object, as in `Inclined` by default.
 
     Returns:
         A scenario of the same class.

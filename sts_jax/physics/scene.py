@@ -115,13 +115,13 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 
 
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
-    """Compile the scene for C MuJoCo: pad, stop wall and the object as a mesh.
+    """Compile the scene, which has the pad, the stop wall and the object as a mesh, for C MuJoCo.
 
     MuJoCo finds the contacts of the mesh. The object has placeholder mass properties, which `set_rigid` replaces.
 
     Args:
-        parts: Points of the convex parts with which the object collides, (p, n, 3), for p parts with n points each, in
-            the mesh frame (m).
+        parts: Points of the p convex parts that form the collision shape of the object, n points for each part,
+            (p, n, 3), in the mesh frame (m).
         pad: Size of the pad along x and y (m).
         contact: Contact and solver constants.
         wall: Height of the stop wall (m), 0 for none.
@@ -217,7 +217,7 @@ def template(
 
 
 def drawn(model: mujoco.MjModel, like: mjx.Model) -> dict[str, np.ndarray]:
-    """Return the fields that `set_rigid` changes in a model.
+    """Return the values that a model has in the fields that `set_rigid` changes.
 
     The keys are the names of the fields in `mjx.Model`. The arrays have the dtypes of the fields of `like`.
     """

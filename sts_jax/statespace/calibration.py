@@ -124,8 +124,9 @@ def fit(
         params: Parameters of the model.
         inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
             and pose codes `pose` `(n, 12)`.
-        targets: True values by name: `state`, the state codes of the first frames, `(n, code)`. `pose`, the pose codes
-            of the last frames, `(n, 12)`. `outcome`, the indices of the outcomes in the scenario's outcomes, `(n,)`.
+        targets: True values by name. `state` has the state codes of the first frames, `(n, code)`. `pose` has the pose
+            codes of the last frames, `(n, 12)`. `outcome` has the index of each trajectory's outcome in the list of the
+            scenario's outcomes, `(n,)`.
         empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
             in all items.

@@ -156,7 +156,7 @@ class FinalPose(NamedTuple):
 class Layers(NamedTuple):
     """Outlines and colours of n rendered objects, and the changes that the objects cause in the tactile images.
 
-    `compose` adds the images of the empty sensor.
+    `compose` combines them with the images of the empty sensor to full images.
     """
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
@@ -195,8 +195,8 @@ def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, A
     the same. The coefficients of functions in the sensor frame change.
 
     Args:
-        config: Configuration of the model. Its fields give the numbers of traits (`traits`), of functions of a
-            direction in the mesh frame (`own`), and of functions of a direction in the sensor frame (`shown`).
+        config: Configuration of the model. Its fields are the number of traits (`traits`), the number of functions in
+            the mesh frame (`own`), and the number of functions in the sensor frame (`shown`).
         look: Appearance codes of n items.
 
     Returns:

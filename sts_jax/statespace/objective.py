@@ -94,8 +94,8 @@ def of_state(belief: Gaussian) -> Gaussian:
     """Remove the appearance code from a belief. The result is a belief about the state code alone, `(n, code)`.
 
     Args:
-        belief: Gaussian over the state code, of length `code`, and the appearance code, of length `look`. The shape is
-            `(n, code + look)`.
+        belief: Gaussian over two codes, `(n, code + look)`: the state code, whose length is `code`, and the appearance
+            code, whose length is `look`.
     """
     return Gaussian(belief.mean[:, : state.CODE], belief.log_var[:, : state.CODE])
 
@@ -142,7 +142,7 @@ def excess(
     Args:
         image: Rendered images in [0, 1].
         target: Target images in [0, 1].
-        counts: Weight of each pixel. None weights all pixels by 1.
+        counts: Weight of each pixel. If `counts` is None, each pixel has the weight 1.
 
     Returns:
         The difference for each image (nats), summed over pixels and channels.
@@ -210,7 +210,8 @@ def loss(
             side `input_size`, and pose codes `pose` `(n, 12)`.
         targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
             `image_size`. State codes `state` of the first frames, `(n, code)`, and pose codes `pose` of the last
-            frames, `(n, 12)`. Indices `outcome` of the outcomes in the scenario's outcomes, `(n,)`.
+            frames, `(n, 12)`. Index `outcome` of each trajectory's outcome in the list of the scenario's outcomes,
+            `(n,)`.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
             in all items. Each item must have at least one input. Values of items whose mask is False have no influence

@@ -20,8 +20,8 @@ KINDS: dict[str, type[Config]] = {"mvae": mvae.Config, "statespace": statespace.
 class Model(NamedTuple):
     """A trained model.
 
-    `graphdef` and `state` are the first two arguments of `mvae.predict` for an `mvae` model, and of `statespace.sample`
-    for a state-space model.
+    `graphdef` and `state` are the first two arguments of the functions `mvae.predict` (for an `mvae` model) and
+    `statespace.sample` (for a state-space model).
     """
 
     config: Config  # configuration of the model

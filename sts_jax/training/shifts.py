@@ -7,7 +7,7 @@ from jaxtyping import Int, UInt8
 def shifted(
     images: UInt8[np.ndarray, "n 2 h w 3"], empty: UInt8[np.ndarray, "h w 3"], shifts: Int[np.ndarray, "n 2"]
 ) -> UInt8[np.ndarray, "n 2 h w 3"]:
-    """Shift the images of trajectories to other places on a level pad.
+    """Shift the images of trajectories, as if the objects were at other places on a level pad.
 
     The function subtracts the image of the empty pad, shifts the difference, and adds the image of the empty pad again.
     The light on the empty pad therefore stays in place.

@@ -297,7 +297,7 @@ class ObjectScene(Scene):
 
         Raises:
             ValueError: The command is unknown, `release` comes without a held object, `time_s` is earlier than in the
-                previous call, or the object comes to rest in none of 32 successive simulated trajectories.
+                previous call, or the object does not come to rest in any of 32 successive simulated trajectories.
         """
         last_s, _, number = self._events[-1]
         if time_s < last_s:
