@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of objects that fall on the pad, from a first frame in the air.
 
-    python -m experiments.freefall                    # 15 to 40 minutes on two CPU cores
+    python -m experiments.freefall                    # 8 to 15 minutes on two CPU cores
     python -m experiments.freefall --preset long      # 1.5 to 3 hours, can be stopped and started again
     python -m experiments.freefall --model paper      # the paper's four models instead of the state-space model
     python -m experiments.freefall --preset smoke     # about two minutes, for tests
@@ -21,7 +21,7 @@ from sts_jax.training import TrainConfig
 COLLECTION = dataset.Collection(
     physics.Freefall(),
     num_objects=2000,
-    num_per_object=12,
+    num_per_object=6,
     num_rendered=4,
     num_views=8,
     num_full=20,
@@ -32,13 +32,13 @@ COLLECTION = dataset.Collection(
 )
 DEFAULT = config.Config(
     collection=COLLECTION,
-    state_training=dataclasses.replace(config.STATE_TRAINING, steps=3300),
+    state_training=dataclasses.replace(config.STATE_TRAINING, steps=2000),
     training=TrainConfig(batch_size=16, learning_rate=2e-3, schedule="cosine", encoder_epsilon=3.0),
     steps=(1500, 600, 600, 100),
 )
 LONG = dataclasses.replace(
     DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
+    collection=dataclasses.replace(COLLECTION, num_objects=6000, num_per_object=12, shares=(0.97, 0.01, 0.02)),
     state_training=dataclasses.replace(config.STATE_TRAINING, steps=16000),
 )
 SMOKE = config.smoke(DEFAULT)

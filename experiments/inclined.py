@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of objects released on a tilted pad or just above it, from the first frame.
 
-    python -m experiments.inclined                    # 15 to 40 minutes on two CPU cores
+    python -m experiments.inclined                    # 8 to 15 minutes on two CPU cores
     python -m experiments.inclined --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests
@@ -21,7 +21,7 @@ from sts_jax.training import TrainConfig
 COLLECTION = dataset.Collection(
     physics.Inclined(),
     num_objects=1600,
-    num_per_object=10,
+    num_per_object=6,
     num_rendered=4,
     num_views=4,
     num_full=20,
@@ -38,7 +38,7 @@ DEFAULT = config.Config(
 )
 LONG = dataclasses.replace(
     DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
+    collection=dataclasses.replace(COLLECTION, num_objects=6000, num_per_object=10, shares=(0.97, 0.01, 0.02)),
     state_training=dataclasses.replace(config.STATE_TRAINING, steps=8000),
 )
 SMOKE = config.smoke(DEFAULT)

@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of a bottle on a pad that is jerked, from the first frame and the jerk.
 
-    python -m experiments.perturbed                    # 15 to 40 minutes on two CPU cores
+    python -m experiments.perturbed                    # 8 to 15 minutes on two CPU cores
     python -m experiments.perturbed --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
@@ -22,7 +22,7 @@ COLLECTION = dataset.Collection(
     physics.Perturbed(),
     categories=("bottle",),
     num_objects=1600,
-    num_per_object=10,
+    num_per_object=6,
     num_rendered=4,
     num_full=20,
     symmetries=False,
@@ -38,7 +38,7 @@ DEFAULT = config.Config(
 )
 LONG = dataclasses.replace(
     DEFAULT,
-    collection=dataclasses.replace(COLLECTION, num_objects=6000, shares=(0.97, 0.01, 0.02)),
+    collection=dataclasses.replace(COLLECTION, num_objects=6000, num_per_object=10, shares=(0.97, 0.01, 0.02)),
     state_training=dataclasses.replace(config.STATE_TRAINING, steps=8000),
 )
 SMOKE = config.smoke(DEFAULT)
