@@ -1,7 +1,8 @@
 """Seconds of one training step and of one prediction, for the paper's model and for the state-space model.
 
-    python -m benchmarks.learning               # about 3 minutes on two CPU cores
-    taskset -c 0 python -m benchmarks.learning  # on one core
+    python -m benchmarks.learning                    # about 3 minutes on two CPU cores
+    python -m benchmarks.learning --only statespace  # one kind of model
+    taskset -c 0 python -m benchmarks.learning       # on one core
 
 The first line is a training step of the paper's model at batch 64, as in freefall: three modalities, of which touch is
 never an input, and a prediction of all modalities from every subset of the inputs. It is compared with a plain
@@ -13,8 +14,10 @@ with 16 samples.
 The figures are medians of alternating calls, after one unmeasured call each. The command writes no files.
 """
 
+import dataclasses
+import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 from unittest import mock
 
 import jax
@@ -37,6 +40,13 @@ MODEL = mvae.Config(
 )
 VISUAL = mvae.Config(MODEL.modalities[:1])
 LAYOUT = ("NHWC", "HWIO", "NHWC")
+
+
+@dataclasses.dataclass(frozen=True)
+class Args:
+    """Options of the command line."""
+
+    only: Literal["paper", "statespace"] | None = None  # kind of model to measure. None: both kinds
 
 
 def plain_conv(x: Array, kernel: Array, stride: int, padding: int) -> Array:
@@ -152,19 +162,33 @@ def median_seconds(call: Callable[[], None], repeats: int) -> float:
     return float(np.median(in_turn(call, repeats=repeats)))
 
 
-def main() -> None:
-    """Measure all steps and predictions, and print a line for each."""
+def paper() -> None:
+    """Print the milliseconds of training steps and of a prediction of the paper's model."""
     with mock.patch.multiple(networks, conv=plain_conv, conv_transpose=plain_conv_transpose):
         plain = stepper(MODEL, 64, ())
     ours, enumerated = np.median(in_turn(stepper(MODEL, 64, ("tactile",)), plain, repeats=3), axis=0)
-    print(f"training step, batch 64: {ours:.2f} s, plain {enumerated:.2f} s, ratio {enumerated / ours:.1f}")
+    ratio = enumerated / ours
+    print(f"training step, batch 64: {1e3 * ours:.1f} ms, plain {1e3 * enumerated:.1f} ms, ratio {ratio:.1f}")
     for size in (16, 32):
-        print(f"training step, batch {size}: {median_seconds(stepper(MODEL, size, ('tactile',)), 5):.3f} s")
-    print(f"training step, visual only, batch 64: {median_seconds(stepper(VISUAL, 64, ()), 5):.3f} s")
+        print(f"training step, batch {size}: {1e3 * median_seconds(stepper(MODEL, size, ('tactile',)), 5):.1f} ms")
+    print(f"training step, visual only, batch 64: {1e3 * median_seconds(stepper(VISUAL, 64, ()), 5):.1f} ms")
     print(f"prediction, batch 1: {1e3 * median_seconds(predictor(1), 50):.1f} ms")
-    print(f"state-space model, training step, batch 32: {median_seconds(state_stepper(32), 11):.3f} s")
+
+
+def state_space() -> None:
+    """Print the milliseconds of a training step and of a prediction of the state-space model."""
+    print(f"state-space model, training step, batch 32: {1e3 * median_seconds(state_stepper(32), 11):.1f} ms")
     print(f"state-space model, prediction with 16 samples: {1e3 * median_seconds(state_predictor(16), 50):.1f} ms")
 
 
+def main(args: Args) -> None:
+    """Measure the chosen kinds of models, and print a line for each step and prediction."""
+    print(f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores")
+    if args.only != "statespace":
+        paper()
+    if args.only != "paper":
+        state_space()
+
+
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    main(tyro.cli(Args, description=__doc__))

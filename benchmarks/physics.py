@@ -2,7 +2,7 @@
 
     python -m benchmarks.physics                   # about 2 minutes on two CPU cores
     python -m benchmarks.physics --engines 4       # about 2 minutes
-    python -m benchmarks.physics --pipeline 64     # about a minute (use 16384 worlds on a GPU)
+    python -m benchmarks.physics --pipeline 64     # about a minute (4096 on a GPU, where MJX simulates)
     python -m benchmarks.physics --scaling         # about 10 minutes. Writes benchmarks/results/physics/
     python -m benchmarks.physics --compile         # about 8 minutes
 
@@ -11,7 +11,8 @@ All commands print their results. Only `--scaling` writes files.
 - Without an option, the command measures steps per second of MJX and of C MuJoCo's batch function (`mujoco.rollout`),
   both on all cores and with the same starts. It first drops an object with one hull of 32 vertices, then one object of
   each of the eight classes, with hulls of up to 64 vertices.
-- `--engines N` measures falls per second of both engines of `simulate`, for N falls of each of 16 objects.
+- `--engines N` measures falls per second of both engines of `simulate`, for N falls of each of 16 objects. On a GPU,
+  MJX needs a larger `--chunk` than on a CPU.
 - `--pipeline N` drops a bottle N times, renders every frame in both streams as 64x64 uint8 images, and fetches the
   images from the device. It measures seconds and frames per second of physics, of rendering and of both together. A
   frame is one world at one time.
@@ -78,6 +79,7 @@ class Args:
 
     num: int = 8  # drops of each of the eight objects in the comparison with C MuJoCo
     engines: int | None = None  # measure both engines of `simulate`, with this many falls of each object
+    chunk: int = 32  # falls that MJX simulates at once, for --engines. A GPU needs more than a CPU
     pipeline: int | None = None  # measure physics and rendering of this many drops
     scaling: bool = False  # measure steps per second against the number of worlds
     compile: bool = False  # measure the time of compilation, and count compiled programs
@@ -170,16 +172,22 @@ def compare_speed(name: str, items: list[objects.Body], num: int) -> None:
     print(f"    ratio            {ratio:10.4f} (1/{1 / ratio:.1f}), median of pairs")
 
 
-def engines(num: int) -> None:
-    """Print falls per second of both engines of `simulate`, for `num` falls of each of 16 objects."""
+def engines(num: int, chunk: int) -> None:
+    """Print falls per second of both engines of `simulate`, for `num` falls of each of 16 objects.
+
+    Args:
+        num: Number of falls of each object.
+        chunk: Largest number of falls that MJX simulates at once.
+    """
     items, sensor, scenario = bodies(objects.CATEGORIES, 16), Sensor(), physics.Freefall()
     calls = [
-        functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, engine=engine)
+        functools.partial(physics.simulate, jax.random.key(0), items, sensor, scenario, num, chunk=chunk, engine=engine)
         for engine in get_args(physics.Engine)
     ]
     seconds = in_turn(*calls, repeats=3)
     count = len(items) * num
-    print(f"{count} falls of {scenario.frames} frames, eight classes, {os.cpu_count()} cores")
+    machine = f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores"
+    print(f"{count} falls of {scenario.frames} frames, eight classes, chunks of {chunk} in MJX: {machine}")
     for engine, median in zip(get_args(physics.Engine), np.median(seconds, axis=0), strict=True):
         print(f"    simulate, engine {engine!r:9s} {count / median:8.1f} falls/s")
     ratio = float(np.median(seconds[:, 0] / seconds[:, 1]))
@@ -303,11 +311,13 @@ def draw(body: objects.Body, traj: physics.Trajectory) -> None:
 
 def pipeline(count: int) -> None:
     """Print frames per second of the physics, of both streams, and of both together, for drops of a bottle."""
-    chunk = 32 if jax.default_backend() == "cpu" else count
+    engine: physics.Engine = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    chunk = 32 if engine == "mujoco" else count
     body, scenario = objects.make(jax.random.key(0), "bottle"), physics.Freefall()
     for _ in range(2):  # the first round compiles
         begin = time.perf_counter()
-        traj = jax.block_until_ready(physics.simulate(jax.random.key(1), body, Sensor(), scenario, count, chunk=chunk))
+        traj = physics.simulate(jax.random.key(1), body, Sensor(), scenario, count, chunk=chunk, engine=engine)
+        jax.block_until_ready(traj)
         simulated = time.perf_counter()
         draw(body, traj)
         drawn = time.perf_counter()
@@ -369,7 +379,7 @@ def main(args: Args) -> None:
     elif args.scaling:
         scaling()
     elif args.engines is not None:
-        engines(args.engines)
+        engines(args.engines, args.chunk)
     elif args.pipeline is not None:
         pipeline(args.pipeline)
     else:
