@@ -520,9 +520,8 @@ def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Sho
         if shot.time_s - started_s > timeout_s:
             break
     raise NotStillError(
-        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. The largest change of a part "
-        f"of the image is {change:.0f} of 255, between the last image and an earlier image (allowed: at most "
-        f"{allowed:.0f}). "
+        f"within {timeout_s:g} s, there was no period of {window_s:g} s without movement. A part of the last image "
+        f"differs by {change:.0f} of 255 from an earlier image, and at most {allowed:.0f} is allowed. "
         "Keep the scene at rest, raise timeout_s, or check whether the light of the room changes."
     )
 

@@ -24,7 +24,8 @@ def write(folder: Path, calibration: statespace.Calibration, inputs: tuple[str, 
         folder: Folder of the model.
         calibration: Calibration, from `statespace.fit_calibration`.
         inputs: Inputs of the model, `Config.inputs`.
-        data: Checksum of the arrays that the calibration was fitted to, from `Arrays.checksum`. None if it is unknown.
+        data: Checksum of the validation data to which the calibration was fitted, from `Arrays.checksum`. None if it is
+            unknown.
 
     Raises:
         OSError: The file cannot be written.
@@ -44,7 +45,8 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
         folder: Folder of the model.
 
     Returns:
-        The calibration, and the checksum of the arrays that it was fitted to (None if unknown). If the folder has no
+        The calibration, and the checksum of the validation data to which it was fitted (None if unknown). If the folder
+            has no
         calibration, or if the model's files changed after the fit, the result is None instead of a pair.
 
     Raises:
