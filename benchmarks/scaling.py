@@ -1,7 +1,7 @@
 """Skill of the state-space model for different numbers of training trajectories and of training steps.
 
     python -m benchmarks.scaling runs/freefall --out scaling.png  # a run of --preset default, about 20 minutes
-    python -m benchmarks.scaling runs/freefall --shares 1 --steps 3300 --seeds 1 2   # the spread between two more seeds
+    python -m benchmarks.scaling runs/freefall --shares 1 --steps 2000 --seeds 1 2   # the spread between two more seeds
 
 Uses the dataset of a run, and trains models in the folder `scaling` of the run. Some models see a share of the training
 objects (`--shares`) and are trained for the largest number of `--steps`. The others see all training objects, and are
