@@ -155,8 +155,8 @@ def predict(
 ) -> Predicted:
     """Predict the last frames of held-out trajectories with a model, from some of its inputs.
 
-    The predicted outcome follows from the predicted pose. The outcome probabilities are those of the model if it
-    predicts them. Otherwise, they are the shares of the outcomes among the samples, if there are samples.
+    The predicted outcome follows from the predicted pose. If the model predicts outcome probabilities, these are used.
+    Otherwise, the probabilities are the shares of the outcomes among the samples, if there are samples.
 
     If the model predicts no pose, the outcome follows from the predicted visual image. This requires a scenario with
     two outcomes, and the arguments `validation` and `blank`. If the image shows no object, the outcome is `FELL_OFF`.

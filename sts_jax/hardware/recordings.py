@@ -108,7 +108,7 @@ class Recordings:
 
     @property
     def identity(self) -> str:
-        """SHA-256 checksum of these trajectories.
+        """SHA-256 checksum of the recorded trajectories.
 
         If a trajectory is added, discarded or replaced, the recordings that `load_recordings` returns afterwards have
         another checksum.

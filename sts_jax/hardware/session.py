@@ -231,7 +231,7 @@ class Session:
 
         Raises:
             SessionError: The session is closed, or its queue is full because 6 changes (image pairs, confirmations and
-                discards) are not on disk yet. The trajectory is not confirmed.
+                discards) are not on disk yet. In both cases, the trajectory is not confirmed.
             ValueError: The initial or the final image pair of the trajectory was not passed to `save` of this
                 `Session`.
         """

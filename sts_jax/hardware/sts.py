@@ -368,7 +368,7 @@ class STS:
 
         Raises:
             ValueError: An argument is out of range.
-            LightError, LedError, CameraError: A step of the iterator raises them. The causes are those of `read`.
+            LightError, LedError, CameraError: A step of the iterator fails. The causes are those of `read`.
         """
         stream_order(duty, dwell)
         self._stop_background()

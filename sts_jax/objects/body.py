@@ -257,7 +257,7 @@ def fill_moments(
     middle = (jnp.min(interior, axis=(0, 1)) + jnp.max(interior, axis=(0, 1))) / 2
 
     def below(level: Float[Array, ""]) -> tuple[Array, Array, Array, Array]:
-        """Divide the part of the interior below the height `level` (m) along `up` into tetrahedra that share a corner.
+        """Divide the interior below `level`, a height along `up` (m), into tetrahedra that share a corner.
 
         Returns:
             Signed volume of each tetrahedron, vectors from the common corner to the other three corners of each

@@ -262,7 +262,7 @@ def _check_file(path: Path) -> None:
         return
     if head.lstrip().startswith(b"solid") and b"facet" in head:
         if b"endsolid" not in tail:
-            raise ValueError(f"{path}: the file is truncated, because its last line `endsolid` is missing: replace it")
+            raise ValueError(f"{path}: the file is truncated (its last line is not `endsolid`): replace the file")
         return
     number = int.from_bytes(head[80:84], "little")  # triangles of 50 bytes each
     if size < 84 + 50 * number or size < 84:

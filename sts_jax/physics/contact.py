@@ -254,7 +254,7 @@ def collide(
         pose: Mesh frame in the frame of the box's top, (7,): position (m), quaternion (w, x, y, z).
         half: Half the size of the box along x and y, (2,) (m). The box has its top at z = 0 and is infinitely deep.
         num: Number of contacts, >= 2.
-        plane: Indices of the two axes of the plane in which the contacts lie far apart, such as (0, 1) for x and y.
+        plane: Indices of the two axes along which distances and directions are measured, such as (0, 1) for x and y.
 
     Returns:
         `num` contacts in the frame of the box's top. Their field `dist` is minus the depth. If the object has fewer

@@ -313,8 +313,8 @@ def _check_times(scenario: Scenario) -> None:
     steps = 1 / (rate * timestep)
     if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
         raise ValueError(
-            f"scenario.rate is {rate}/s, which gives {steps:.3f} time steps of {timestep} s per frame, but the number "
-            "of time steps must be whole: choose another scenario.rate or scenario.contact.timestep"
+            f"scenario.rate is {rate}/s, which gives {steps:.3f} time steps (of {timestep} s) per frame, but the "
+            "number of time steps must be whole: choose another scenario.rate or scenario.contact.timestep"
         )
     if scenario.frames < 1:
         raise ValueError(f"scenario.frames is {scenario.frames}, but it must be >= 1")
@@ -375,7 +375,7 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
     lacking = sorted(set(changes[name]) - {field.name for field in dataclasses.fields(scenario)})
     if lacking:
         raise ValueError(
-            f"name is {name!r}, but the scenario {scenario} lacks fields that the variant {name!r} changes: "
+            f"the variant {name!r} changes fields that the scenario {scenario} lacks: "
             f"declare {', '.join(lacking)} in the scenario's dataclass"
         )
     return dataclasses.replace(scenario, **changes[name])

@@ -115,7 +115,7 @@ def _xml(pad: tuple[float, float], wall: float, contact: Contact, shapes: list[s
 
 
 def compile_scene(parts: np.ndarray, pad: tuple[float, float], contact: Contact, wall: float = 0.0) -> mujoco.MjModel:
-    """Compile the scene, which has the pad, the stop wall and the object as a mesh, for C MuJoCo.
+    """Compile the scene for C MuJoCo. It has the pad, the stop wall and the object as a mesh.
 
     MuJoCo finds the contacts of the mesh. The object has placeholder mass properties, which `set_rigid` replaces.
 

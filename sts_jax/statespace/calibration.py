@@ -56,7 +56,7 @@ def predict(
 
     Args:
         model: The networks.
-        inputs: Inputs of n items by name, at least one: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1],
+        inputs: One or more inputs of n items, by name: images `visual` and `tactile` `(n, size, size, 3)` in [0, 1],
             pose codes `pose` `(n, 12)` and true state codes `state` `(n, code)`.
         present: A mask for each name in `inputs`, `(n,)`. True means that the item has the input.
         empty: `visual` and `tactile` image of the empty sensor, in [0, 1].

@@ -194,6 +194,6 @@ def _check_paper(model: mvae.Config, arrays: Arrays, absent: tuple[str, ...]) ->
             if modality.name in values and values[modality.name].shape[1:] != modality.shape:
                 raise ValueError(
                     f"modality {modality.name!r}: the samples have the shape {values[modality.name].shape[1:]}, but "
-                    f"the model needs the shape {modality.shape}: give samples of this shape, or another model"
+                    f"the model needs the shape {modality.shape}: change the samples or the model"
                 )
     _check_condition(model.condition, arrays)

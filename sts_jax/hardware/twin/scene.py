@@ -246,7 +246,7 @@ class ObjectScene(Scene):
             trajectory: Number of the trajectory, from 0. A trajectory that was not simulated before is simulated now.
 
         Raises:
-            ValueError: The object comes to rest in none of 32 successive simulated trajectories.
+            ValueError: The object does not come to rest in any of 32 successive simulated trajectories.
         """
         return self._motion(trajectory).outcome
 
@@ -254,7 +254,7 @@ class ObjectScene(Scene):
         """Return the state of the scene at a time (s), see `Scene.at`.
 
         Raises:
-            ValueError: The object comes to rest in none of 32 successive simulated trajectories.
+            ValueError: The object does not come to rest in any of 32 successive simulated trajectories.
         """
         index = bisect.bisect_right(self._events, time_s, key=lambda event: event[0]) - 1
         since_s, phase, number = self._events[max(index, 0)]
