@@ -64,7 +64,7 @@ def check_condition(scenario: Scenario, start: Start) -> None:
 
 
 def check_outcomes(scenario: Scenario, outcome: np.ndarray) -> None:
-    """Raise a ValueError unless `scenario.outcomes` contains each of the n outcomes, (n,)."""
+    """Raise a ValueError unless `scenario.outcomes` contains all values in `outcome`."""
     known = [int(one) for one in scenario.outcomes]
     other = sorted(set(outcome.tolist()) - set(known))
     if other:
