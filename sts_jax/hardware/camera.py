@@ -183,8 +183,8 @@ class Camera:
         the oldest frame that has not been returned yet.
 
         Args:
-            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera is lost when the call begins,
-                the wait includes the time until it is found again.
+            timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`. If the camera was lost before the call, the
+                camera must be found again within this time, too.
 
         Returns:
             The frame.

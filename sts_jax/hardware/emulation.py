@@ -17,7 +17,7 @@ _TEXTS = {
 class EmulatedController:
     """An emulated LED controller, which replaces the real one where there is no hardware.
 
-    The caller passes the request bytes and the time to `receive`, so no serial port is needed. Not thread-safe.
+    `receive` takes the request bytes and the time, so no serial port is needed. Not thread-safe.
     """
 
     def __init__(self, *, now_s: float = 0.0, boot: int = 1, serial_number: str = "EMULATED"):

@@ -41,7 +41,7 @@ class _Problem:
 class Grabber:
     """The thread that fetches the frames of a camera.
 
-    It runs from the call of `Camera.connect` to that of `Camera.disconnect`.
+    It runs from the call of `Camera.connect` to the call of `Camera.disconnect`.
 
     Only this thread opens, reads and closes the source, which is a device, a stream or a video file. While the thread
     runs, no other `Camera` can use the device or the stream.

@@ -62,7 +62,7 @@ class Body:
         """
         if jnp.ndim(self.vertices) != 2:
             raise ValueError(
-                f"vertices has the shape {jnp.shape(self.vertices)}, but one body has (v, 3): use jax.vmap for "
+                f"vertices has the shape {jnp.shape(self.vertices)}, but it must be (v, 3): use jax.vmap for "
                 "stacked bodies"
             )
         for field in dataclasses.fields(self):

@@ -95,7 +95,7 @@ def rasterise(
         order: Number for each vertex, smaller for nearer vertices. It must be a linear function of column and row on
             each face, such as -1 / depth for a pinhole, or depth for a parallel projection.
         faces: Vertex indices of each face, counter-clockwise as seen from outside the object in a right-handed frame.
-            Padding faces at the end, whose three corners are the same vertex, cost almost nothing.
+            Faces that only pad the array, with three equal corners, cost almost nothing.
         keep: Mask of the vertices that may be drawn. A face is drawn only if the mask is True for all its corners.
         two_sided: If True, faces are also visible from behind.
         shape: Height and width of the image (pixels).

@@ -226,7 +226,7 @@ def _check_numbers(
             wanted = "one finite number" if shape == () else f"{shape[0]} finite numbers"
             raise ValueError(f"{name} is {value!r}, but it must be {wanted}")
     if not 0 <= fill <= 1:
-        raise ValueError(f"fill is {fill}, but this share of the interior's volume must be from 0 to 1")
+        raise ValueError(f"fill is {fill}, but it must be from 0 to 1, as a share of the interior's volume")
     if not shell_scale > 0:
         raise ValueError(f"shell_scale is {shell_scale}, but it must be > 0")
     length = float(np.linalg.norm(np.asarray(up, float)))

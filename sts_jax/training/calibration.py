@@ -46,8 +46,7 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
 
     Returns:
         The calibration, and the checksum of the validation data to which it was fitted (None if unknown). If the folder
-            has no
-        calibration, or if the model's files changed after the fit, the result is None instead of a pair.
+        has no calibration, or if the model's files changed after the fit, the result is None.
 
     Raises:
         DamagedFileError: The file is damaged, or was written by another version of sts_jax.

@@ -393,7 +393,7 @@ class Twin:
         The controller turns the lights off after 1 s without a request. Regular calls of this method keep them on.
 
         Returns:
-            The controller's answer with the current levels, as from `hardware.Leds.ping`.
+            The controller's answer with the current levels. It has the form of an answer of `hardware.Leds.ping`.
 
         Raises:
             RuntimeError: The twin runs on the real clock.

@@ -84,7 +84,7 @@ class Warp(NamedTuple):
 
 
 class Blender:
-    """Makes camera frames from two images of a scene, with the LEDs off and with the LEDs at full power.
+    """Makes camera frames from two images of a scene: one with the LEDs off, and one with the LEDs at full power.
 
     First, call `ends` with both images. This takes as long as making a few frames, so do it only once for each pose of
     the object. Then call `frame` for each frame. Only one thread at a time may call `frame`.
