@@ -45,7 +45,7 @@ class Settling:
 class Switch:
     """The frames that arrive after the lights are switched on or off.
 
-    The last frame must arrive so late that the lights no longer change.
+    The last frame must arrive after the lights have stopped changing.
     """
 
     delays_s: Float[np.ndarray, "n"]  # time from the acknowledgement to the arrival of each frame (s)

@@ -150,10 +150,9 @@ class Released(Scenario):
         - `TOPPLES`, if it has turned by more than 45 degrees (turns about the vertical do not count),
         - `RETURNS`, in all other cases.
 
-        `start` places an object on an edge between two of its faces. The angle between the narrower face and the pad is
-        usually less than 45 degrees. If the two faces meet at a right angle, the angle between the wider face and the
-        pad is then more than 45 degrees. An object that has turned by less than 45 degrees has therefore returned to
-        the narrower face.
+        `start` places an object on an edge between two of its faces, usually with the narrower face at less than 45
+        degrees to the pad. If the two faces meet at a right angle, the wider face is then at more than 45 degrees to
+        the pad. An object that turns by less than 45 degrees can therefore only reach the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)
