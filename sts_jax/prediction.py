@@ -140,7 +140,7 @@ def predict_samples(
         preprocessing: Preprocessing with which the model was trained.
         empty: Images "visual" and "tactile" of the untouched sensor in [0, 1].
         inputs: All inputs of the model by the name of the modality: images (*n, height, width, 3) and poses (*n, 7).
-            `completed` adds placeholders for inputs that are not given.
+            For inputs that are not given, call `completed` first, which adds placeholders.
         present: Masks (*n,) by the name of the modality. False means that the input of this modality is ignored for
             this item of the batch.
         condition: Known parameters of each trajectory in SI units, (*n, c). None for a model that was trained without

@@ -70,7 +70,7 @@ def draw(
 def starts(
     key: PRNGKeyArray, bodies: Body | Sequence[Body], sensor: Sensor, scenario: Scenario, num: int = 1
 ) -> Starts:
-    """Draw `num` random starts of each body without a simulation.
+    """Draw `num` random starts of each body, and simulate nothing.
 
     A start contains an initial pose and hidden properties (friction, mass of the shell, and contents).
     `simulate` draws its starts from the same distribution. The starts of the two functions are independent, even if

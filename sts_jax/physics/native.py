@@ -202,7 +202,7 @@ def roll(
         models: Models of the n trajectories, each a copy of the result of `compile_body`. Their gravity is overwritten.
         points: h vertices of the hull in the mesh frame, (h, 3) (m).
         start: Starts of the n trajectories, with a leading axis of n.
-        gravity: Gravity in each of the s time steps before each of the f frames, (n, f, s, 3) (m/s^2, sensor frame).
+        gravity: Gravity in the s time steps that lead to each of the f frames, (n, f, s, 3) (m/s^2, sensor frame).
         velocity: Velocity on release in the sensor frame, (n, 6): linear velocity of the mesh frame's origin (m/s) and
             angular velocity (rad/s). None for objects at rest.
         freeze: If True, an object is no longer simulated once it has been slower than 1 mm/s and 0.02 rad/s for 0.5 s

@@ -210,8 +210,8 @@ def loss(
             side `input_size`, and pose codes `pose` `(n, 12)`.
         targets: Images `visual` and `tactile` of the last frame `(n, size, size, 3)` in [0, 1] with the side
             `image_size`. State codes `state` of the first frames, `(n, code)`, and pose codes `pose` of the last
-            frames, `(n, 12)`. Index `outcome` of each trajectory's outcome in the list of the scenario's outcomes,
-            `(n,)`.
+            frames, `(n, 12)`. The array `outcome`, `(n,)`, has an index into the list of the scenario's outcomes for
+            each trajectory.
         empty: `visual` and `tactile` image of the empty sensor in [0, 1], with the side `input_size`.
         present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
             in all items. Each item must have at least one input. Values of items whose mask is False have no influence

@@ -98,7 +98,7 @@ def animation(
     """Write an animation of one trajectory: a view from outside, both streams, and the wrench of the pad on the object.
 
     Curves below the images show the wrench from the first to the current frame. A red arrow on the visual stream shows
-    the component of `gravity` along the pad. It appears on a slope and while the pad accelerates. The animation runs at
+    the component of `gravity` along the pad. The arrow appears if the pad slopes or accelerates. The animation runs at
     half the speed of the motion (the constant `SLOWER` is 2).
 
     Args:
