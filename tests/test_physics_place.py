@@ -131,7 +131,7 @@ def test_errors_name_arguments_of_place_that_are_out_of_range(bodies, changes, m
 
 def test_errors_name_bodies_that_cannot_be_placed(bodies):
     leaning = Rotation.from_euler("x", 30, degrees=True).as_matrix().astype(np.float32)
-    with pytest.raises(ValueError, match=r"`face` is 'upright', but the body does not stand"):
+    with pytest.raises(ValueError, match=r"`face` is 'upright', but the body does not stand stably"):
         physics.place(dataclasses.replace(bodies[0], hulls=bodies[0].hulls @ leaning.T), sts.Sensor(), face="upright")
     outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
     with pytest.raises(ValueError, match="the body rests on no face"):

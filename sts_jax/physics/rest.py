@@ -205,7 +205,7 @@ def _index(faces: StableFaces, face: int | str) -> int:
             raise ValueError(f"`face` is {face!r}, but it must be the index of a face or 'upright': {numbered}")
         best = int(np.argmax(faces.up[:, 2]))
         if faces.up[best, 2] < math.cos(UPRIGHT):
-            raise ValueError(f"`face` is 'upright', but the body does not stand with its +z up: {numbered}")
+            raise ValueError(f"`face` is 'upright', but the body does not stand stably with its +z up: {numbered}")
         return best
     if isinstance(face, bool) or not isinstance(face, int | np.integer) or not 0 <= face < count:
         raise ValueError(f"`face` is {face!r}, but the body has no such face: {numbered}")

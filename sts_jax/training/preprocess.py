@@ -67,7 +67,7 @@ class Preprocessing:
         """Encode poses for the networks.
 
         Args:
-            pose: Position (m) and quaternion (w, x, y, z) of each pose. Quaternions are normalised.
+            pose: Position (m) and quaternion (w, x, y, z) of each pose. This method normalises the quaternions.
 
         Returns:
             Position divided by `position_scale`, followed by the nine entries of the rotation matrix row by row. If
