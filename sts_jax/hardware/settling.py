@@ -108,9 +108,9 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
     """Return how far the lights had been switched on or off when an image was taken: 0 means not yet, 1 means fully.
 
     A thumbnail value counts as visible if its change has a magnitude of at least 0.5 (of 255). It counts as clear if
-    this magnitude is also at least a quarter of the median over all visible values. The result is the median of `(look
-    - before) / change` over the clear values. Because of the median, an object that moves in less than half of the view
-    has no influence.
+    this magnitude is also at least a quarter of the median over all visible values. The result is the median of
+    `(look - before) / change` over the clear values. Because of the median, an object that moves in less than half of
+    the view has no influence.
 
     Args:
         look: Thumbnail of the image.
