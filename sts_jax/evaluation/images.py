@@ -68,8 +68,8 @@ def image_summary(
 
     Args:
         predictions: Dictionary from the name of each predictor to its predictions of the last image of each trajectory.
-            The dictionary must contain the predictors of `image_baselines`. A stream that a predictor does not predict
-            is None.
+            The dictionary must contain the predictors of `image_baselines`. None stands for a stream that a predictor
+            does not predict.
         test: The held-out trajectories.
         num: Number of bootstrap samples.
         seed: Seed of the bootstrap.

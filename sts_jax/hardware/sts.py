@@ -323,7 +323,7 @@ class STS:
         return self._started().next(self._limit_s(timeout_ms, 3))
 
     def read_latest(self, max_age_ms: float = 500.0) -> Pair:
-        """Return the newest pair of images that the thread of `async_read` has taken, without waiting.
+        """Return, without waiting, the newest pair of images that the thread of `async_read` has taken.
 
         The same pair may be returned several times. The thread is started if it is not running.
 
