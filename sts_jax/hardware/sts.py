@@ -281,9 +281,9 @@ class STS:
     def read(self, timeout_ms: float | None = None) -> Pair:
         """Take one image of the visual stream and one image of the tactile stream.
 
-        Both frames arrive after the start of the call. The first frame may have been exposed earlier. The time from
-        exposure to arrival is at most one settling time. The first image belongs to the stream for which the lights are
-        already set, so each pair needs only one switch of the lights.
+        Both frames arrive after the start of the call. The exposure of the first frame may be earlier, by at most one
+        settling time of the lights (`settling`). The first image belongs to the stream for which the lights are already
+        set, so the lights are switched only once for a pair.
 
         Args:
             timeout_ms: Longest wait for the pair (ms). None: two times the sensor's `timeout_s`. If the LED controller
