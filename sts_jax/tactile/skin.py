@@ -148,8 +148,9 @@ def shadows(
         share = clip(1 - (atan(max_t (d(x + t u) - d(x)) / t) - e) / penumbra, 0, 1)
 
     d is the depth of the skin, u the unit vector along the gel's face from x towards the light, and t the distance
-    along u. Elevations are angles above the gel's plane (rad), seen from x. The arctangent is the largest elevation of
-    other skin. e is the elevation of the light's lower edge, and e + penumbra is the elevation of its upper edge.
+    along u. An elevation is the angle between a direction from x and the gel's plane (rad), positive into the gel. The
+    arctangent is the largest elevation of other skin. e is the elevation of the light's lower edge, and e + penumbra is
+    the elevation of its upper edge.
 
     A light in the gel's plane, as in the paper, has e = 0. Such a light does not illuminate flat skin or the
     tops of pressed parts, because the normals there are perpendicular to the direction of the light. The shadows of
