@@ -187,7 +187,8 @@ def _read_orbax(path: Path, part: str, wanted: dict[str, Any]) -> dict[str, Arra
         there = ocp.metadata(str(path.absolute()), stored).metadata
         _compare(there, wanted)
         if stored == OPTIMISER and there.keys() != wanted.keys():
-            raise ValueError(f"array {min(there.keys() - wanted.keys())} is not in the state of the given optimiser")
+            extra = min(there.keys() - wanted.keys())
+            raise ValueError(f"the checkpoint has the array {extra}, which the given optimiser's state lacks")
         with context:
             return ocp.load(str(path.absolute()), abstract, checkpointable_name=stored)
 
