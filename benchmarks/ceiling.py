@@ -52,8 +52,8 @@ class Args:
     def __post_init__(self) -> None:
         if self.times < 2:
             raise ValueError(
-                "--times, the number of simulations from each held-out start, must be at least 2, so that the final "
-                f"poses can be compared, got {self.times}"
+                f"--times is {self.times}, but the number of simulations from each held-out start must be at least 2, "
+                "so that the final poses can be compared"
             )
 
 

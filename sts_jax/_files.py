@@ -44,8 +44,7 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> None:
         temporary.replace(path)
     except OSError as error:
         raise OSError(
-            f"cannot write {path}: {error}. {remedy(error)}, then start again. Everything that was finished before is "
-            "kept."
+            f"cannot write {path}: {error}. {remedy(error)}, then start again. All finished results are kept."
         ) from error
     finally:
         with contextlib.suppress(OSError):

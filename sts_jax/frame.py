@@ -195,8 +195,8 @@ def touch(
         Image in [0, 1]. If its shorter side has at least `Sensor.fine_below` pixels, it equals the image
         `Frame.tactile` that `sense` renders for the same imprint. For smaller images, `sense` samples more finely than
         `touch`. If a number in a traced `window` or in a traced constant of the sensor is invalid, no error is raised.
-        Instead, the image shows flat skin, and `window` counts as None. If a traced constant is invalid, all traced
-            constants get their default values.
+        In both cases, the image shows flat skin, and `window` counts as None. In the second case, all traced constants
+        also get their default values.
 
     Raises:
         TypeError: `sensor` is not a `Sensor`, or `imprint` or `window` is not an array of numbers.

@@ -86,7 +86,9 @@ def test_other_types_than_sensor_and_body_raise_an_error():
     for given, message in cases:
         with pytest.raises(TypeError, match=message):
             sense(*given, POSE, WRENCH)
-    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\), but one body .* jax\.vmap"):
+    with pytest.raises(
+        ValueError, match=r"vertices has the shape \(2, 1024, 3\), but it must be \(v, 3\): use jax\.vmap for"
+    ):
         sense(SENSOR, objects.stack([BODY, BODY]), POSE, WRENCH)
     for call in (touch, expose):
         with pytest.raises(TypeError, match="sensor is None, but it must be a Sensor"):

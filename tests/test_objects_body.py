@@ -92,7 +92,9 @@ def test_check_refuses_an_invalid_body_and_names_the_field(changes, message):
     changes = {name: jnp.full_like(getattr(body, name), value) for name, value in changes.items()}
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(body, **changes).check()
-    with pytest.raises(ValueError, match=r"vertices has the shape \(2, 1024, 3\), but one body .* jax.vmap"):
+    with pytest.raises(
+        ValueError, match=r"vertices has the shape \(2, 1024, 3\), but it must be \(v, 3\): use jax.vmap for"
+    ):
         objects.stack([body, body]).check()
 
 

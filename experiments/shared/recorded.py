@@ -182,9 +182,9 @@ def jobs(config: Config, data: Recorded) -> Iterator[stages.Job]:
         arrays, own = training.image_arrays(visual, tactile, modalities, preprocessing, blank)
         if own.absent:
             raise ValueError(
-                "none of the initial tactile images for training shows a contact: draw the images with `python -m "
-                "experiments.real review --sheet review.png`, and compare them with the tactile background image that "
-                "sensor.json names"
+                "none of the initial tactile images for training shows a contact: write a sheet of the images with "
+                "`python -m experiments.real review --sheet review.png`, and compare it with the tactile background "
+                "image that sensor.json names"
             )
         schedule = config.training
         if config.steps is not None:

@@ -342,7 +342,7 @@ def load(folder: str | Path) -> Dataset:
         path = records.shard_path(folder, count, index)
         if not path.with_suffix(".npz").exists():
             raise FileNotFoundError(
-                f"{path.with_suffix('.npz')} is missing: the collection is not finished. Collect again to resume it."
+                f"{path.with_suffix('.npz')} is missing: the collection is not finished. Call `collect` to continue it."
             )
         parts.append(records.read_shard(path, records.Identity(made_of, seen_by, index)))
         shards.append(path)

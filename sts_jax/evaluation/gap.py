@@ -90,7 +90,7 @@ def pixel_errors(real: np.ndarray, simulated: np.ndarray, group: np.ndarray) -> 
 
 
 def features(images: np.ndarray) -> np.ndarray:
-    """Compute colours and oriented gradients in 4 x 4 cells of each image. No network is involved.
+    """Compute colours and oriented gradients in 16 cells of each image, in 4 rows of 4 cells. No network is involved.
 
     A cell has two kinds of features. The colours are the means of the three channels. The gradients are the mean
     absolute differences of neighbouring pixels of the grey image, in four directions (horizontal, vertical and both

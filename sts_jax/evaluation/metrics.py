@@ -170,8 +170,8 @@ def gradient_energy(images: np.ndarray) -> np.ndarray:
 def energy_score(samples: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Compute the energy score `E|X - y| - E|X - X'| / 2` of samples X of a position, whose true value is y.
 
-    X' is another sample. The second mean is taken over the k (k - 1) pairs of different samples, so the expected score
-    does not depend on k. The score of a single sample is its distance from the true position.
+    X' is another sample. The mean of |X - X'| is taken over the k (k - 1) pairs of different samples, so the expected
+    score does not depend on k. The score of a single sample is its distance from the true position.
 
     Args:
         samples: k samples of n positions with d coordinates, `(k, n, d)`.
@@ -333,7 +333,7 @@ def auc(positive: np.ndarray, score: np.ndarray, weight: np.ndarray | None = Non
         weight: Weights of the items, `(n,)` (default: 1).
 
     Returns:
-        The area, or NaN if all items with a weight above 0 are positive or all are negative.
+        The area, or NaN without a positive item or without a negative item. Items with the weight 0 are ignored.
     """
     w = np.ones(len(score)) if weight is None else weight
     _, place = np.unique(score, return_inverse=True)

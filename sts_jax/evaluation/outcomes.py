@@ -78,7 +78,7 @@ def outcome_of_image(
 ) -> np.ndarray:
     """Determine from the last visual image of each trajectory whether the object fell off.
 
-    The outcome is `FELL_OFF` if the image shows no object. Otherwise, it is always `stays`, because only poses
+    The outcome is `FELL_OFF` if the image shows no object. Otherwise, it is always `stays`. The images are not used to
     distinguish the outcomes of objects that stay on the pad.
 
     Args:

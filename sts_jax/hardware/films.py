@@ -120,7 +120,7 @@ class RecordedFilm(Film):
             self._files[stream] = path.open("rb")
         except OSError as error:
             raise type(error)(
-                f"{path} cannot be read ({error}), but {FRAMES} lists {len(places)} images of this file. Check the "
+                f"{path} cannot be read ({error}). According to {FRAMES}, it contains {len(places)} images. Check the "
                 "file, or copy the recording again."
             ) from error
         size = path.stat().st_size

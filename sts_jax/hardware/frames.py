@@ -131,7 +131,7 @@ class Pace:
         self._gap = gap._replace(frames=frames, missing=missing) if missing and frames < gap.limit else None
 
     def interrupted(self) -> None:
-        """Ignore the interval before the next frame in the measurement of the period and in the count of lost frames.
+        """Exclude the interval before the next frame from the measured period and from the count of lost frames.
 
         Call this method after an interruption of the connection.
         """

@@ -158,7 +158,7 @@ class Session:
 
     @property
     def waiting(self) -> int:
-        """Number of changes, such as new pairs of images and confirmations, that are not on disk yet."""
+        """Number of changes that are not on disk yet, such as confirmations and new pairs of images."""
         with self._changed:
             return len(self._jobs)
 

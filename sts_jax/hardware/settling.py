@@ -115,7 +115,7 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
     Args:
         look: Thumbnail of the image.
         before: Thumbnail of an image before the switch.
-        change: Thumbnail after the switch minus thumbnail before it, measured on earlier images.
+        change: Difference of two thumbnails: after minus before an earlier switch in the same direction.
 
     Returns:
         0 if the image shows the lights before the switch, and 1 if it shows the lights after the switch. The result is
@@ -160,8 +160,9 @@ def settling(on: Sequence[Switch], off: Sequence[Switch], period_s: float) -> Se
 def last_mixed(switch: Switch, dark: Thumbnail, lit: Thumbnail) -> float:
     """Return the time from the acknowledgement of a switch to the arrival of the last frame that is not settled (s).
 
-    A frame is settled if its `light_share` differs by at most 0.02 from the `light_share` of the last frame in
-    `switch`. If all frames are settled, the result is 0. The result is never negative.
+    The function `light_share` returns 0 for a frame like `dark` and 1 for a frame like `lit`. A frame is settled if
+    this value differs by at most 0.02 from the value of the last frame in `switch`. If all frames are settled, the
+    result is 0. The result is never negative.
 
     Args:
         switch: The frames after a switch of the lights.

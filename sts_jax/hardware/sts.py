@@ -54,7 +54,7 @@ class STS:
 
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
       lights. Earlier frames may show the previous state of the lights.
-    - Two successive frames since the switch have shown the effect of the new lights.
+    - Two successive frames have already shown the effect of the switch.
     - After the frame arrived, the controller answered the next request. This answer shows that the lights have not
       changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.
@@ -415,7 +415,7 @@ class STS:
 
         Raises:
             NoContrastError: The lights do not change the image.
-            LightError: The image was still changing `watch_s` seconds after a switch, in each of three attempts.
+            LightError: In each of three attempts, the image had not settled within `watch_s` seconds after a switch.
             LedError: The controller does not answer.
             CameraError: The sensor is not connected, or the camera sends no usable frames.
         """
@@ -495,7 +495,7 @@ def stream_order(duty: float, dwell: int) -> Iterator[Stream]:
 def first_still(shots: Iterable[Shot], timeout_s: float, window_s: float) -> Shot:
     """Wait until the view has been still for `window_s` seconds, and return the last image of this period.
 
-    `STS.wait_until_still` describes when a view is still.
+    See `STS.wait_until_still` for the definition of a still view.
 
     Args:
         shots: Successive images of the visual stream.

@@ -85,8 +85,8 @@ def loss(
     predicts the targets from the inputs of the modalities in the subset.
 
     The `absent` modalities are removed from all subsets. If several subsets are then equal, the term of one subset is
-    computed and multiplied by the number of equal subsets. Naming a modality in `absent` gives the same loss as masking
-    it in every sample, in less time.
+    computed and multiplied by the number of equal subsets. A modality that is masked in every sample gives the same
+    loss, but takes more time.
 
     For each modality, one call of the decoder predicts the targets for all subsets. Batch normalisation computes one
     mean and one variance of each channel for this call. As in the loss, n equal subsets count n times in this
@@ -270,7 +270,8 @@ def _check(
     if set(targets) != set(config.names):
         raise ValueError(
             f"targets has the names {sorted(targets)}, but the loss needs exactly one target for each modality "
-            f"{sorted(config.names)}: add or remove targets. If samples lack a target, mask it in target_present"
+            f"{sorted(config.names)}: add or remove targets. If some samples lack a target, set target_present to "
+            "False for these samples"
         )
 
 

@@ -45,8 +45,9 @@ def assemble(
             of `vertices`. None for an object without contents.
         contents_density: Density of the contents (kg/m^3).
         mass: Mass of the object without contents (kg). The masses of all faces are multiplied by one factor, so that
-            their sum is `mass`. None computes the mass from `density` and the areas of the faces.
-        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row. None sets all to 0.
+            their sum is `mass`. If it is None, the mass is computed from `density` and the areas of the faces.
+        uv: Texture coordinates of each corner of each face, with v = 0 at the texture's top row. If `uv` is None, all
+            coordinates are 0.
         texture: Square texture in linear light, [0, 1]. Its side is 1, 256 or 1024 pixels. If `texture` is None, the
             texture is one white pixel.
         two_sided: True if faces are also visible from behind.

@@ -111,9 +111,9 @@ def surface_gaps(
     """Compute the largest distances between a visible surface and its collision parts.
 
     Each distance is a maximum over points of the visible surface or of the parts: all corners, and 10,000 other points.
-    The distance of each point from the other side is exact. The true maximum can lie between the points. The returned
-    value is then too small by about half the distance between neighbouring points. For a single hull, the first
-    returned value is exact.
+    The distance from each of these points to the parts or to the visible surface is exact. The true maximum can lie
+    between the points. The returned value is then too small by about half the distance between neighbouring points. For
+    a single hull, the first returned value is exact.
 
     Args:
         vertices: Vertices of the visible surface (m).

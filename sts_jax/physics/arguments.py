@@ -91,7 +91,7 @@ def check_hidden(hidden: Hidden, count: int) -> Hidden:
         if values.shape != expected:
             raise ValueError(
                 f"hidden.{name} has shape {values.shape}, but it must be {expected}, with one entry for each of the "
-                f"{count} trajectories (number of bodies times num)"
+                f"{count} trajectories (the number of bodies times `num`)"
             )
         if not np.isfinite(values).all():
             raise ValueError(f"hidden.{name} has values that are not finite, but all must be finite")

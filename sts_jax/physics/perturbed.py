@@ -29,7 +29,7 @@ from sts_jax.physics.scene import Contact
 
 
 class Jerk(NamedTuple):
-    """The condition of `Perturbed`: a constant acceleration of the pad for a short time, from frame 0 on."""
+    """The condition of `Perturbed`: a short, constant acceleration of the pad, which begins at frame 0."""
 
     acceleration: Float[Array | np.ndarray, "*n 2"]  # acceleration of the pad along x and y (m/s^2)
     duration: Float[Array | np.ndarray, "*n"]  # duration of the acceleration (s)
@@ -52,8 +52,8 @@ class Perturbed(Scenario):
     The condition of a trajectory contains the acceleration of the pad along x and y (m/s^2) and its duration (s). The
     simulation runs in the frame of the pad, so the acceleration of the pad is subtracted from gravity.
 
-    The share of the interior that is filled (`fill`) matters most for objects with a narrow base. The default ranges
-    are therefore chosen for bottles.
+    The share of the interior that is filled (`fill`) matters most for objects with a narrow base. The default ranges of
+    the fields are therefore chosen for bottles.
 
     Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
     section "Data Collection".

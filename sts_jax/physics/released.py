@@ -45,7 +45,7 @@ class Released(Scenario):
     (`held.held_wrench`). It does not depend on the motion after the release.
 
     Each trajectory draws its values uniformly from the ranges in the fields. Source: the See-Through-your-Skin paper,
-    section "Real-World Dataset", where a small camera is released by hand.
+    section "Real-World Dataset", where the object is a small camera.
     """
 
     symmetries = tuple(range(8))
@@ -104,8 +104,8 @@ class Released(Scenario):
 
         The object stands on a stable face and is tilted about an edge of this face. The edge is chosen from random
         edges (the field `tries` is their number). Edges at which the object balances at a tilt of 15 to 45 degrees are
-        preferred. If no random edge is of this kind, for example for a cylinder on its side, the object is tilted about
-        any of them.
+        preferred. If no random edge is of this kind, for example for a cylinder on its side, one of the other random
+        edges is used.
 
         If the edge is a preferred one, the object stands on the narrower of the two faces that meet at the edge. In
         most cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than
@@ -152,7 +152,7 @@ class Released(Scenario):
 
         `start` places an object on an edge between two of its faces, usually with the narrower face at less than 45
         degrees to the pad. If the two faces meet at a right angle, the wider face is then at more than 45 degrees to
-        the pad. An object that turns by less than 45 degrees can therefore only reach the narrower face.
+        the pad. An object that turns by less than 45 degrees can therefore only come to rest on the narrower face.
         """
         before, after = (geometry.quat_to_matrix(geometry.normalize(pose[3:]))[2] for pose in (first, last))
         stays = jnp.where(before @ after < math.cos(TURNED), Outcome.TOPPLES, Outcome.RETURNS)

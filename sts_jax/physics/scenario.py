@@ -355,7 +355,7 @@ def variant(scenario: _AnyScenario, name: str) -> _AnyScenario:
         scenario: Scenario to copy. Its other fields stay the same.
         name: Name of the variant. "default" changes nothing. "off" fixes each hidden property at the middle of its
             range, and the contents of an object lie at its base. "wide-friction" draws friction from 0.3 to 0.9. With
-            "off-centre", the contents lie at any side of the object, as in `Inclined` by default.
+            "off-centre", the contents lie at any side of the object, which is the default of the scenario `Inclined`.
 
     Returns:
         A scenario of the same class.

@@ -33,14 +33,14 @@ def where_active(
     over the whole image.
 
     Args:
-        function: Function `(params, images) -> result`. It must map a pytree of images of any shape
-            (a + 2 ring, b + 2 ring) to a pytree of images (a, b). A pixel of the result must depend only on pixels at
-            most `ring` rows and columns away. `function` may receive a batch of tiles as images of shape
-            (a + 2 ring, b + 2 ring, number of tiles). It must then return images of shape (a, b, number of tiles).
-            `function` must not close over traced values. Pass traced values in `params`.
+        function: Function `(params, images) -> result`. For any a and b, it must map a pytree of images (a + 2 * ring,
+            b + 2 * ring) to a pytree of images (a, b). A pixel of the result must depend only on pixels at most `ring`
+            rows and columns away. `function` may receive a batch of tiles as images of shape (a + 2 * ring, b + 2 *
+            ring, number of tiles). It must then return images of shape (a, b, number of tiles). `function` must not
+            close over traced values. Pass traced values in `params`.
         active: Mask of the pixels at which the result is needed.
         params: First argument of `function`.
-        images: Pytree of images (h + 2 ring, w + 2 ring). An image with a single row or column is broadcast.
+        images: Pytree of images (h + 2 * ring, w + 2 * ring). An image with a single row or column is broadcast.
         otherwise: Pytree of images (h, w) with the result at pixels that are not active. Its structure must be the
             structure that `function` returns.
         ring: Number of neighbouring pixels in each direction that `function` needs.

@@ -85,7 +85,7 @@ def turn(angle: Float[Array, "n 2"], coefficients: Float[Array, "n c k"]) -> Flo
 
 
 def turn_variance(angle: Float[Array, "n 2"], variance: Float[Array, "n c k"]) -> Float[Array, "n c k"]:
-    """Compute the variances of spherical harmonic coefficients after a rotation of the functions about the z axis.
+    """Compute the variances of spherical harmonic coefficients after a rotation about the z axis.
 
     Args:
         angle: Cosine and sine of the rotation angle of each object.

@@ -156,7 +156,7 @@ class FinalPose(NamedTuple):
 class Layers(NamedTuple):
     """Outlines and colours of n rendered objects, and the changes that the objects cause in the tactile images.
 
-    `compose` combines them with the images of the empty sensor to full images.
+    `compose` combines them with the images of the empty sensor, and returns complete images.
     """
 
     covered: Float[Array, "n size size 1"]  # logit of the probability that a pixel shows the object
@@ -190,9 +190,10 @@ class _ResidualDense(nnx.Module):
 def parts(config: Config, look: Float[Array, "n look"]) -> tuple[Array, Array, Array]:
     """Split appearance codes into traits and functions on the unit sphere.
 
-    Traits are numbers that do not depend on the object's rotation. A function assigns a number to each direction. If
-    the object rotates, the functions rotate with the object. The coefficients of functions in the mesh frame then stay
-    the same. The coefficients of functions in the sensor frame change.
+    Traits are numbers that do not depend on the object's rotation. A function assigns a number to each direction, and
+    rotates with the object. Some functions are expressed in the mesh frame, and their coefficients do not depend on the
+    rotation of the object. The other functions are expressed in the sensor frame, and their coefficients change when
+    the object rotates.
 
     Args:
         config: Configuration of the model. Its fields are the number of traits (`traits`), the number of functions in

@@ -58,9 +58,9 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: Row indices for the arrays in the fields `views` and `falls`, passed as the keyword arguments
-                `views` and `falls`. A row is an entry along the first axis. If an argument is not given, the field of
-                the same name is left out of the batch.
+            further: Keyword arguments `views` and `falls`. Each selects the rows with these indices from all arrays in
+                the field of the same name. A row is an entry along the first axis. Without the argument, the batch
+                lacks the field.
 
         Returns:
             The selected arrays by name of the field. The field named `empty` is included as a whole.

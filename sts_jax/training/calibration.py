@@ -49,7 +49,7 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
         has no calibration, or if the model's files changed after the fit, the result is None.
 
     Raises:
-        DamagedFileError: The file is damaged, or was written by another version of sts_jax.
+        DamagedFileError: `calibration.json` is damaged, or was written by another version of sts_jax.
     """
     path = folder / NAME
     remedy = (

@@ -158,8 +158,8 @@ def _check_condition(expected: int, arrays: Arrays) -> None:
     width = 0 if arrays.condition is None else arrays.condition.shape[1]
     if width != expected:
         raise ValueError(
-            f"`condition` has width {width}, but the model needs width {expected}: give a condition of this width "
-            f"(None for width 0), or a model with condition={width}"
+            f"`condition` has width {width}, but the model needs width {expected}: give a condition of width "
+            f"{expected} (None if the width is 0), or a model with condition={width}"
         )
 
 

@@ -53,7 +53,7 @@ class Hand(AutomaticPerson):
 
         Raises:
             ValueError: The instruction stays the same for longer than the argument `patience_s` of `Hand`, or no
-                contact is detected in ten held poses in a row.
+                contact is detected while the object is held in ten poses in a row.
         """
         super().show(view)
         entered, self._seen = view.stage is not self._seen, view.stage
@@ -74,7 +74,7 @@ class Hand(AutomaticPerson):
         if self._now_s - self._since_s > self._patience_s or self._unseen == _UNSEEN:
             raise ValueError(
                 f"hardware.collect has shown the instruction `{view.instruction}` for "
-                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, without movement: {view.still}): the "
+                f"{self._now_s - self._since_s:.1f} s (contact: {view.contact}, still: {view.still}): the "
                 "thresholds of hardware.collect do not suit the twin's images, or patience_s of Hand is too short. "
                 "Change the argument config (a GuideConfig) of hardware.collect, or increase patience_s"
             )
