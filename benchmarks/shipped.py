@@ -1,6 +1,7 @@
 """Metrics of the models that come with the library, on many objects that no model was trained on.
 
     python -m benchmarks.shipped perturbed    # about 15 minutes on two CPU cores, 5 GB of memory
+    python -m benchmarks.shipped perturbed --trained runs/perturbed/models/statespace    # another trained model
 
 The held-out objects of an experiment are few, so its table has wide intervals for the metrics of the outcome. This
 command draws new objects from the distribution of the experiment, and simulates and renders four trajectories of each.
@@ -24,7 +25,7 @@ import sts_jax as sts
 from experiments import freefall, inclined, perturbed, released
 from experiments.shared.judging import MAIN_SUBSETS
 from experiments.shared.progress import Bar
-from sts_jax import dataset, evaluation
+from sts_jax import dataset, evaluation, physics, statespace
 
 EXPERIMENTS = {"freefall": freefall, "inclined": inclined, "perturbed": perturbed, "released": released}
 PER_OBJECT = 4  # trajectories of each object
@@ -53,7 +54,9 @@ DRAWS = 200  # number of times that outcomes are drawn from the probabilities
 class Args:
     """Options of the command line."""
 
-    model: Annotated[Literal["freefall", "inclined", "perturbed", "released"], tyro.conf.Positional]  # shipped model
+    # experiment, which is also the name of its shipped model
+    model: Annotated[Literal["freefall", "inclined", "perturbed", "released"], tyro.conf.Positional]
+    trained: Path | None = None  # folder of a state-space model of this experiment, to measure it instead
     objects: int = 1250  # number of objects. A fifth of them are for the baselines
     seed: int = 100  # seed of the objects and trajectories. The models were trained with the seed 2
     workdir: Path | None = None  # folder for the trajectories (default: runs/shipped-MODEL)
@@ -89,18 +92,22 @@ def main(args: Args) -> str:
     """Simulate the trajectories, and return a table of the main metrics and a table of the metrics of the samples.
 
     Raises:
-        ValueError: There are fewer than 5 objects, or the work directory has the trajectories of other options.
+        FileNotFoundError: The folder `--trained` contains no model.
+        ValueError: There are fewer than 5 objects, the work directory has the trajectories of other options, or the
+            model in `--trained` is not a state-space model of the experiment's scenario.
     """
     if args.objects < 5:
         raise ValueError(
             f"--objects must be at least 5, because a fifth of the objects is for the baselines, got {args.objects}"
         )
     sts.enable_compilation_cache()
+    scenario = EXPERIMENTS[args.model].COLLECTION.scenario
+    predictor = _predictor(args, scenario)
     folder = args.workdir or Path("runs") / f"shipped-{args.model}"
-    made, scenario = collection(args), EXPERIMENTS[args.model].COLLECTION.scenario
+    made = collection(args)
     with Bar() as bar:
         dataset.collect(made, sts.Sensor(), folder, progress=lambda p: bar(f"collect: {p.stage}", p.done, p.total))
-    data, predictor = dataset.load(folder), sts.Predictor.load(args.model)
+    data = dataset.load(folder)
     rows = evaluation.rows_of(data, "object")
     size = EXPERIMENTS[args.model].DEFAULT.image_size
     train, given = dataset.reduced(data.pairs(rows["train"]), size), data.pairs(rows["test"])
@@ -128,11 +135,27 @@ def main(args: Args) -> str:
             "vision."
         )
     summary = evaluation.summarise(scores, test, outcomes=scenario.outcomes)
-    title = f"{args.model}: the shipped model on new objects (seed {args.seed})"
+    measured = "the shipped model" if args.trained is None else f"the model in {args.trained}"
+    title = f"{args.model}: {measured} on new objects (seed {args.seed})"
     main_table = evaluation.table(summary, title=title, notes=notes, columns=COLUMNS)
     title = f"{args.model}: {NUM_SAMPLES} samples of each prediction"
     sample_table = evaluation.table(summary, title=title, rows=[*subsets], columns=SAMPLE_COLUMNS)
     return f"{main_table}\n{sample_table}"
+
+
+def _predictor(args: Args, scenario: physics.Scenario) -> sts.Predictor:
+    """Load the model, and check that it was trained for the scenario."""
+    predictor = sts.Predictor.load(args.trained or args.model)
+    config, outcomes, known = predictor.model.config, len(scenario.outcomes), len(scenario.condition_scale)
+    if not isinstance(config, statespace.Config):
+        raise ValueError(f"--trained {args.trained} is not a state-space model: give the folder of a state-space model")
+    if (config.outcomes, config.condition) != (outcomes, known):
+        raise ValueError(
+            f"the model in --trained {args.trained} has {config.outcomes} outcomes and a condition of width "
+            f"{config.condition}, but {args.model} has {outcomes} outcomes and a condition of width {known}: give a "
+            f"model of {args.model}"
+        )
+    return predictor
 
 
 if __name__ == "__main__":

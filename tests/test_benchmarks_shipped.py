@@ -1,8 +1,13 @@
 """Metrics of the shipped models on new objects: the calibration error of exact probabilities, and a small run."""
 
+import dataclasses
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import sts_jax
 from benchmarks import shipped
 from sts_jax import dataset
 
@@ -26,6 +31,15 @@ def test_too_few_objects_are_refused(tmp_path):
     assert not (tmp_path / "work").exists()
 
 
+def test_a_model_of_another_scenario_is_refused(tmp_path):
+    other = Path(sts_jax.__file__).parent / "models" / "perturbed"
+    with pytest.raises(ValueError, match=r"--trained .*perturbed has 4 outcomes and a condition of width 3, but"):
+        shipped.main(shipped.Args("freefall", trained=other, workdir=tmp_path / "work"))
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        shipped.main(shipped.Args("freefall", trained=tmp_path / "nothing", workdir=tmp_path / "work"))
+    assert not (tmp_path / "work").exists()
+
+
 @pytest.mark.slow
 def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     args = shipped.Args("released", objects=10, workdir=tmp_path / "work")
@@ -41,3 +55,7 @@ def test_a_small_run_prints_the_metrics_of_every_input(tmp_path):
     assert 0 < energy < 100
     assert 0 < coverage <= 1
     assert shipped.main(args) == text  # the trajectories are reused
+    copy = shutil.copytree(Path(sts_jax.__file__).parent / "models" / "released", tmp_path / "copy")
+    same = shipped.main(dataclasses.replace(args, trained=copy))
+    assert f"the model in {copy}" in same
+    assert same.splitlines()[1:] == text.splitlines()[1:]

@@ -134,7 +134,7 @@ def test_errors_name_bodies_that_cannot_be_placed(bodies):
     with pytest.raises(ValueError, match=r"`face` is 'upright', but the body does not stand stably"):
         physics.place(dataclasses.replace(bodies[0], hulls=bodies[0].hulls @ leaning.T), sts.Sensor(), face="upright")
     outside = dataclasses.replace(bodies[0], shell_com=jnp.array([0.3, 0.2, 0.3]), contents_density=jnp.float32(0))
-    with pytest.raises(ValueError, match="the body rests on no face"):
+    with pytest.raises(ValueError, match="the body cannot rest on any of its faces"):
         physics.place(outside, sts.Sensor())
     with pytest.raises(ValueError, match="hulls span no volume"):
         physics.place(dataclasses.replace(bodies[0], hulls=jnp.zeros((1, 64, 3))), sts.Sensor())

@@ -102,8 +102,8 @@ def _of_stream(predictions: Mapping[str, Predicted], test: Streams, stream: str,
             continue
         if images.shape != truth.shape:
             raise ValueError(
-                f"prediction {name!r}: {stream} has shape {images.shape}, but it must have the shape of the true last "
-                f"images, {truth.shape}"
+                f"prediction {name!r}: {stream} has shape {images.shape}, but the true images have shape "
+                f"{truth.shape}: give predicted images of this shape"
             )
         errors[name] = image_error(in_unit(images), truth)
     reference = errors[CONSTANT]

@@ -153,8 +153,8 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
 
     An observation contains the mean colours of blocks of the images, see `observe`. The mean colour of a block varies
     from observation to observation, and the standard deviation of this variation is the noise of the block. A few
-    observations can underestimate the noise. A noise below the median is therefore raised to the median. The median is
-    taken over all blocks that have the same size and belong to the same image.
+    observations can underestimate the noise. The noise of a block is therefore at least the median noise of all blocks
+    of the same size in the same stream.
 
     Args:
         observations: At least two observations of the empty pad without movement.

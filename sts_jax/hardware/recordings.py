@@ -404,7 +404,7 @@ def _pair_sum(path: Path, end: str) -> str:
     if not file.exists():
         raise FileNotFoundError(
             f"trajectory {path.name} cannot be confirmed, because it has no {end} pair of images ({file} does not "
-            "exist): discard the trajectory, or give another number."
+            "exist): discard the trajectory, or give the number of another trajectory."
         )
     return _files.sha256(file)
 
@@ -478,8 +478,8 @@ def read_trajectory(folder: Path, number: int) -> RecordedTrajectory:
         raise DamagedFileError(f"{file} is damaged (its checksum does not match its content): {_remedy(number)}.")
     if content["number"] != number:
         raise DamagedFileError(
-            f"{file} belongs to trajectory {content['number']}, not to trajectory {number}: rename the folder to "
-            f"{content['number']:05d}, or discard trajectory {number}."
+            f"{file} belongs to trajectory {content['number']}, but lies in the folder of trajectory {number}: rename "
+            f"this folder to {content['number']:05d}, or discard trajectory {number} with discard_recording()."
         )
     initial, final = (read_pair(path / end, number, content[end]) for end in _ENDS)
     return RecordedTrajectory(number, initial, final, content["confirmed"], content["note"])

@@ -195,8 +195,8 @@ def _index(faces: StableFaces, face: int | str) -> int:
     count = len(faces.up)
     if not count:
         raise ValueError(
-            "the body rests on no face. Its centre of mass would have to lie above a face, and at least 0.5 mm inside "
-            "the outline of this face. Give `sense` a pose of your own."
+            "the body cannot rest on any of its faces. A body rests on a face if its centre of mass lies above the "
+            "face, at least 0.5 mm inside the face's outline. Give `sense` a pose of your own."
         )
     numbers = f"faces 0 (the most likely) to {count - 1}" if count > 1 else "face 0 only"
     numbered = f"the body rests on {numbers}"

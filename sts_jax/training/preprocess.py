@@ -139,10 +139,10 @@ def touch_of_noisy_images(
     by more than a threshold. The threshold is six times the standard deviation of the noise in the mean of a block, but
     at least 3/255 and at most 24/255.
 
-    The standard deviation is estimated as 1.4826 times the median absolute difference between the block means of the
-    images and of the blank image. The median difference of each channel of an image is first subtracted from all
-    differences of this channel, so a uniform change of the light does not count. Contacts on less than half of the pad
-    hardly change the estimate. An uneven change of the light since the blank image increases the estimate.
+    The estimate of the standard deviation uses the differences between the block means of the images and of the blank
+    image. The median is subtracted from the differences of each channel of an image, so a uniform change of the light
+    does not count. The estimate is 1.4826 times the median absolute value of the results. Contacts on less than half of
+    the pad hardly change the estimate. An uneven change of the light since the blank image increases the estimate.
 
     Args:
         preprocessing: Preprocessing whose fields are kept, except the four fields of the contact test.
