@@ -152,8 +152,8 @@ def _predictor(args: Args, scenario: physics.Scenario) -> sts.Predictor:
     if (config.outcomes, config.condition) != (outcomes, known):
         raise ValueError(
             f"the model in --trained {args.trained} has {config.outcomes} outcomes and a condition of width "
-            f"{config.condition}, but {args.model} has {outcomes} outcomes and a condition of width {known}: give a "
-            f"model of {args.model}"
+            f"{config.condition}, but the experiment {args.model} has {outcomes} outcomes and a condition of width "
+            f"{known}: give a model that this experiment trained"
         )
     return predictor
 

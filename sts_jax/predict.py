@@ -325,7 +325,8 @@ class Predictor:
         """Check the argument `state`, and return it as float32."""
         if isinstance(self.model.config, mvae.Config):
             raise ValueError(
-                f"{self.name} does not accept the argument state: only state-space models do. Leave out this argument."
+                f"{self.name} does not accept the argument `state`, because it is not a state-space model: leave out "
+                "`state`."
             )
         array = _arguments.checked_array("state", value, f"{statespace.STATE_CODE} numbers, from statespace.encode")
         if array.shape != (*lead, statespace.STATE_CODE):

@@ -466,7 +466,7 @@ def test_a_true_state_determines_the_belief_and_a_wrong_one_is_refused(state_pre
     ):
         with pytest.raises(ValueError, match=message):
             state_predictor(visual=given["visual"], condition=CONDITION, state=wrong)
-    with pytest.raises(ValueError, match="does not accept the argument state: only state-space models do"):
+    with pytest.raises(ValueError, match="does not accept the argument `state`, because it is not a state-space model"):
         predictor(pose=given["pose"], state=code)
 
 

@@ -155,8 +155,8 @@ def predict(
 ) -> Predicted:
     """Predict the last frames of held-out trajectories with a model, from some of its inputs.
 
-    The predicted outcome follows from the predicted pose. If the model predicts outcome probabilities, these are used.
-    Otherwise, the probabilities are the shares of the outcomes among the samples, if there are samples.
+    The predicted outcome follows from the predicted pose. The outcome probabilities are those of the model, if it
+    predicts any. Otherwise, they are the shares of the outcomes among the samples, if there are samples.
 
     If the model predicts no pose, the outcome follows from the predicted visual image. This requires a scenario with
     two outcomes, and the arguments `validation` and `blank`. If the image shows no object, the outcome is `FELL_OFF`.
@@ -188,7 +188,8 @@ def predict(
     def run(pairs: Pairs, num_samples: int) -> Predicted:
         """Predict the trajectories in groups of equal size, to limit the memory.
 
-        The last group is filled with copies of the last trajectory, and their predictions are removed.
+        If the last group is too small, copies of the last trajectory are added to it, and the predictions of the copies
+        are removed.
         """
         count = len(pairs.object)
         size, parts = min(count, _CHUNK), []

@@ -203,8 +203,8 @@ class Camera:
     def async_read(self, timeout_ms: float | None = None) -> Captured:
         """Return the oldest frame in the buffer, or wait for the next frame if the buffer is empty.
 
-        The buffer contains the newest `CameraConfig.buffer` frames that have not been returned yet. A frame may have
-        been exposed before the call.
+        The buffer contains the newest frames that have not been returned yet, at most `CameraConfig.buffer` frames. A
+        frame may have been exposed before the call.
 
         Args:
             timeout_ms: Longest wait (ms). None: `CameraConfig.timeout_s`.

@@ -153,8 +153,8 @@ def empty_pad(observations: Sequence[Observation]) -> EmptyPad:
 
     An observation contains the mean colours of blocks of the images, see `observe`. The mean colour of a block varies
     from observation to observation, and the standard deviation of this variation is the noise of the block. A few
-    observations can underestimate the noise. The noise of a block is therefore at least the median noise of all blocks
-    of the same size in the same stream.
+    observations can underestimate the noise. If the measured noise of a block is below the median of all blocks of the
+    same size in the same stream, the median is therefore returned.
 
     Args:
         observations: At least two observations of the empty pad without movement.

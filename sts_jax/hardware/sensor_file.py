@@ -187,8 +187,8 @@ class Device:
 
         Raises:
             SensorFileError: The file of a kept background is missing or damaged.
-            ValueError: An image is not uint8 or does not have the shape (height, width, 3) of this device's lens, or
-                `constants` are not the constants of a simulated sensor.
+            ValueError: An image is not uint8, or its shape is not (height, width, 3) with the size for which the lens
+                was calibrated. Or `constants` are not the constants of a simulated sensor.
             OSError: A file cannot be written.
         """
         if "camera" not in constants or "device" in constants:

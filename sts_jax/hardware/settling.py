@@ -59,8 +59,8 @@ def thumbnail(image: UInt8[np.ndarray, "height width 3"]) -> Thumbnail:
         image: RGB image, 0 to 255.
 
     Returns:
-        The mean colour of each block, shape (24, 32, 3), 0 to 255. The image is divided into 24 rows and 32 columns of
-        blocks.
+        The image is divided into 24 rows and 32 columns of blocks. The result is the mean colour of each block, shape
+        (24, 32, 3), 0 to 255.
     """
     return cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
 
@@ -108,14 +108,14 @@ def switched_share(look: Thumbnail, before: Thumbnail, change: Thumbnail) -> flo
     """Return how far the lights had been switched on or off when an image was taken: 0 means not yet, 1 means fully.
 
     A thumbnail value counts as visible if its change has a magnitude of at least 0.5 (of 255). It counts as clear if
-    this magnitude is also at least a quarter of the median over all visible values. The result is the median of
+    this magnitude is also at least a quarter of the median magnitude of all visible values. The result is the median of
     `(look - before) / change` over the clear values. Because of the median, an object that moves in less than half of
     the view has no influence.
 
     Args:
         look: Thumbnail of the image.
         before: Thumbnail of an image before the switch.
-        change: Difference of two thumbnails: after minus before an earlier switch in the same direction.
+        change: Thumbnail after an earlier switch in the same direction, minus the thumbnail before that switch.
 
     Returns:
         0 if the image shows the lights before the switch, and 1 if it shows the lights after the switch. The result is

@@ -54,7 +54,7 @@ class STS:
 
     - It arrived after the settling time. This time begins when the LED controller acknowledges the switch of the
       lights. Earlier frames may show the previous state of the lights.
-    - Two successive frames have already shown the effect of the switch.
+    - Two successive frames have shown the effect of the switch. The frame itself can be the second of them.
     - After the frame arrived, the controller answered the next request. This answer shows that the lights have not
       changed since the acknowledgement.
     - It was not delayed. A delayed frame may have been exposed long before it arrived.

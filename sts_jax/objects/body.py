@@ -261,7 +261,7 @@ def fill_moments(
 
         Returns:
             Signed volume of each tetrahedron, vectors from the common corner to the other three corners of each
-            tetrahedron, the common corner, and the volume of the liquid.
+            tetrahedron, the common corner, and the volume of the interior below `level`.
         """
         # A triangle with one corner below the level adds the piece at that corner. A triangle with two corners below
         # adds the whole triangle and subtracts the piece at the corner above.

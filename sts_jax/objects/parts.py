@@ -110,10 +110,10 @@ def surface_gaps(
 ) -> tuple[float, float]:
     """Compute the largest distances between a visible surface and its collision parts.
 
-    Each distance is a maximum over points of the visible surface or of the parts: all corners, and 10,000 other points.
-    The distance from each of these points to the parts or to the visible surface is exact. The true maximum can lie
-    between the points. The returned value is then too small by about half the distance between neighbouring points. For
-    a single hull, the first returned value is exact.
+    The first distance is a maximum over points of the visible surface, and the second is a maximum over points of the
+    parts. The points are all corners and 10,000 other points, and the distance of each point is exact. The true maximum
+    can lie between the points. The returned value is then too small by about half the distance between neighbouring
+    points. For a single hull, the first returned value is exact.
 
     Args:
         vertices: Vertices of the visible surface (m).

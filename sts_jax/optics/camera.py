@@ -57,10 +57,10 @@ def object_window(
     """Compute a window around an object, as in the paper (supplement, "Training Details").
 
     A window is the rectangle on the gel's outer face that an image shows. The full window (`full_window`) is the
-    largest one with the aspect ratio of the image. The points are projected to the gel's outer face, and their
-    bounding box is clipped to the full window. The result is the smallest window that contains the box, has the aspect
-    ratio of the image and lies within the full window. If the box is outside the full window, the result is the full
-    window.
+    largest one with the aspect ratio of the image. The points are projected to the gel's outer face. If their bounding
+    box does not overlap the full window, the result is the full window. Otherwise, the box is clipped to the full
+    window. The result is the smallest window that contains the clipped box, has the aspect ratio of the image and lies
+    within the full window.
 
     Args:
         camera: The camera.

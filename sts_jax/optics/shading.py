@@ -253,7 +253,7 @@ def shade(
     3. Haze: the share `exp(-height / haze)` of the remaining light is transmitted and multiplied by `tint`. The
        background, `empty`, replaces the rest.
     4. Milky skin: the share `1 - milk` of the result is transmitted. The skin adds `milk * (1 - hidden)` times the
-       light of the background without the object's shadow.
+       light of a background on which the object casts no shadow.
 
     Args:
         room: Constants of the external light.

@@ -24,7 +24,8 @@ def check_arguments(bodies: Sequence[Any], sensor: Any, scenario: Any, **counts:
         bodies: Bodies to simulate.
         sensor: Sensor whose pad the bodies fall on.
         scenario: Scenario to simulate.
-        counts: Further arguments, such as `num=num`, that must be whole numbers >= 1. Errors name the keyword.
+        counts: Further arguments, such as `num=num`, that must be whole numbers >= 1. The message of an error contains
+            the keyword, such as `num`.
 
     Raises:
         BodyError: A body has bad values. BodyError is a ValueError.

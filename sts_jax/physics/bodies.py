@@ -110,7 +110,7 @@ def hulls(bodies: Sequence[Body]) -> list[Hull]:
 
 
 def shapes(bodies: Sequence[Body], scenario: Scenario) -> Shape:
-    """Compute the geometry of each body, from which the scenario draws random initial poses.
+    """Compute the geometry of each body, which the scenario needs to draw random initial poses.
 
     Args:
         bodies: Bodies that `check_bodies` accepts.

@@ -104,8 +104,8 @@ class Released(Scenario):
 
         The object stands on a stable face and is tilted about an edge of this face. The edge is chosen from random
         edges (the field `tries` is their number). Edges at which the object balances at a tilt of 15 to 45 degrees are
-        preferred. If no random edge is of this kind, for example for a cylinder on its side, one of the other random
-        edges is used.
+        preferred. If no random edge is of this kind, for example for a cylinder on its side, any of the random edges is
+        used.
 
         If the edge is a preferred one, the object stands on the narrower of the two faces that meet at the edge. In
         most cases, the object then turns by less than 45 degrees if it returns to the narrower face, and by more than

@@ -117,7 +117,7 @@ def log_density(
         outcome: Indices into the outcomes of the scenario.
 
     Returns:
-        The log probability of the outcome, and the log density of the pose code and the rotation given the outcome.
+        The log probability of `outcome`, and the log density of `code` and `turn` for this outcome.
     """
 
     def of_outcome(x: Array) -> Array:
@@ -218,9 +218,8 @@ def loss(
             and may be NaN.
         condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
             `training.Preprocessing.encode_condition`. None if the model has no condition.
-        views: Objects in initial poses that do not belong to a trajectory: images `visual` `(m, size, size, 3)` in
-            [0, 1] with the side `input_size`, and state codes `state` `(m, code)`. The model must have the input
-            `visual`.
+        views: Further objects in initial poses, without trajectories: images `visual` `(m, size, size, 3)` in [0, 1]
+            with the side `input_size`, and state codes `state` `(m, code)`. The model must have the input `visual`.
         falls: Trajectories without images: `state`, `pose` and `outcome` as in `targets` and, if the model has a
             condition, `condition`.
         beta: Weight of the divergence of the appearance code.

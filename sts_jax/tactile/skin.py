@@ -140,7 +140,7 @@ def couple(depth: Float[Array, "h w"], length: Scalar, pitch: Float[Array, "2"])
 def shadows(
     skin: Skin, lights: Lights | Leds, depth: Float[Array, "h w"], window: Float[Array, "4"]
 ) -> Float[Array, "m h w"]:
-    """Compute the share of each light that is not hidden by other parts of the skin, for each pixel.
+    """For each pixel and light, compute the share of the light that other parts of the skin do not hide.
 
     Pressed parts of the skin stand out into the gel, through which the light travels. They cast shadows on the skin
     behind them. The share of a light at a point x of the skin is

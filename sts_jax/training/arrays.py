@@ -58,9 +58,9 @@ class Arrays:
 
         Args:
             index: Indices of the samples.
-            further: Keyword arguments `views` and `falls`. Each selects the rows with these indices from all arrays in
-                the field of the same name. A row is an entry along the first axis. Without the argument, the batch
-                lacks the field.
+            further: The keyword argument `views` has row indices for all arrays in the field `views`, and `falls` has
+                row indices for those in the field `falls`. A row is an entry along the first axis. Without the
+                argument, the batch lacks the field.
 
         Returns:
             The selected arrays by name of the field. The field named `empty` is included as a whole.

@@ -117,8 +117,9 @@ class Preprocessing:
 
         Returns:
             True for images in which at least `touch_blocks` blocks differ from the blank image. A block is a square
-            with a side of `touch_block` pixels. It differs if its mean changes by more than `touch_threshold` in any
-            channel. If `touch_level` is True, the median change of each image and channel is subtracted first. If
+            with a side of `touch_block` pixels. Its change is the difference of its mean colour from that of the blank
+            image. If `touch_level` is True, the median change of all blocks of the image is subtracted, separately for
+            each channel. The block differs if its change exceeds `touch_threshold` in any channel. If
             `mask_blank_touch` is False, the result is True for all images.
         """
         if not self.mask_blank_touch:

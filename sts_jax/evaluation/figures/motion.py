@@ -34,7 +34,7 @@ def strip(
     num: int = 10,
     title: str = "",
 ) -> None:
-    """Draw one trajectory over time: a view from outside, both streams, and the wrench of the pad on the object.
+    """Draw one trajectory over time: a view from outside, the visual and tactile images, and the wrench.
 
     Two plots below the images show the force and its moment about the sensor's origin.
 
@@ -95,7 +95,7 @@ def animation(
     outcome: str = "",
     side: int = 240,
 ) -> None:
-    """Write an animation of one trajectory: a view from outside, both streams, and the wrench of the pad on the object.
+    """Write an animation of one trajectory: a view from outside, the visual and tactile images, and the wrench.
 
     Curves below the images show the wrench from the first to the current frame. A red arrow on the visual stream shows
     the component of `gravity` along the pad. The arrow appears if the pad slopes or accelerates. The animation runs at

@@ -128,7 +128,7 @@ class Blender:
             tactile: Image with the LEDs at full power (`Frame.tactile`), of the same form.
 
         Returns:
-            Both images, for `blend` and `frame`.
+            The pair of converted images, which is an argument of `blend` and of `frame`.
 
         Raises:
             ValueError: The shape of an image is not (height, width, 3).
