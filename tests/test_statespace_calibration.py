@@ -101,8 +101,8 @@ def test_fitted_variance_is_the_mean_of_squared_deviations():
     np.testing.assert_allclose(fitted[2], expected, rtol=0.01)
 
 
-def test_calibration_never_narrows_the_density():
-    """Items whose outcomes and poses are more certain than predicted keep their density."""
+def test_calibration_never_narrows_the_density_of_the_pose():
+    """The density of the pose is kept where true poses are nearer than predicted. The outcomes become more certain."""
     rng, number = np.random.default_rng(3), 400
     code, pose = random_states(rng, number), random_codes(rng, number)
     final = density(rng, number)
@@ -111,16 +111,19 @@ def test_calibration_never_narrows_the_density():
     own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
     near = own - 0.3 * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
     final = final._replace(mean=jnp.asarray(near, jnp.float32))
-    np.testing.assert_array_equal(calibration._fitted(final, code, pose, outcome), 1)
+    fitted = calibration._fitted(final, code, pose, outcome)
+    np.testing.assert_array_equal(fitted[1:], 1)
+    assert 1 < fitted[0] <= 4
 
 
-def test_fitted_power_recovers_the_power_of_drawn_outcomes():
+@pytest.mark.parametrize("true", [0.6, 1.5])
+def test_fitted_power_recovers_the_power_of_drawn_outcomes(true):
     rng, number = np.random.default_rng(2), 4000
     code, pose = random_states(rng, number), random_codes(rng, number)
     final = density(rng, number)
-    chance = special.softmax(0.6 * np.asarray(final.outcome, np.float64), axis=1)
+    chance = special.softmax(true * np.asarray(final.outcome, np.float64), axis=1)
     outcome = np.array([rng.choice(3, p=row) for row in chance])
-    assert abs(calibration._fitted(final, code, pose, jnp.asarray(outcome))[0] - 0.6) < 0.06
+    assert abs(calibration._fitted(final, code, pose, jnp.asarray(outcome))[0] / true - 1) < 0.1
 
 
 @pytest.mark.slow

@@ -5,8 +5,10 @@ density from training objects, and this density is too narrow for other objects.
 
 Three numbers for each subset of the inputs correct the density: a power of the probabilities of the outcomes, a power
 of the weights of the mixture, and a factor of the variances. They are temperatures in the sense of Guo et al. (2017),
-"On Calibration of Modern Neural Networks". They can only widen the density. On few objects, the likelihood is often
-largest for a narrower density, which then covers too few of the true poses of other objects.
+"On Calibration of Modern Neural Networks". The first number can make the outcomes less or more certain. After a short
+training, the predicted probabilities are often too uncertain. The other two numbers can only widen the density of the
+pose. On few objects, the likelihood is often largest for a narrower density, which then covers too few of the true
+poses of other objects.
 """
 
 import functools
@@ -26,20 +28,20 @@ from sts_jax.statespace.networks import FinalPose, Model
 from sts_jax.statespace.objective import experts, fuse, log_density, of_state, rotation_between
 
 _CHUNK = 64  # items in one compiled call
-# Bounds of the logarithms of the three numbers. They allow a wider density, and no narrower one.
-_BOUNDS = ((-math.log(4), 0), (-math.log(4), 0), (0, math.log(4)))
+# Bounds of the logarithms of the three numbers. The last two allow a wider density of the pose, and no narrower one.
+_BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
 _PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
 
 
 class Calibration(NamedTuple):
-    """Factors and exponents that widen the predicted density of the final pose, for each subset of the model's inputs.
+    """Factors and exponents that correct the density of the final pose, for each subset of the model's inputs.
 
     Each array has one value for each subset. The value 1 leaves the density unchanged. A subset has the index
     `sum(2**i for i in members)`, where `members` are the positions of its inputs in `Config.inputs`. For example, the
     subset of the first and the second input has the index 3.
     """
 
-    outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 1]
+    outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 4]
     weight: Float[Array, "subsets"]  # exponent of the weights of an outcome's mixture components, in [1/4, 1]
     variance: Float[Array, "subsets"]  # factor of the variances of the components, in [1, 4]
 

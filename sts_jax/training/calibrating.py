@@ -15,8 +15,9 @@ from sts_jax.training.model import Model, load
 def calibrate(workdir: str | os.PathLike[str], arrays: Arrays) -> Model:
     """Fit the calibration of a trained state-space model, and write it to `calibration.json` in the model's folder.
 
-    For new objects, the predicted density of the final pose is too narrow. The calibration widens this density, see
-    `statespace.fit_calibration`. If the model was calibrated on the same arrays before, nothing is fitted or written.
+    For new objects, the predicted density of the final pose is too narrow, and the predicted outcomes can be too
+    certain or too uncertain. The calibration corrects both, see `statespace.fit_calibration`. If the model was
+    calibrated on the same arrays before, nothing is fitted or written.
 
     Args:
         workdir: Folder of the model.
