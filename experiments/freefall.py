@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of objects that fall on the pad, from a first frame in the air.
 
-    python -m experiments.freefall                    # 10 to 25 minutes on two CPU cores
+    python -m experiments.freefall                    # 10 to 30 minutes on two CPU cores
     python -m experiments.freefall --preset long      # 1.5 to 2.5 hours, can be stopped and started again
     python -m experiments.freefall --model paper      # the paper's four models instead of the state-space model
     python -m experiments.freefall --preset smoke     # about two minutes, for tests

@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of objects released on a tilted pad or just above it, from the first frame.
 
-    python -m experiments.inclined                    # 10 to 25 minutes on two CPU cores
+    python -m experiments.inclined                    # 10 to 30 minutes on two CPU cores
     python -m experiments.inclined --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.inclined --model paper      # the paper's four models instead of the state-space model
     python -m experiments.inclined --preset smoke     # about two minutes, for tests

@@ -1,6 +1,6 @@
 """Predict the images and the pose at rest of a bottle on a pad that is jerked, from the first frame and the jerk.
 
-    python -m experiments.perturbed                    # 10 to 25 minutes on two CPU cores
+    python -m experiments.perturbed                    # 10 to 30 minutes on two CPU cores
     python -m experiments.perturbed --preset long      # at most 150 minutes, can be stopped and started again
     python -m experiments.perturbed --model paper      # the paper's four models instead of the state-space model
     python -m experiments.perturbed --preset smoke     # about two minutes, for tests
