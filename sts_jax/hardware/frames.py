@@ -74,8 +74,8 @@ class Pace:
 
     After an interval of n + 1 periods between two frames, n frames count as lost. The attribute `dropped` is the number
     of all lost frames. If the next frames follow each other in less than one period, some or all of the n frames were
-    only late, not lost. `dropped` is then reduced by the number of late frames. If the method `arrived` has returned a
-    number of lost frames already, this number is not corrected.
+    only late, not lost. `dropped` is then reduced by the number of late frames. Only `dropped` is corrected. The sum of
+    the numbers that `arrived` has returned can therefore be too large.
     """
 
     def __init__(self, nominal: float | None):

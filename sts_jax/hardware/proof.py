@@ -157,9 +157,9 @@ class ProvenFrames:
         slowest_s = max(found.visual_s, found.tactile_s)
         if slowest_s > watch_s - period_s:
             raise LightError(
-                f"the image was still changing {slowest_s:.2f} s after the lights were switched, and the "
-                f"measurement ends after {watch_s:.2f} s: keep the scene at rest and lock the camera's "
-                "exposure. If the lights are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
+                f"the image was still changing at the end of the measurement, {slowest_s:.2f} s after the lights were "
+                f"switched (watch_s is {watch_s:.2f}): keep the scene at rest and lock the camera's exposure. If the "
+                "lights are slow, pass longer times as STS(settling=Settling(visual_s, tactile_s))."
             )
         return found
 

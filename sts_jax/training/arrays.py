@@ -63,7 +63,7 @@ class Arrays:
                 argument, the batch lacks the field.
 
         Returns:
-            The selected arrays by name of the field. The field named `empty` is included as a whole.
+            A dictionary from the name of each field to its selected arrays. The field `empty` is included as a whole.
         """
         batch = jax.tree.map(lambda x: x[index], self._tree()) | {"empty": self.empty}
         return batch | {name: {k: x[rows] for k, x in getattr(self, name).items()} for name, rows in further.items()}

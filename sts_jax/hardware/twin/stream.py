@@ -59,8 +59,8 @@ class CameraThread:
             index: Number of the frame that the client received last, or -1.
 
         Returns:
-            The newest of the frames after `index` that are due for delivery. If none of them is due yet, the first
-            frame after `index` is returned. If no frame after `index` exists, the result is None.
+            The newest frame after `index` that is due for delivery. If frames after `index` exist, but none of them is
+            due yet, the first of them is returned. If no frame after `index` exists, the result is None.
         """
         with self._changed:
             later = [made for made in self._made if made.exposure.index > index]
