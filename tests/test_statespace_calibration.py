@@ -1,5 +1,6 @@
 """Calibration of the final pose's density: closed forms, subsets of the inputs, and the file in a model's folder."""
 
+import json
 import shutil
 
 import jax
@@ -11,12 +12,12 @@ from scipy import special
 from statespace_config import STATE, random_codes, random_states, state_model
 
 import sts_jax as sts
-from sts_jax import _files, mvae, statespace, training
-from sts_jax.statespace import calibration, networks, poses
+from sts_jax import _files, evaluation, mvae, statespace, training
+from sts_jax.statespace import calibration, fitting, networks, poses, predict
 
 NUMBER = 40
 SUBSETS = ((), ("visual",), ("tactile",), ("visual", "tactile"), ("pose",), ("visual", "pose"), ("tactile", "pose"))
-TRIPLE = calibration.Calibration(*(jnp.asarray(np.linspace(low, 2, 8), jnp.float32) for low in (0.5, 0.7, 0.9)))
+NUMBERS = calibration.Calibration(*(jnp.asarray(np.linspace(low, 2, 8), jnp.float32) for low in (0.5, 0.7, 0.9, 1.1)))
 
 
 def arrays(**changes):
@@ -89,12 +90,12 @@ def test_fitted_variance_is_the_mean_of_squared_deviations():
     rng, number = np.random.default_rng(1), 400
     code, pose = random_states(rng, number), random_codes(rng, number)
     outcome = rng.integers(0, 3, number)
-    turn = np.asarray(calibration.rotation_between(code, pose)).reshape(number, 9)
+    turn = np.asarray(fitting.rotation_between(code, pose)).reshape(number, 9)
     own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
     final = density(rng, number)
     scatter = np.sqrt(1.7) * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
     final = final._replace(mean=jnp.asarray(own - scatter, jnp.float32))
-    fitted = calibration._fitted(final, code, pose, jnp.asarray(outcome))
+    fitted = fitting._fitted(final, code, pose, jnp.asarray(outcome))
     chosen = np.arange(number), outcome, 0
     expected = np.mean((own[:, 0, 0] - np.asarray(final.mean)[chosen]) ** 2 / np.exp(np.asarray(final.log_var)[chosen]))
     assert 1.6 < expected < 1.8
@@ -107,11 +108,11 @@ def test_calibration_never_narrows_the_density_of_the_pose():
     code, pose = random_states(rng, number), random_codes(rng, number)
     final = density(rng, number)
     outcome = jnp.argmax(final.outcome, axis=1)
-    turn = np.asarray(calibration.rotation_between(code, pose)).reshape(number, 9)
+    turn = np.asarray(fitting.rotation_between(code, pose)).reshape(number, 9)
     own = np.concatenate([np.asarray(pose), turn], axis=1)[:, None, None]
     near = own - 0.3 * np.exp(0.5 * np.asarray(final.log_var)) * rng.normal(size=final.mean.shape)
     final = final._replace(mean=jnp.asarray(near, jnp.float32))
-    fitted = calibration._fitted(final, code, pose, outcome)
+    fitted = fitting._fitted(final, code, pose, outcome)
     np.testing.assert_array_equal(fitted[1:], 1)
     assert 1 < fitted[0] <= 4
 
@@ -123,7 +124,7 @@ def test_fitted_power_recovers_the_power_of_drawn_outcomes(true):
     final = density(rng, number)
     chance = special.softmax(true * np.asarray(final.outcome, np.float64), axis=1)
     outcome = np.array([rng.choice(3, p=row) for row in chance])
-    assert abs(calibration._fitted(final, code, pose, jnp.asarray(outcome))[0] / true - 1) < 0.1
+    assert abs(fitting._fitted(final, code, pose, jnp.asarray(outcome))[0] / true - 1) < 0.1
 
 
 @pytest.mark.slow
@@ -141,10 +142,10 @@ def test_each_item_is_corrected_by_the_numbers_of_its_inputs():
     def run(present, correction):
         return calibration.predict(nnx.merge(graphdef, params), inputs, present, empty, condition, correction)[1]
 
-    plain, found = run(present, None), run(present, TRIPLE)
+    plain, found = run(present, None), run(present, NUMBERS)
     for i, subset in enumerate(SUBSETS):
         number = sum(2 ** STATE.inputs.index(name) for name in subset)
-        expected = calibration.corrected(plain, *(x[number] for x in TRIPLE))
+        expected = calibration.corrected(plain, *(x[number] for x in NUMBERS[:3]))
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a[i], b[i], rtol=1e-5, atol=1e-5)
 
@@ -155,14 +156,14 @@ def test_calibration_is_at_the_minimum_and_other_subsets_stay(folder):
     found = training.calibrate(folder, given).calibration
     for number, row in enumerate(np.asarray(found).T):
         touched = bool(number & 2 ** STATE.inputs.index("tactile"))
-        assert (row == 1).all() == (touched or number == 0), number
+        assert (row == (1, 1, 1, networks.CONTRAST)).all() == (touched or number == 0), number
 
 
 @pytest.mark.slow
 def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
     before = sts.Predictor.load(folder)
     training.save_calibration(
-        folder, calibration.Calibration(*(jnp.ones(8), jnp.ones(8), jnp.full(8, 4.0))), STATE.inputs
+        folder, calibration.Calibration(jnp.ones(8), jnp.ones(8), jnp.full(8, 4.0), jnp.full(8, 7.0)), STATE.inputs
     )
     after = sts.Predictor.load(folder)
     after.save(tmp_path / "copy", compact=True)
@@ -177,6 +178,43 @@ def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
     np.testing.assert_allclose(deviations(after) / deviations(before), 2, rtol=0.4)
     np.testing.assert_allclose(deviations(copy), deviations(after), rtol=0.1)
     np.testing.assert_array_equal(copy.model.calibration.variance, 4)
+    np.testing.assert_array_equal(copy.model.calibration.contrast, 7)
+
+
+@pytest.mark.slow
+def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
+    """The energy at a contrast is that of samples. True images of this energy, plus 0.2 %, lead to this contrast."""
+    given, chosen, rows = arrays(), ["visual", "pose"], np.arange(NUMBER)
+    graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
+    params["decoder"]["last"]["bias"][...] += 3.0  # an untrained decoder covers hardly any pixel
+    chunk = np.arange(fitting._CHUNK) % NUMBER  # a call draws its samples for a whole chunk
+    inputs = {name: jnp.asarray(fitting._unit(x[chunk])) for name, x in given.inputs.items()}
+    empty = {name: jnp.asarray(fitting._unit(image)) for name, image in given.empty.items()}
+    present = {name: jnp.full(len(chunk), name in chosen) for name in STATE.inputs}
+    condition, num, key = jnp.asarray(given.condition[chunk]), fitting._SAMPLES, jax.random.key(0)
+    noise = np.random.default_rng(1).random((NUMBER, STATE.image_size, STATE.image_size, 3))
+    noise /= np.sqrt(evaluation.metrics.gradient_energy(noise))[:, None, None, None]
+    for contrast in fitting.CONTRASTS:
+        numbers = calibration.Calibration(*(jnp.full(8, x) for x in (1.0, 1.0, 1.0, contrast)))
+        drawn = predict.sample(graphdef, params, key, inputs, present, empty, condition, numbers, num=num, drawn=num)
+        energy = evaluation.metrics.gradient_energy(np.asarray(drawn.images["visual"][:, :NUMBER])).mean()
+        target = np.asarray(noise * np.sqrt(1.002 * energy), np.float32)
+        own = (given.inputs, target, given.empty, given.condition, chosen, rows, np.ones(3))
+        assert fitting._contrast(graphdef, params, *own) == contrast
+    blank = np.zeros((NUMBER, STATE.image_size, STATE.image_size, 3), np.uint8)  # all objects fell off
+    own = (given.inputs, blank, given.empty, given.condition, chosen, rows, np.ones(3))
+    assert fitting._contrast(graphdef, params, *own) == networks.CONTRAST
+
+
+@pytest.mark.slow
+def test_older_calibration_has_the_default_contrast(calibrated):
+    path = calibrated / "calibration.json"
+    content = json.loads(path.read_text())
+    for row in content["subsets"].values():
+        del row["contrast"]
+    del content["checksum"]
+    path.write_text(json.dumps({**content, "checksum": _files.digest(content)}))
+    np.testing.assert_array_equal(training.load(calibrated).calibration.contrast, networks.CONTRAST)
 
 
 @pytest.mark.slow

@@ -274,6 +274,10 @@ def test_share_of_levels_that_cover_a_pixel_is_its_probability():
     outlines = np.asarray(sharp["visual"])
     assert np.mean((outlines < 0.05) | (outlines > 0.95)) > 0.7
     np.testing.assert_array_equal(sharp["tactile"], soft["tactile"])
+    level, contrast = jnp.full(200, 0.3), jnp.linspace(1, 9, 200)
+    softer = networks.compose(layers, empty, level, contrast)["visual"]
+    odds = (chance / (1 - chance) / (0.3 / 0.7))[0, None] ** np.asarray(contrast)[:, None, None, None]
+    np.testing.assert_allclose(softer, np.broadcast_to(odds / (1 + odds), softer.shape), rtol=1e-3, atol=1e-6)
 
 
 def test_belief_from_the_true_state_is_the_true_state(model, empty, batch):

@@ -1,8 +1,8 @@
 """A state-space model that predicts final poses and images from any subset of vision, touch and pose."""
 
 from sts_jax.statespace.calibration import Calibration
-from sts_jax.statespace.calibration import fit as fit_calibration
-from sts_jax.statespace.networks import IMAGES, INPUTS, Config, Model, init
+from sts_jax.statespace.fitting import fit as fit_calibration
+from sts_jax.statespace.networks import CONTRAST, IMAGES, INPUTS, Config, Model, init
 from sts_jax.statespace.objective import loss
 from sts_jax.statespace.poses import CODE as POSE_CODE
 from sts_jax.statespace.predict import Samples, sample
@@ -10,6 +10,7 @@ from sts_jax.statespace.state import CODE as STATE_CODE
 from sts_jax.statespace.state import encode
 
 __all__ = [
+    "CONTRAST",
     "IMAGES",
     "INPUTS",
     "POSE_CODE",

@@ -1,4 +1,4 @@
-"""Calibration of the predicted density of the final pose on trajectories that the training did not see.
+"""Calibration of predictions: correction of the density of the final pose, and of the contrast of samples.
 
 The encoders estimate the states of training objects better than the states of other objects. The transition learns its
 density from training objects, and this density is too narrow for other objects. The error depends on the inputs.
@@ -9,41 +9,54 @@ of the weights of the mixture, and a factor of the variances. They are temperatu
 training, the predicted probabilities are often too uncertain. The other two numbers can only widen the density of the
 pose. On few objects, the likelihood is often largest for a narrower density, which then covers too few of the true
 poses of other objects.
+
+A fourth number is the contrast of the samples. It makes their outlines sharper, until their gradient energy is that of
+the true images.
+
+`statespace.fitting` finds the numbers on trajectories that the training did not see.
 """
 
-import functools
-import itertools
-import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from flax import nnx
-from jaxtyping import Array, Bool, Float, Int
-from scipy import optimize
+from jaxtyping import Array, Bool, Float
 
 from sts_jax.mvae import Gaussian
-from sts_jax.statespace.networks import FinalPose, Model
-from sts_jax.statespace.objective import experts, fuse, log_density, of_state, rotation_between
-
-_CHUNK = 64  # items in one compiled call
-# Bounds of the logarithms of the three numbers. The last two allow a wider density of the pose, and no narrower one.
-_BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
-_PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
+from sts_jax.statespace.networks import Config, FinalPose, Model
+from sts_jax.statespace.objective import experts, fuse, of_state
 
 
 class Calibration(NamedTuple):
-    """Factors and exponents that correct the density of the final pose, for each subset of the model's inputs.
+    """Numbers that correct the density of the final pose and the sharpness of samples, for each subset of the inputs.
 
-    Each array has one value for each subset. The value 1 leaves the density unchanged. A subset has the index
-    `sum(2**i for i in members)`, where `members` are the positions of its inputs in `Config.inputs`. For example, the
-    subset of the first and the second input has the index 3.
+    Each array has one value for each subset. The value 1 of the first three numbers leaves the density unchanged. A
+    subset has the index `sum(2**i for i in members)`, where `members` are the positions of its inputs in
+    `Config.inputs`. For example, the subset of the first and the second input has the index 3.
     """
 
     outcome: Float[Array, "subsets"]  # exponent of the probabilities of the outcomes, in [1/4, 4]
     weight: Float[Array, "subsets"]  # exponent of the weights of an outcome's mixture components, in [1/4, 1]
     variance: Float[Array, "subsets"]  # factor of the variances of the components, in [1, 4]
+    contrast: Float[Array, "subsets"]  # contrast of the outlines in samples, `compose`
+
+
+def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[Array, "n"]]) -> Calibration:
+    """Select the numbers of a calibration that belong to the inputs of each item.
+
+    Args:
+        config: Configuration of the model.
+        calibration: Numbers for each subset of the inputs.
+        present: Masks `(n,)` of the inputs by name. An item with the true state `state` gets the numbers of the empty
+            subset, which leave its density unchanged.
+
+    Returns:
+        Numbers for each item, four arrays `(n,)`.
+    """
+    number = sum(2**i * present[name].astype(int) for i, name in enumerate(config.inputs) if name in present)
+    if "state" in present:
+        number = jnp.where(present["state"], 0, number)
+    return Calibration(*(x[jnp.asarray(number)] for x in calibration))
 
 
 def predict(
@@ -75,10 +88,8 @@ def predict(
     final = model.transition(of_state(belief), condition)
     if calibration is None:
         return belief, final
-    number = sum(2**i * present[name].astype(int) for i, name in enumerate(model.config.inputs) if name in present)
-    if "state" in present:
-        number = jnp.where(present["state"], 0, number)
-    return belief, corrected(final, *(x[jnp.asarray(number)] for x in calibration))
+    own = of_items(model.config, calibration, present)
+    return belief, corrected(final, own.outcome, own.weight, own.variance)
 
 
 def corrected(
@@ -104,112 +115,3 @@ def corrected(
         weight=power(final.weight, weight),
         log_var=final.log_var + jnp.log(variance).reshape(-1, 1, 1, 1),
     )
-
-
-def fit(
-    graphdef: nnx.GraphDef[Model],
-    params: nnx.State,
-    inputs: dict[str, np.ndarray],
-    targets: dict[str, np.ndarray],
-    empty: dict[str, np.ndarray],
-    *,
-    present: dict[str, np.ndarray] | None = None,
-    condition: np.ndarray | None = None,
-) -> Calibration:
-    """Fit the calibration of a model to the final poses of trajectories that its training did not see.
-
-    The calibration has three values for each subset of the inputs. These values maximise the likelihood of the true
-    outcomes and final poses, multiplied by a prior that favours calibration values near 1.
-
-    Args:
-        graphdef: Definition of the model, from `init`.
-        params: Parameters of the model.
-        inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
-            and pose codes `pose` `(n, 12)`.
-        targets: True values by name. `state` has the state codes of the first frames, `(n, code)`. `pose` has the pose
-            codes of the last frames, `(n, 12)`. `outcome` has the index of each trajectory's outcome in the list of the
-            scenario's outcomes, `(n,)`.
-        empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
-        present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
-            in all items.
-        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
-            `training.Preprocessing.encode_condition`. None if the model has no condition.
-
-    Returns:
-        The calibration. If no item has all inputs of a subset, the values of this subset are 1.
-    """
-    names = nnx.merge(graphdef, params).config.inputs
-    number = len(targets["pose"])
-    there = {name: np.ones(number, bool) for name in names} | (present or {})
-    found = np.ones((2 ** len(names), 3))
-    for members in itertools.product((False, True), repeat=len(names)):
-        chosen = [name for name, member in zip(names, members, strict=True) if member]
-        rows = np.flatnonzero(np.all([there[name] for name in chosen], axis=0)) if chosen else np.zeros(0, int)
-        if len(rows):
-            final = _densities(graphdef, params, inputs, empty, condition, chosen, rows)
-            truth = (jnp.asarray(targets[name][rows]) for name in ("state", "pose", "outcome"))
-            found[sum(2 ** names.index(name) for name in chosen)] = _fitted(final, *truth)
-    return Calibration(*jnp.asarray(found.T, jnp.float32))
-
-
-def _densities(
-    graphdef: nnx.GraphDef[Model],
-    params: nnx.State,
-    inputs: dict[str, np.ndarray],
-    empty: dict[str, np.ndarray],
-    condition: np.ndarray | None,
-    chosen: list[str],
-    rows: np.ndarray,
-) -> FinalPose:
-    """Predict the densities of the items `rows` from the inputs `chosen`, in chunks of one size."""
-    present = {name: np.full(_CHUNK, name in chosen) for name in inputs}
-    shown = {name: _unit(image) for name, image in empty.items()}
-    parts = []
-    for start in range(0, len(rows), _CHUNK):
-        some = rows[np.arange(start, start + _CHUNK) % len(rows)]
-        own = {name: _unit(values[some]) for name, values in inputs.items()}
-        parts.append(_density(graphdef, params, own, present, shown, None if condition is None else condition[some]))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[: len(rows)], *parts)
-
-
-@functools.partial(jax.jit, static_argnames="graphdef")
-def _density(
-    graphdef: nnx.GraphDef[Model],
-    params: nnx.State,
-    inputs: dict[str, Array],
-    present: dict[str, Bool[Array, "n"]],
-    empty: dict[str, Float[Array, "size size 3"]],
-    condition: Float[Array, "n c"] | None,
-) -> FinalPose:
-    return predict(nnx.merge(graphdef, params), inputs, present, empty, condition)[1]
-
-
-def _unit(values: np.ndarray) -> np.ndarray:
-    """Convert uint8 images to float32 in [0, 1]. Other arrays are returned as they are."""
-    return values.astype(np.float32) / 255 if values.dtype == np.uint8 else values
-
-
-def _fitted(
-    final: FinalPose, code: Float[Array, "n code"], pose: Float[Array, "n 12"], outcome: Int[Array, "n"]
-) -> np.ndarray:
-    """Fit the three numbers of one subset."""
-
-    def evaluated(log: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = _nats(jnp.asarray(log, jnp.float32), final, code, pose, outcome)
-        return float(value), np.asarray(slope, np.float64)
-
-    return np.exp(optimize.minimize(evaluated, np.zeros(3), jac=True, bounds=_BOUNDS).x)
-
-
-@jax.jit
-@jax.value_and_grad
-def _nats(
-    log: Float[Array, "3"],
-    final: FinalPose,
-    code: Float[Array, "n code"],
-    pose: Float[Array, "n 12"],
-    outcome: Int[Array, "n"],
-) -> Float[Array, ""]:
-    """Negative log posterior density of the three numbers, up to a constant. `log` has their logarithms."""
-    given, density = log_density(corrected(final, *jnp.exp(log)), pose, rotation_between(code, pose), outcome)
-    return jnp.sum((log / _PRIOR) ** 2) / 2 - jnp.sum(given) - jnp.sum(density)

@@ -29,7 +29,7 @@ INPUTS = (*IMAGES, "pose")  # names of all inputs that a model can have
 UNKNOWN_LOG_VAR = 30.0  # log variance of numbers that an input does not determine: their precision is almost 0
 _LOG_VAR_LIMIT = 8.0  # largest absolute value of an encoder's log variances
 _FINAL_LOG_VAR = (-3.0, 5.0)  # range of the log variances of the final pose: its centre and half of its width
-_CONTRAST = 40.0  # factor of the logits in an image with sharp outlines
+CONTRAST = 40.0  # contrast of samples without a calibration, see `compose`
 _OUTSIDE = 8.0  # difference of the logit of being covered by the object, between inside and outside of the canvas
 # The tint describes the mean colour of the object in the visual image. For each colour channel, it is the mean change
 # from the empty sensor over the pixels that show the object, minus _MIDDLE, divided by _WIDTH.
@@ -447,6 +447,7 @@ def compose(
     layers: Layers,
     empty: dict[str, Float[Array, "size size 3"]],
     level: Float[Array, "n"] | None = None,
+    contrast: float | Float[Array, "n"] = CONTRAST,
 ) -> dict[str, Float[Array, "n size size 3"]]:
     """Combine the rendered objects with the images of the empty sensor.
 
@@ -458,6 +459,8 @@ def compose(
             is above the threshold. Otherwise, the pixel shows the empty sensor. If the threshold is drawn uniformly,
             the pixel shows the object with the probability p. With None, the colour of the pixel is the mean of the
             colours of the object and the empty sensor, with the weights p and 1 - p.
+        contrast: Factor of the logits of p with a threshold. Pixels are blended where p is near the threshold. With a
+            larger contrast, the outlines are sharper.
 
     Returns:
         The images `visual` and `tactile` of each object, in [0, 1].
@@ -465,7 +468,7 @@ def compose(
     logit = layers.covered
     if level is not None:
         level = jnp.clip(level, 0.01, 0.99).reshape(-1, 1, 1, 1)
-        logit = _CONTRAST * (logit - jnp.log(level / (1 - level)))
+        logit = jnp.reshape(contrast, (-1, 1, 1, 1)) * (logit - jnp.log(level / (1 - level)))
     covered = jax.nn.sigmoid(logit)
     grey = jnp.clip(empty["tactile"], 0.01, 0.99)
     return {

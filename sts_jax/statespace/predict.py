@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from sts_jax.mvae import Gaussian
 from sts_jax.statespace import calibration, poses, state
-from sts_jax.statespace.networks import FinalPose, Model, compose
+from sts_jax.statespace.networks import CONTRAST, FinalPose, Layers, Model, compose
 from sts_jax.statespace.objective import reduced
 
 
@@ -54,8 +54,8 @@ def sample(
         empty: `visual` and `tactile` image of the empty sensor, `(size, size, 3)` in [0, 1].
         condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
             `training.Preprocessing.encode_condition`. None if the model has no condition.
-        correction: Calibration of the density of the final pose, from `fit_calibration`. None leaves the density
-            unchanged.
+        correction: Calibration of the density of the final pose and of the contrast, from `fit_calibration`. None
+            leaves the density unchanged.
         num: Number of final poses for each item.
         drawn: Number of final poses with rendered visual and tactile images, from 1 to `num`. A random appearance code
             is drawn for each of these poses.
@@ -70,6 +70,45 @@ def sample(
     if not 1 <= drawn <= num:
         raise ValueError(f"`drawn` must be from 1 to `num` ({num}), got {drawn}")
     model = nnx.merge(graphdef, params)
+    found = draw(model, key, inputs, present, empty, condition, correction, num=num, drawn=drawn)
+    contrast = jnp.full(len(found.outcome), CONTRAST)
+    if correction is not None:
+        contrast = calibration.of_items(model.config, correction, present).contrast
+    sharp = compose(found.layers, found.empty, found.level, jnp.tile(contrast, drawn))
+    soft = compose(found.layers, found.empty)
+    return Samples(
+        belief=found.belief,
+        outcome=found.outcome,
+        pose=found.pose,
+        images={name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in sharp.items()},
+        mean={name: x.reshape(drawn, -1, *x.shape[1:]).mean(0) for name, x in soft.items()},
+    )
+
+
+class Drawn(NamedTuple):
+    """Samples whose images are not composed yet: k final poses for each of n items, and layers of `drawn` of them."""
+
+    belief: Gaussian  # posterior of the state code and the appearance code of the first frame, (n, code + look)
+    outcome: Float[Array, "n outcomes"]  # probability of each outcome
+    pose: Float[Array, "k n 12"]  # pose codes of the last frame
+    layers: Layers  # outlines and colours, drawn * n, with the axis of the items last
+    level: Float[Array, "m"]  # threshold of each outline, drawn * n
+    empty: dict[str, Float[Array, "size size 3"]]  # images of the empty sensor with the size of the layers
+
+
+def draw(
+    model: Model,
+    key: PRNGKeyArray,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n c"] | None,
+    correction: calibration.Calibration | None,
+    *,
+    num: int,
+    drawn: int,
+) -> Drawn:
+    """Sample final poses, and render the layers of the images of some of them. The arguments are those of `sample`."""
     belief, final = calibration.predict(model, inputs, present, empty, condition, correction)
     end, appearance, outline = jax.random.split(key, 3)
     codes, turns = jax.vmap(lambda key: _final_pose(key, final))(jax.random.split(end, num))
@@ -86,15 +125,8 @@ def sample(
     # An image is sharp because pixels are covered above a level of probability. The levels of an item are equally
     # spaced, in random order.
     order = jax.vmap(lambda key: jax.random.permutation(key, drawn))(jax.random.split(outline, len(mean)))
-    sharp = compose(layers, shown, (order.T.reshape(-1) + 0.5) / drawn)
-    soft = compose(layers, shown)
-    return Samples(
-        belief=belief,
-        outcome=jnp.exp(final.outcome),
-        pose=codes,
-        images={name: x.reshape(drawn, -1, *x.shape[1:]) for name, x in sharp.items()},
-        mean={name: x.reshape(drawn, -1, *x.shape[1:]).mean(0) for name, x in soft.items()},
-    )
+    level = (order.T.reshape(-1) + 0.5) / drawn
+    return Drawn(belief, jnp.exp(final.outcome), codes, layers, level, shown)
 
 
 def _final_pose(key: PRNGKeyArray, final: FinalPose) -> tuple[Float[Array, "n 12"], Float[Array, "n 3 3"]]:

@@ -65,7 +65,8 @@ def read(folder: Path) -> tuple[statespace.Calibration, int | None] | None:
         raise _files.DamagedFileError(f"{path} was written by another version of sts_jax: {remedy}.")
     if content["weights"] != _weights(folder):
         return None
-    rows = [[row[name] for name in statespace.Calibration._fields] for row in content["subsets"].values()]
+    default = {"contrast": statespace.CONTRAST}  # older files lack the contrast
+    rows = [[(default | row)[name] for name in statespace.Calibration._fields] for row in content["subsets"].values()]
     return statespace.Calibration(*jnp.asarray(rows, jnp.float32).T), content["data"]
 
 

@@ -1,0 +1,211 @@
+"""Fit of the calibration of a model to trajectories that the training did not see."""
+
+import functools
+import itertools
+import math
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Bool, Float, Int
+from scipy import optimize
+
+from sts_jax.statespace.calibration import Calibration, corrected, predict
+from sts_jax.statespace.networks import CONTRAST, FinalPose, Model, compose
+from sts_jax.statespace.objective import log_density, rotation_between
+from sts_jax.statespace.predict import draw
+
+CONTRASTS = (5.0, 10.0, 20.0, 40.0)  # contrasts of samples that are tried
+_CHUNK = 64  # items in one compiled call
+_SAMPLES = 4  # samples of each item for the choice of the contrast
+_MOST = 128  # largest number of items for the choice of the contrast
+# Bounds of the logarithms of the three numbers. The last two allow a wider density of the pose, and no narrower one.
+_BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
+_PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
+
+
+def fit(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, np.ndarray],
+    targets: dict[str, np.ndarray],
+    empty: dict[str, np.ndarray],
+    *,
+    present: dict[str, np.ndarray] | None = None,
+    condition: np.ndarray | None = None,
+) -> Calibration:
+    """Fit the calibration of a model to trajectories that its training did not see.
+
+    The calibration has four values for each subset of the inputs. The first three maximise the likelihood of the true
+    outcomes and final poses, multiplied by a prior that favours values near 1. The fourth is the contrast, out of
+    `CONTRASTS`, at which the gradient energy of samples is nearest to that of the true images.
+
+    Args:
+        graphdef: Definition of the model, from `init`.
+        params: Parameters of the model.
+        inputs: All inputs of the model by name: images `visual` and `tactile` `(n, size, size, 3)`, uint8 or in [0, 1],
+            and pose codes `pose` `(n, 12)`.
+        targets: True values by name. `state` has the state codes of the first frames, `(n, code)`. `pose` has the pose
+            codes of the last frames, `(n, 12)`. `outcome` has the index of each trajectory's outcome in the list of the
+            scenario's outcomes, `(n,)`. `visual` has the visual images of the last frames,
+            `(n, image_size, image_size, 3)`, uint8 or in [0, 1].
+        empty: `visual` and `tactile` image of the empty sensor, uint8 or in [0, 1].
+        present: Masks `(n,)` of the inputs. True means that the item has the input. An input without a mask is present
+            in all items.
+        condition: Known quantities of the scenario such as an acceleration, `(n, c)`, from
+            `training.Preprocessing.encode_condition`. None if the model has no condition.
+
+    Returns:
+        The calibration. If no item has all inputs of a subset, its first three values are 1, and its contrast is
+        `CONTRAST`.
+    """
+    names = nnx.merge(graphdef, params).config.inputs
+    number = len(targets["pose"])
+    there = {name: np.ones(number, bool) for name in names} | (present or {})
+    found = np.ones((2 ** len(names), 4))
+    found[:, 3] = CONTRAST
+    for members in itertools.product((False, True), repeat=len(names)):
+        chosen = [name for name, member in zip(names, members, strict=True) if member]
+        rows = np.flatnonzero(np.all([there[name] for name in chosen], axis=0)) if chosen else np.zeros(0, int)
+        if len(rows):
+            final = _densities(graphdef, params, inputs, empty, condition, chosen, rows)
+            truth = (jnp.asarray(targets[name][rows]) for name in ("state", "pose", "outcome"))
+            own = found[sum(2 ** names.index(name) for name in chosen)]
+            own[:3] = _fitted(final, *truth)
+            own[3] = _contrast(graphdef, params, inputs, targets["visual"], empty, condition, chosen, rows, own[:3])
+    return Calibration(*jnp.asarray(found.T, jnp.float32))
+
+
+def _contrast(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, np.ndarray],
+    target: np.ndarray,
+    empty: dict[str, np.ndarray],
+    condition: np.ndarray | None,
+    chosen: list[str],
+    rows: np.ndarray,
+    numbers: np.ndarray,
+) -> float:
+    """Find the contrast at which the gradient energy of samples from the inputs `chosen` is nearest to the true one.
+
+    `numbers` are the first three numbers of the calibration of these inputs.
+    """
+    some = rows[np.linspace(0, len(rows), min(len(rows), _MOST), endpoint=False).astype(int)]
+    true = np.array(gradient_energy(jnp.asarray(_unit(target[some]))))
+    correction = Calibration(*(jnp.full(2 ** len(inputs), x, jnp.float32) for x in (*numbers, CONTRAST)))
+    parts = [
+        _energies(graphdef, params, own, present, shown, given, correction)
+        for own, present, shown, given in _chunks(inputs, empty, condition, chosen, some)
+    ]
+    found = np.concatenate(parts, axis=1)[:, : len(some)].mean(1)
+    if true.sum() == 0 or not (found > 0).all():
+        return CONTRAST
+    return CONTRASTS[np.argmin(np.abs(np.log(found / true.mean())))]
+
+
+def gradient_energy(images: Float[Array, "*n h w 3"]) -> Float[Array, "*n"]:
+    """Compute the sum of the squared differences of neighbouring pixels of each image along both axes."""
+    down, across = (jnp.diff(images, axis=axis) for axis in (-3, -2))
+    return jnp.sum(down**2, axis=(-3, -2, -1)) + jnp.sum(across**2, axis=(-3, -2, -1))
+
+
+@functools.partial(jax.jit, static_argnames="graphdef")
+def _energies(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n c"] | None,
+    correction: Calibration,
+) -> Float[Array, "contrasts n"]:
+    """Mean gradient energy of the samples of each item, for each of the contrasts."""
+    model, key = nnx.merge(graphdef, params), jax.random.key(0)
+    found = draw(model, key, inputs, present, empty, condition, correction, num=_SAMPLES, drawn=_SAMPLES)
+    energies = [
+        gradient_energy(compose(found.layers, found.empty, found.level, contrast)["visual"]) for contrast in CONTRASTS
+    ]
+    return jnp.stack(energies).reshape(len(CONTRASTS), _SAMPLES, -1).mean(1)
+
+
+def _densities(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, np.ndarray],
+    empty: dict[str, np.ndarray],
+    condition: np.ndarray | None,
+    chosen: list[str],
+    rows: np.ndarray,
+) -> FinalPose:
+    """Predict the densities of the items `rows` from the inputs `chosen`."""
+    parts = [
+        _density(graphdef, params, own, present, shown, given)
+        for own, present, shown, given in _chunks(inputs, empty, condition, chosen, rows)
+    ]
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[: len(rows)], *parts)
+
+
+def _chunks(
+    inputs: dict[str, np.ndarray],
+    empty: dict[str, np.ndarray],
+    condition: np.ndarray | None,
+    chosen: list[str],
+    rows: np.ndarray,
+) -> Iterator[tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]]:
+    """Divide the items `rows` into chunks of one size, the last of which is filled with copies.
+
+    Yields:
+        Inputs, masks of the inputs `chosen`, images of the empty sensor, and condition.
+    """
+    present = {name: np.full(_CHUNK, name in chosen) for name in inputs}
+    shown = {name: _unit(image) for name, image in empty.items()}
+    for start in range(0, len(rows), _CHUNK):
+        some = rows[np.arange(start, start + _CHUNK) % len(rows)]
+        own = {name: _unit(values[some]) for name, values in inputs.items()}
+        yield own, present, shown, None if condition is None else condition[some]
+
+
+@functools.partial(jax.jit, static_argnames="graphdef")
+def _density(
+    graphdef: nnx.GraphDef[Model],
+    params: nnx.State,
+    inputs: dict[str, Array],
+    present: dict[str, Bool[Array, "n"]],
+    empty: dict[str, Float[Array, "size size 3"]],
+    condition: Float[Array, "n c"] | None,
+) -> FinalPose:
+    return predict(nnx.merge(graphdef, params), inputs, present, empty, condition)[1]
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Convert uint8 images to float32 in [0, 1]. Other arrays are returned as they are."""
+    return values.astype(np.float32) / 255 if values.dtype == np.uint8 else values
+
+
+def _fitted(
+    final: FinalPose, code: Float[Array, "n code"], pose: Float[Array, "n 12"], outcome: Int[Array, "n"]
+) -> np.ndarray:
+    """Fit the three numbers of one subset."""
+
+    def evaluated(log: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = _nats(jnp.asarray(log, jnp.float32), final, code, pose, outcome)
+        return float(value), np.asarray(slope, np.float64)
+
+    return np.exp(optimize.minimize(evaluated, np.zeros(3), jac=True, bounds=_BOUNDS).x)
+
+
+@jax.jit
+@jax.value_and_grad
+def _nats(
+    log: Float[Array, "3"],
+    final: FinalPose,
+    code: Float[Array, "n code"],
+    pose: Float[Array, "n 12"],
+    outcome: Int[Array, "n"],
+) -> Float[Array, ""]:
+    """Negative log posterior density of the three numbers, up to a constant. `log` has their logarithms."""
+    given, density = log_density(corrected(final, *jnp.exp(log)), pose, rotation_between(code, pose), outcome)
+    return jnp.sum((log / _PRIOR) ** 2) / 2 - jnp.sum(given) - jnp.sum(density)
