@@ -47,16 +47,17 @@ def of_items(config: Config, calibration: Calibration, present: dict[str, Bool[A
     Args:
         config: Configuration of the model.
         calibration: Numbers for each subset of the inputs.
-        present: Masks `(n,)` of the inputs by name. An item with the true state `state` gets the numbers of the empty
-            subset, which leave its density unchanged.
+        present: Masks `(n,)` of the inputs by name. The density of an item with the true state `state` is not
+            corrected.
 
     Returns:
         Numbers for each item, four arrays `(n,)`.
     """
-    number = sum(2**i * present[name].astype(int) for i, name in enumerate(config.inputs) if name in present)
-    if "state" in present:
-        number = jnp.where(present["state"], 0, number)
-    return Calibration(*(x[jnp.asarray(number)] for x in calibration))
+    names = enumerate(config.inputs)
+    subset = jnp.asarray(sum(2**i * present[name].astype(int) for i, name in names if name in present))
+    corrected_as = jnp.where(present["state"], 0, subset) if "state" in present else subset
+    density = Calibration(*(x[corrected_as] for x in calibration))
+    return density._replace(contrast=calibration.contrast[subset])
 
 
 def predict(
