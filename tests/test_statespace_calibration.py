@@ -184,7 +184,8 @@ def test_calibration_changes_samples_and_survives_saving(folder, tmp_path):
 @pytest.mark.slow
 def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
     """The energy at a contrast is that of samples. True images of this energy, plus 0.2 %, lead to this contrast."""
-    given, chosen, rows = arrays(), ["visual", "pose"], np.arange(NUMBER)
+    given, chosen = arrays(), ["visual", "pose"]
+    chunks = list(fitting._chunks(given.inputs, given.empty, given.condition, chosen, np.arange(NUMBER)))
     graphdef, params, _ = statespace.init(jax.random.key(0), STATE)
     params["decoder"]["last"]["bias"][...] += 3.0  # an untrained decoder covers hardly any pixel
     chunk = np.arange(fitting._CHUNK) % NUMBER  # a call draws its samples for a whole chunk
@@ -199,11 +200,9 @@ def test_fitted_contrast_has_the_gradient_energy_of_the_true_images():
         drawn = predict.sample(graphdef, params, key, inputs, present, empty, condition, numbers, num=num, drawn=num)
         energy = evaluation.metrics.gradient_energy(np.asarray(drawn.images["visual"][:, :NUMBER])).mean()
         target = np.asarray(noise * np.sqrt(1.002 * energy), np.float32)
-        own = (given.inputs, target, given.empty, given.condition, chosen, rows, np.ones(3))
-        assert fitting._contrast(graphdef, params, *own) == contrast
+        assert fitting._contrast(graphdef, params, chunks, target, np.ones(3)) == contrast
     blank = np.zeros((NUMBER, STATE.image_size, STATE.image_size, 3), np.uint8)  # all objects fell off
-    own = (given.inputs, blank, given.empty, given.condition, chosen, rows, np.ones(3))
-    assert fitting._contrast(graphdef, params, *own) == networks.CONTRAST
+    assert fitting._contrast(graphdef, params, chunks, blank, np.ones(3)) == networks.CONTRAST
 
 
 @pytest.mark.slow

@@ -3,7 +3,8 @@
 import functools
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +25,15 @@ _MOST = 128  # largest number of items for the choice of the contrast
 # Bounds of the logarithms of the three numbers. The last two allow a wider density of the pose, and no narrower one.
 _BOUNDS = ((-math.log(4), math.log(4)), (-math.log(4), 0), (0, math.log(4)))
 _PRIOR = 0.5  # standard deviation of the logarithms in the prior, which is a normal distribution about 0
+
+
+class _Chunk(NamedTuple):
+    """Items of one compiled call, the arguments of `calibration.predict` between the model and the calibration."""
+
+    inputs: dict[str, np.ndarray]
+    present: dict[str, np.ndarray]
+    empty: dict[str, np.ndarray]
+    condition: np.ndarray | None
 
 
 def fit(
@@ -70,37 +80,32 @@ def fit(
         chosen = [name for name, member in zip(names, members, strict=True) if member]
         rows = np.flatnonzero(np.all([there[name] for name in chosen], axis=0)) if chosen else np.zeros(0, int)
         if len(rows):
-            final = _densities(graphdef, params, inputs, empty, condition, chosen, rows)
+            final = _densities(graphdef, params, _chunks(inputs, empty, condition, chosen, rows), len(rows))
             truth = (jnp.asarray(targets[name][rows]) for name in ("state", "pose", "outcome"))
             own = found[sum(2 ** names.index(name) for name in chosen)]
             own[:3] = _fitted(final, *truth)
-            own[3] = _contrast(graphdef, params, inputs, targets["visual"], empty, condition, chosen, rows, own[:3])
+            some = rows[np.linspace(0, len(rows), min(len(rows), _MOST), endpoint=False).astype(int)]
+            chunks = _chunks(inputs, empty, condition, chosen, some)
+            own[3] = _contrast(graphdef, params, chunks, targets["visual"][some], own[:3])
     return Calibration(*jnp.asarray(found.T, jnp.float32))
 
 
 def _contrast(
     graphdef: nnx.GraphDef[Model],
     params: nnx.State,
-    inputs: dict[str, np.ndarray],
+    chunks: Iterable[_Chunk],
     target: np.ndarray,
-    empty: dict[str, np.ndarray],
-    condition: np.ndarray | None,
-    chosen: list[str],
-    rows: np.ndarray,
     numbers: np.ndarray,
 ) -> float:
-    """Find the contrast at which the gradient energy of samples from the inputs `chosen` is nearest to the true one.
+    """Find the contrast at which the gradient energy of samples is nearest to that of the true images `target`.
 
-    `numbers` are the first three numbers of the calibration of these inputs.
+    `numbers` are the first three numbers of the calibration for the inputs of the chunks.
     """
-    some = rows[np.linspace(0, len(rows), min(len(rows), _MOST), endpoint=False).astype(int)]
-    true = np.array(gradient_energy(jnp.asarray(_unit(target[some]))))
-    correction = Calibration(*(jnp.full(2 ** len(inputs), x, jnp.float32) for x in (*numbers, CONTRAST)))
-    parts = [
-        _energies(graphdef, params, own, present, shown, given, correction)
-        for own, present, shown, given in _chunks(inputs, empty, condition, chosen, some)
-    ]
-    found = np.concatenate(parts, axis=1)[:, : len(some)].mean(1)
+    true = np.array(gradient_energy(jnp.asarray(_unit(target))))
+    subsets = 2 ** len(nnx.merge(graphdef, params).config.inputs)
+    correction = Calibration(*(jnp.full(subsets, x, jnp.float32) for x in (*numbers, CONTRAST)))
+    parts = [_energies(graphdef, params, *chunk, correction) for chunk in chunks]
+    found = np.concatenate(parts, axis=1)[:, : len(target)].mean(1)
     if true.sum() == 0 or not (found > 0).all():
         return CONTRAST
     return CONTRASTS[np.argmin(np.abs(np.log(found / true.mean())))]
@@ -131,21 +136,10 @@ def _energies(
     return jnp.stack(energies).reshape(len(CONTRASTS), _SAMPLES, -1).mean(1)
 
 
-def _densities(
-    graphdef: nnx.GraphDef[Model],
-    params: nnx.State,
-    inputs: dict[str, np.ndarray],
-    empty: dict[str, np.ndarray],
-    condition: np.ndarray | None,
-    chosen: list[str],
-    rows: np.ndarray,
-) -> FinalPose:
-    """Predict the densities of the items `rows` from the inputs `chosen`."""
-    parts = [
-        _density(graphdef, params, own, present, shown, given)
-        for own, present, shown, given in _chunks(inputs, empty, condition, chosen, rows)
-    ]
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[: len(rows)], *parts)
+def _densities(graphdef: nnx.GraphDef[Model], params: nnx.State, chunks: Iterable[_Chunk], number: int) -> FinalPose:
+    """Predict the densities of the first `number` items of the chunks."""
+    parts = [_density(graphdef, params, *chunk) for chunk in chunks]
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[:number], *parts)
 
 
 def _chunks(
@@ -154,18 +148,17 @@ def _chunks(
     condition: np.ndarray | None,
     chosen: list[str],
     rows: np.ndarray,
-) -> Iterator[tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]]:
-    """Divide the items `rows` into chunks of one size, the last of which is filled with copies.
+) -> Iterator[_Chunk]:
+    """Divide the items `rows` into chunks of one size. Copies of items complete the last chunk.
 
-    Yields:
-        Inputs, masks of the inputs `chosen`, images of the empty sensor, and condition.
+    Items have only the inputs `chosen`.
     """
     present = {name: np.full(_CHUNK, name in chosen) for name in inputs}
     shown = {name: _unit(image) for name, image in empty.items()}
     for start in range(0, len(rows), _CHUNK):
         some = rows[np.arange(start, start + _CHUNK) % len(rows)]
         own = {name: _unit(values[some]) for name, values in inputs.items()}
-        yield own, present, shown, None if condition is None else condition[some]
+        yield _Chunk(own, present, shown, None if condition is None else condition[some])
 
 
 @functools.partial(jax.jit, static_argnames="graphdef")
